@@ -1,0 +1,189 @@
+"""Restoring forces of worn and ageing structures (thesis, Section 5.3.1).
+
+The three forces are sums of one shape, the ramp ``max(z, 0)``. With `width` its kink becomes a
+polynomial bend, and every force that is built of ramps is smooth in the displacement.
+"""
+
+from numbers import Real
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import ArrayLike
+from pytensor import config
+from pytensor.tensor import TensorVariable
+
+from .errors import ModelError
+
+__all__ = ["cubic", "freeplay", "hysteresis"]
+
+type Value = TensorVariable | ArrayLike
+
+
+def cubic(z: Value, k_l: Value, k_nl: Value) -> TensorVariable:
+    """Force of a spring with linear and cubic stiffness.
+
+    .. math:: f_c = k_l z + k_{nl} z^3
+
+    A positive `k_nl` makes the spring harden with displacement, a negative one makes it soften.
+
+    Parameters
+    ----------
+    z : tensor_like
+        Displacement.
+    k_l, k_nl : tensor_like
+        Linear and cubic stiffness, of any shapes that broadcast with `z`.
+
+    Returns
+    -------
+    TensorVariable
+        The force, of the broadcast shape.
+
+    References
+    ----------
+    Thesis, Eq. 5.20.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.cubic(2.0, k_l=1.0, k_nl=0.5).eval()
+    array(6.)
+    """
+    z = _real(z)
+    return k_l * z + k_nl * z**3
+
+
+def freeplay(z: Value, k_f: Value, delta_f: Value, *, width: float | None = None) -> TensorVariable:
+    r"""Force of a spring with a gap, such as a worn hinge or a loose rivet.
+
+    .. math::
+
+        f_f = \begin{cases} k_f (z - \delta_f) & z > \delta_f \\
+                            0 & -\delta_f \le z \le \delta_f \\
+                            k_f (z + \delta_f) & z < -\delta_f \end{cases}
+
+    Parameters
+    ----------
+    z : tensor_like
+        Displacement.
+    k_f : tensor_like
+        Stiffness outside the gap.
+    delta_f : tensor_like
+        Half the gap, not negative.
+    width : float, optional
+        Length over which each of the two kinks is bent, centred on the kink. Farther than
+        ``width / 2`` from a kink the force is unchanged; nowhere is it off by more than
+        ``3 / 32 * k_f * width``. It has two continuous derivatives, so that a likelihood which
+        uses its Jacobian is differentiable. None keeps the kinks.
+
+    Returns
+    -------
+    TensorVariable
+        The force, of the broadcast shape of the arguments.
+
+    Raises
+    ------
+    ModelError
+        If `width` is not a positive, finite number.
+
+    References
+    ----------
+    Thesis, Eq. 5.21.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.freeplay([-0.5, 0.1, 0.5], k_f=2.0, delta_f=0.2).eval()
+    array([-0.6, 0. , 0.6])
+    """
+    z, width = _real(z), _checked(width)
+    return k_f * (_ramp(z - delta_f, width) - _ramp(-z - delta_f, width))
+
+
+def hysteresis(
+    z: Value, v: Value, k_h: Value, a_h: Value, delta_h: Value, *, width: float | None = None
+) -> TensorVariable:
+    r"""Force that takes one branch on the way up and another on the way down.
+
+    With :math:`f_0 = k_h (2 a_h + \delta_h) / 2` the rising branch, :math:`v \ge 0`, is
+
+    .. math::
+
+        f_h = \begin{cases} k_h (z - a_h) + f_0 & z < a_h \\
+                            f_0 & a_h \le z \le a_h + \delta_h \\
+                            k_h (z - a_h - \delta_h) + f_0 & z > a_h + \delta_h \end{cases}
+
+    and the falling branch, :math:`v < 0`, is its mirror image, :math:`-f_h(-z)`. Beyond
+    :math:`|z| = a_h + \delta_h` both are the line :math:`k_h (z - \delta_h / 2)` for positive and
+    :math:`k_h (z + \delta_h / 2)` for negative `z`. A full cycle takes the energy
+    :math:`2 f_0 \delta_h` out of the motion.
+
+    Parameters
+    ----------
+    z, v : tensor_like
+        Displacement and velocity.
+    k_h : tensor_like
+        Stiffness outside the plateaus.
+    a_h, delta_h : tensor_like
+        Where a plateau begins and how long it is, neither of them negative.
+    width : float, optional
+        Length over which each kink in `z` is bent, as in :func:`freeplay`; the force is off by at
+        most ``3 / 32 * k_h * width``. The jump between the branches at ``v = 0``, of height up to
+        ``k_h * delta_h``, stays: no distance says how fast a velocity should be blended. The
+        derivative with respect to `v` is therefore zero wherever it exists. None keeps the kinks.
+
+    Returns
+    -------
+    TensorVariable
+        The force, of the broadcast shape of the arguments.
+
+    Raises
+    ------
+    ModelError
+        If `width` is not a positive, finite number.
+
+    Notes
+    -----
+    The rule has no memory: the branch follows from the sign of the velocity alone. Between the
+    plateaus, ``abs(z) < a_h``, it is a spring with dry friction of strength ``k_h * delta_h / 2``,
+    which holds the mass in place if the other forces are weaker than that.
+
+    *Differences from the source.* "Positive deflection" is read as positive velocity: with the sign
+    of the displacement there would be no loop. A velocity of exactly zero is on the rising branch.
+
+    References
+    ----------
+    Thesis, Eqs. 5.22 and 5.23.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.hysteresis(0.0, [1.0, -1.0], k_h=1.0, a_h=0.5, delta_h=1.5).eval()
+    array([ 0.75, -0.75])
+    """
+    z, v, width = _real(z), _real(v), _checked(width)
+    f_0 = k_h * (2 * a_h + delta_h) / 2
+
+    def rising(z: TensorVariable) -> TensorVariable:
+        return f_0 + k_h * (_ramp(z - a_h - delta_h, width) - _ramp(a_h - z, width))
+
+    return pt.switch(v >= 0, rising(z), -rising(-z))
+
+
+def _ramp(z: TensorVariable, width: float | None) -> TensorVariable:
+    """``max(z, 0)``; with `width` its slope is the smoothstep ``3 s^2 - 2 s^3``, not a step."""
+    if width is None:
+        return pt.switch(z > 0, z, 0.0)
+    s = z / width + 0.5
+    bend = width * s**3 * (1 - s / 2)
+    return pt.switch(s <= 0, 0.0, pt.switch(s >= 1, z, bend))
+
+
+def _real(value: Value) -> TensorVariable:
+    """Make a symbolic value of PyTensor's floating type: small integers overflow in a power."""
+    return pt.cast(pt.as_tensor_variable(value), config.floatX)
+
+
+def _checked(width: float | None) -> float | None:
+    if width is None or (isinstance(width, Real) and 0 < width < np.inf):
+        return width
+    raise ModelError(f"width must be a positive, finite number or None; got {width!r}")
