@@ -1,0 +1,74 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`. `make help` lists the rest.
+
+VENV   ?= .venv
+LATEST ?= .venv-latest
+
+# The first of these that runs, is of a version that PyMC supports and can make environments.
+CANDIDATES = python3 python3.14 python3.13 python3.12
+FITS = import ensurepip, sys, venv; sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 14))
+PYTHON ?= $(shell for p in $(CANDIDATES); do $$p -c '$(FITS)' >/dev/null 2>&1 && echo $$p && break; done)
+
+define NO_PYTHON
+echo "Python 3.12, 3.13 or 3.14 with its venv module is needed; none was found as $(CANDIDATES)."; \
+echo "Get one with 'apt install python3.13 python3.13-venv', 'brew install python@3.13' or"; \
+echo "'pyenv install 3.13', or name yours: make PYTHON=/path/to/python3.13 ..."; exit 1
+endef
+
+IN = $(VENV)/bin
+PYTEST = -m pytest -n 2 --dist loadfile
+
+.DEFAULT_GOAL := help
+.PHONY: help demo demo-quick test test-slow test-latest lint docs bench lock clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
+
+demo: $(VENV)/.installed  ## three rival models of a double well: tables and pictures in out/
+	$(IN)/python examples/double_well.py
+
+demo-quick: $(VENV)/.installed  ## the same with short chains, to see that it runs
+	$(IN)/python examples/double_well.py --quick
+
+test: $(VENV)/.installed  ## the tests, in two processes
+	$(IN)/python $(PYTEST)
+
+test-slow: $(VENV)/.installed  ## the statistical calibrations that `make test` leaves out
+	$(IN)/python $(PYTEST) -m slow
+
+test-latest: $(LATEST)/.exists  ## the tests with the newest release of every dependency
+	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[test]'
+	$(LATEST)/bin/python $(PYTEST)
+
+lint: $(VENV)/.installed  ## style, format, types, and who imports whom
+	$(IN)/ruff check .
+	$(IN)/ruff format --check .
+	$(IN)/mypy
+	$(IN)/lint-imports --no-cache
+
+docs: $(VENV)/.installed  ## the documentation, in docs/_build/html
+	$(IN)/python -m sphinx -W --keep-going --quiet -b html docs docs/_build/html
+
+bench: $(VENV)/.installed  ## timings, side by side
+	$(IN)/python benchmarks/foundation.py
+
+lock: $(LATEST)/.exists  ## resolve anew; PYTHON=python3.12, so that the versions suit every Python
+	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]' hatchling editables
+	sed '/^[^#]/,$$d' requirements.lock > $(LATEST)/lock
+	$(LATEST)/bin/pip freeze --exclude-editable >> $(LATEST)/lock
+	mv $(LATEST)/lock requirements.lock
+
+clean:  ## remove what the commands made, the environments excepted
+	rm -rf out docs/_build .cache .pytest_cache .mypy_cache .ruff_cache
+
+# The environment is made once and brought up to date when the lock or the metadata change.
+$(VENV)/.installed: requirements.lock pyproject.toml
+	@$(if $(PYTHON),,$(NO_PYTHON))
+	$(PYTHON) -m venv $(VENV)
+	$(IN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(IN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+$(LATEST)/.exists:
+	@$(if $(PYTHON),,$(NO_PYTHON))
+	$(PYTHON) -m venv $(LATEST)
+	touch $@
