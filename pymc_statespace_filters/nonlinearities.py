@@ -4,7 +4,7 @@ The three forces are sums of one shape, the ramp ``max(z, 0)``. With `width` its
 polynomial bend, and every force that is built of ramps is smooth in the displacement.
 """
 
-from numbers import Real
+from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
@@ -16,10 +16,11 @@ from pymc_statespace_filters.errors import ModelError
 
 __all__ = ["cubic", "freeplay", "hysteresis"]
 
-type Value = TensorVariable | ArrayLike
+type Tensorlike = TensorVariable | ArrayLike
+type Coefficient = TensorVariable | np.ndarray | float
 
 
-def cubic(z: Value, k_l: Value, k_nl: Value) -> TensorVariable:
+def cubic(z: Tensorlike, k_l: Coefficient, k_nl: Coefficient) -> TensorVariable:
     """Force of a spring with linear and cubic stiffness.
 
     .. math:: f_c = k_l z + k_{nl} z^3
@@ -52,7 +53,9 @@ def cubic(z: Value, k_l: Value, k_nl: Value) -> TensorVariable:
     return k_l * z + k_nl * z**3
 
 
-def freeplay(z: Value, k_f: Value, delta_f: Value, *, width: float | None = None) -> TensorVariable:
+def freeplay(
+    z: Tensorlike, k_f: Coefficient, delta_f: Coefficient, *, width: float | None = None
+) -> TensorVariable:
     r"""Force of a spring with a gap, such as a worn hinge or a loose rivet.
 
     .. math::
@@ -100,7 +103,13 @@ def freeplay(z: Value, k_f: Value, delta_f: Value, *, width: float | None = None
 
 
 def hysteresis(
-    z: Value, v: Value, k_h: Value, a_h: Value, delta_h: Value, *, width: float | None = None
+    z: Tensorlike,
+    v: Tensorlike,
+    k_h: Coefficient,
+    a_h: Coefficient,
+    delta_h: Coefficient,
+    *,
+    width: float | None = None,
 ) -> TensorVariable:
     r"""Force that takes one branch on the way up and another on the way down.
 
@@ -178,12 +187,12 @@ def _ramp(z: TensorVariable, width: float | None) -> TensorVariable:
     return pt.switch(s <= 0, 0.0, pt.switch(s >= 1, z, bend))
 
 
-def _real(value: Value) -> TensorVariable:
+def _real(value: Tensorlike) -> TensorVariable:
     """Make a symbolic value of PyTensor's floating type: small integers overflow in a power."""
     return pt.cast(pt.as_tensor_variable(value), config.floatX)
 
 
-def _checked(width: float | None) -> float | None:
-    if width is None or (isinstance(width, Real) and 0 < width < np.inf):
+def _checked(width: Any) -> float | None:
+    if width is None or (isinstance(width, int | float) and 0 < width < np.inf):
         return width
     raise ModelError(f"width must be a positive, finite number or None; got {width!r}")

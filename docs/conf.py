@@ -1,0 +1,21 @@
+"""Sphinx settings."""
+
+from importlib.metadata import version as installed_version
+
+project = "pymc-statespace-filters"
+author = "The pymc-statespace-filters developers"
+release = version = installed_version(project)
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "numpydoc"]
+myst_enable_extensions = ["dollarmath"]
+exclude_patterns = ["_build"]
+
+# The reference is the list of public names in __init__.py, in its order.
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # shapes and types are told in the docstrings
+numpydoc_show_class_members = False
+
+html_theme = "pydata_sphinx_theme"
+html_title = "pymc-statespace-filters"
+html_theme_options = {"show_prev_next": False}
+html_sidebars = {"**": []}

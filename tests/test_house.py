@@ -1,0 +1,94 @@
+"""What the project promises about itself rather than about numbers."""
+
+import inspect
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import pymc_statespace_filters as psf
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def locked_versions():
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    pins = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(pin.name): str(pin.specifier) for pin in pins}
+
+
+def test_lock_holds_exact_versions():
+    assert all(specifier.startswith("==") for specifier in locked_versions().values())
+
+
+def test_lock_holds_every_dependency_within_its_bounds():
+    extras = PROJECT["optional-dependencies"].values()
+    lines = PROJECT["dependencies"] + [line for extra in extras for line in extra]
+    wanted = [Requirement(line) for line in lines if not line.startswith(PROJECT["name"])]
+    locked = locked_versions()
+    for requirement in wanted:
+        version = locked[canonicalize_name(requirement.name)].removeprefix("==")
+        assert version in requirement.specifier, f"{requirement}, locked at {version}"
+
+
+def test_importing_is_silent_and_leaves_mpi_alone():
+    script = "import sys, pymc_statespace_filters; sys.exit('mpi4py' in sys.modules)"
+    command = [sys.executable, "-W", "error", "-c", script]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("name", psf.__all__)
+def test_every_public_name_is_documented_with_an_example(name):
+    value = getattr(psf, name)
+    if isinstance(value, type) and issubclass(value, Exception):
+        assert inspect.getdoc(value)
+    else:
+        assert "Examples\n-------" in inspect.getdoc(value)
+
+
+@pytest.fixture
+def make(tmp_path):
+    """Dry-run `make test` where only the given interpreters fit, out of python3 and python3.13."""
+    program = shutil.which("make")
+    if program is None:
+        pytest.skip("make is not installed")
+
+    def run(*fitting):
+        for name in ("python3", "python3.13"):
+            script = f'exec "{sys.executable}" "$@"' if name in fitting else "exit 1"
+            (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
+            (tmp_path / name).chmod(0o755)
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")}
+        return subprocess.run(
+            [program, f"VENV={tmp_path}/venv", f"{tmp_path}/venv/.installed"],
+            cwd=ROOT,
+            env=environment | {"PATH": str(tmp_path), "MAKEFLAGS": "n" if fitting else ""},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    return run
+
+
+def test_make_takes_python3_if_it_fits(make):
+    assert "\npython3 -m venv" in "\n" + make("python3", "python3.13").stdout
+
+
+def test_make_takes_another_python_if_python3_does_not_fit(make):
+    assert "\npython3.13 -m venv" in "\n" + make("python3.13").stdout
+
+
+def test_make_says_what_is_missing_if_no_python_fits(make):
+    done = make()
+    assert done.returncode != 0
+    assert "Python 3.12, 3.13 or 3.14" in done.stdout
+    assert "venv" in done.stdout
