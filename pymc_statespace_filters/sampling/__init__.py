@@ -1,0 +1,5 @@
+"""Samplers: they know a model's log-density and its noise seeds, and no filter."""
+
+from pymc_statespace_filters.sampling.step import DRAM
+
+__all__ = ["DRAM"]

@@ -1,0 +1,88 @@
+"""What a chain knows of its own health, and what it says when it ends."""
+
+from typing import NamedTuple
+
+from pymc.stats.convergence import SamplerWarning, WarningType
+
+from pymc_statespace_filters.distribution import FAILURES
+from pymc_statespace_filters.sampling.log_density import NOT_A_NUMBER
+
+# Share of evaluations after warm-up that may fail in silence: a chain that brushes the edge of the
+# region where its filter works is normal.
+TOLERATED_FAILURES = 0.01
+
+
+class Record(NamedTuple):
+    """Counts of a chain in its present phase, warm-up or sampling.
+
+    Attributes
+    ----------
+    iterations, moved : int
+        Iterations, and how many accepted a proposal.
+    evaluations : int
+        Evaluations of the model.
+    failures : tuple of (int, int)
+        Pairs of a failure's code and its count.
+    """
+
+    iterations: int = 0
+    moved: int = 0
+    evaluations: int = 0
+    failures: tuple[tuple[int, int], ...] = ()
+
+    def include(self, moved: bool, codes: tuple[int, ...]) -> "Record":
+        """Take in an iteration: whether it moved, and each evaluation's failure code (0: none)."""
+        failures = self.failures
+        if any(codes):
+            counts = dict(failures)
+            for code in filter(None, codes):
+                counts[code] = counts.get(code, 0) + 1
+            failures = tuple(counts.items())
+        return Record(
+            self.iterations + 1, self.moved + moved, self.evaluations + len(codes), failures
+        )
+
+    @property
+    def accept_rate(self) -> float:
+        """Share of the iterations that moved."""
+        return self.moved / self.iterations if self.iterations else 0.0
+
+
+def reason(code: int) -> str:
+    """Put a failure's code in words."""
+    if code == NOT_A_NUMBER:
+        return "the log-density is NaN or plus infinity"
+    return FAILURES.get(code, f"failure {code}")
+
+
+def closing_warning(record: Record) -> SamplerWarning | None:
+    """Say what went wrong after warm-up, if anything did.
+
+    Parameters
+    ----------
+    record : Record
+        Of the iterations after warm-up, all of them.
+
+    Returns
+    -------
+    pymc.stats.convergence.SamplerWarning or None
+        PyMC logs it in the main process, in whichever process the chain ran.
+    """
+    if record.moved == 0:
+        return _warning(
+            f"DRAM accepted none of {record.iterations} proposals after warm-up: the chain stands "
+            "still. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
+            "likelihood is noisy, give its filter more particles."
+        )
+    n_failed = sum(count for _, count in record.failures)
+    if n_failed > TOLERATED_FAILURES * record.evaluations:
+        counted = "; ".join(f"{reason(code)} ({count})" for code, count in record.failures)
+        return _warning(
+            f"{n_failed} of {record.evaluations} evaluations after warm-up failed and counted as "
+            f"impossible: {counted}. If the posterior reaches into that region it is cut off there."
+        )
+    return None
+
+
+def _warning(message: str) -> SamplerWarning:
+    return SamplerWarning(WarningType.BAD_ACCEPTANCE, message, "warn")

@@ -1,0 +1,108 @@
+"""A PyMC model's log-density as one call of machine code.
+
+The value variables that a sampler moves are joined into one vector; the variables that it does not
+move and the noise seeds of estimated likelihoods are arguments beside it. The health of the filters
+comes out of the same call, so that a failure has a reason and costs no second evaluation.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from pymc.model import Model
+from pymc.pytensorf import compile as compile_pymc
+from pymc.pytensorf import join_nonshared_inputs
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.distribution import health_outputs
+
+# Reason of a failure that no filter reports.
+NOT_A_NUMBER = -1
+
+
+class LogDensity:
+    """Log-density of a model on its unconstrained space, seeds explicit.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    held : sequence of TensorVariable
+        Continuous value variables that become one vector, in this order.
+    point : mapping of str to ndarray
+        Any point of the model; only shapes are read.
+    seeds : mapping of str to shared variable
+        The noise seeds, by the name of their StateSpace variable.
+    compile_kwargs : dict, optional
+        Passed to PyMC's compiler.
+
+    Attributes
+    ----------
+    others : tuple of str
+        Names of the value variables that are not in the vector, in the order of the arguments.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        held: Sequence[TensorVariable],
+        point: Mapping[str, np.ndarray],
+        seeds: Mapping[str, TensorVariable],
+        compile_kwargs: dict | None = None,
+    ):
+        not_held = [v for v in model.value_vars if v not in held]
+        self.others = tuple(v.name for v in not_held)
+        seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
+        logp = model.logp()
+        outputs, joined = join_nonshared_inputs(
+            point, [logp, *health_outputs([logp])], held, shared_inputs=seed_inputs
+        )
+        inputs = [joined, *not_held, *seed_inputs.values()]
+        self._n_inputs = len(inputs)
+        self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
+        self._function.trust_input = True
+        self._call = None
+
+    def __getstate__(self) -> dict:
+        """Leave the machine code behind: another process takes its own."""
+        return self.__dict__ | {"_call": None}
+
+    def prepare(self) -> None:
+        """Take hold of the machine code and of the data as they are now."""
+        function = self._function
+        if not hasattr(function.vm, "jit_fn"):
+            self._call = function  # a mode without numba
+            return
+        machine_code = function.vm.jit_fn
+        data = [cell.storage[0] for cell in function.input_storage[self._n_inputs :]]
+        self._call = (lambda *args: machine_code(*args, *data)) if data else machine_code
+
+    def __call__(
+        self, position: np.ndarray, others: Sequence[np.ndarray], seeds: Sequence[np.ndarray]
+    ) -> tuple[float, int]:
+        """Evaluate once.
+
+        Parameters
+        ----------
+        position : ndarray, shape (d,)
+            The joined vector.
+        others : sequence of ndarray
+            Values of the variables named in ``others``.
+        seeds : sequence of ndarray of int64, shape ()
+            One for each noise seed.
+
+        Returns
+        -------
+        log_density : float
+            Never NaN nor plus infinity; a failed evaluation is minus infinity.
+        failure : int
+            0, or the code of the reason: a key of ``distribution.FAILURES``, or ``NOT_A_NUMBER``.
+        """
+        if self._call is None:
+            self.prepare()
+        value, *healths = self._call(position, *others, *seeds)
+        log_density = float(value)
+        for health in healths:
+            if health[1] != 0.0:
+                return -np.inf, int(health[1])
+        if not log_density < np.inf:
+            return -np.inf, NOT_A_NUMBER
+        return log_density, 0
