@@ -72,7 +72,7 @@ class Moments(NamedTuple):
 
     Attributes
     ----------
-    count, moved, first : float
+    n, moved, first : float
         Iterations; how many moved; and how many of these by the first stage.
     mean : ndarray, shape (d,)
         Mean of the positions.
@@ -80,7 +80,7 @@ class Moments(NamedTuple):
         Sum of the outer products of the deviations from the mean.
     """
 
-    count: float
+    n: float
     moved: float
     first: float
     mean: np.ndarray
@@ -157,7 +157,7 @@ def adapt_by_blocks(
     block = _include(state.block, position, stage)
     if _has_stalled(settings, state.n_blocks, block):
         return _stalled(state)
-    if block.count < settings.adapt_every:
+    if block.n < settings.adapt_every:
         return _with_block(state, block)
     state = _close_block(state, block)
     return _learn(state, _merge(state.older, state.recent))
@@ -174,7 +174,7 @@ def adapt_continuously(
     block = _include(state.block, position, stage)
     if _has_stalled(settings, state.n_blocks, block):
         return _stalled(state)
-    if block.count < settings.adapt_every:
+    if block.n < settings.adapt_every:
         state = _with_block(state, block)
         if state.n_blocks == 0:
             return state
@@ -202,23 +202,23 @@ def _include(moments: Moments, position: np.ndarray, stage: int) -> Moments:
 def _merge(a: Moments, b: Moments) -> Moments:
     """Moments of two pieces together (Chan, Golub and LeVeque)."""
     dim = a.mean.size
-    count = max(1.0, a.count + b.count)
+    n = max(1.0, a.n + b.n)
     mean, scatter = np.empty(dim), np.empty((dim, dim))
     for i in range(dim):
         apart = b.mean[i] - a.mean[i]
-        mean[i] = a.mean[i] + apart * b.count / count
+        mean[i] = a.mean[i] + apart * b.n / n
         for j in range(dim):
-            between = apart * (b.mean[j] - a.mean[j]) * a.count * b.count / count
+            between = apart * (b.mean[j] - a.mean[j]) * a.n * b.n / n
             scatter[i, j] = a.scatter[i, j] + b.scatter[i, j] + between
-    return Moments(a.count + b.count, a.moved + b.moved, a.first + b.first, mean, scatter)
+    return Moments(a.n + b.n, a.moved + b.moved, a.first + b.first, mean, scatter)
 
 
 @njit(cache=True, error_model="numpy")
 def _has_stalled(settings: AdaptationSettings, n_blocks: int, block: Moments) -> bool:
-    if n_blocks == 0 and block.moved == 0.0 and 4 * block.count >= settings.adapt_every:
+    if n_blocks == 0 and block.moved == 0.0 and 4 * block.n >= settings.adapt_every:
         return True
-    full = block.count >= settings.adapt_every
-    return full and block.moved < LEAST_MOVED * block.count
+    full = block.n >= settings.adapt_every
+    return full and block.moved < LEAST_MOVED * block.n
 
 
 @njit(cache=True, error_model="numpy")
@@ -242,9 +242,9 @@ def _with_block(state: AdaptationState, block: Moments) -> AdaptationState:
 def _close_block(state: AdaptationState, block: Moments) -> AdaptationState:
     """File a complete block and let its acceptance move the scale."""
     cov, chol, _, scale, n_blocks, _, recent, older = state
-    if block.first < LOW_ACCEPTANCE * block.count:
+    if block.first < LOW_ACCEPTANCE * block.n:
         scale *= SHRINK
-    elif block.first > FAIR_ACCEPTANCE * block.count:
+    elif block.first > FAIR_ACCEPTANCE * block.n:
         scale = 1.0
     n_blocks += 1
     none = _no_moments(cov.shape[0])
@@ -260,7 +260,7 @@ def _learn(state: AdaptationState, moments: Moments) -> AdaptationState:
     _, _, base, scale, n_blocks, block, recent, older = state
     dim = base.shape[0]
     weight = moments.moved / (moments.moved + PRIOR_MOVES * dim)
-    learnt = weight * (2.38 * scale) ** 2 / (dim * moments.count)
+    learnt = weight * (2.38 * scale) ** 2 / (dim * moments.n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):
         for j in range(i + 1):

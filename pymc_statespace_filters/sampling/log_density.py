@@ -5,7 +5,7 @@ move and the noise seeds of estimated likelihoods are arguments beside it. The h
 comes out of the same call, so that a failure has a reason and costs no second evaluation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from pymc.model import Model
@@ -59,21 +59,25 @@ class LogDensity:
         self._n_inputs = len(inputs)
         self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
-        self._call = None
+        self._call: Callable[..., Sequence[np.ndarray]] | None = None
 
     def __getstate__(self) -> dict:
         """Leave the machine code behind: another process takes its own."""
         return self.__dict__ | {"_call": None}
 
-    def prepare(self) -> None:
+    def prepare(self) -> Callable[..., Sequence[np.ndarray]]:
         """Take hold of the machine code and of the data as they are now."""
         function = self._function
-        if not hasattr(function.vm, "jit_fn"):
-            self._call = function  # a mode without numba
-            return
-        machine_code = function.vm.jit_fn
-        data = [cell.storage[0] for cell in function.input_storage[self._n_inputs :]]
-        self._call = (lambda *args: machine_code(*args, *data)) if data else machine_code
+        call = function
+        if hasattr(function.vm, "jit_fn"):  # else it is a mode without numba
+            machine_code = function.vm.jit_fn
+            data = [cell.storage[0] for cell in function.input_storage[self._n_inputs :]]
+
+            def call(*args: np.ndarray) -> Sequence[np.ndarray]:
+                return machine_code(*args, *data)
+
+        self._call = call
+        return call
 
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: Sequence[np.ndarray]
@@ -96,9 +100,8 @@ class LogDensity:
         failure : int
             0, or the code of the reason: a key of ``distribution.FAILURES``, or ``NOT_A_NUMBER``.
         """
-        if self._call is None:
-            self.prepare()
-        value, *healths = self._call(position, *others, *seeds)
+        call = self._call or self.prepare()
+        value, *healths = call(position, *others, *seeds)
         log_density = float(value)
         for health in healths:
             if health[1] != 0.0:

@@ -46,7 +46,6 @@ class DRAMSettings:
     refresh_noise: bool
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "stages", _stage_pair(self.stages))
         scale = self.stage_scale
         if not _is_real(scale) or not 0.0 < scale < math.inf:
             raise ModelError(f"stage_scale={scale!r}: expected a positive number")
@@ -105,11 +104,14 @@ def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
     return 0.5 * (cov + cov.T)
 
 
-def _is_symmetric(cov: np.ndarray) -> bool:
-    return np.allclose(cov, cov.T, rtol=1e-8, atol=1e-12 * np.abs(cov).max(initial=0.0))
+def stage_pair(stages: object) -> tuple[int, int]:
+    """Turn an int, or a pair, into the stages while tuning and afterwards.
 
-
-def _stage_pair(stages: object) -> tuple[int, int]:
+    Raises
+    ------
+    ModelError
+        If it is neither, or a number is below 1.
+    """
     pair = (stages, stages) if _is_count(stages) else stages
     if (
         not isinstance(pair, tuple | list)
@@ -121,6 +123,10 @@ def _stage_pair(stages: object) -> tuple[int, int]:
             "(while tuning, afterwards)"
         )
     return int(pair[0]), int(pair[1])
+
+
+def _is_symmetric(cov: np.ndarray) -> bool:
+    return np.allclose(cov, cov.T, rtol=1e-8, atol=1e-12 * np.abs(cov).max(initial=0.0))
 
 
 def _is_count(value: object) -> bool:

@@ -5,7 +5,7 @@ find. Draws from the prior, on the unconstrained space, disperse the starts; the
 the one thing known about the units of the variables before a chain has moved.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from pymc.initial_point import make_initial_point_fn
@@ -19,22 +19,59 @@ from pymc_statespace_filters.sampling.transition import EvaluatedPoint
 N_DRAWS = 200
 
 
-def prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
-    """Draw from the prior, on the unconstrained space.
+class Starts:
+    """The prior's draws, and whether a start has been chosen by the user.
 
-    The seed is fixed, so that the table belongs to the model; a chain's own generator picks from
-    it. Where a prior cannot be drawn from (it is flat), the draws are the model's starting point
-    plus U(-1, 1), as under PyMC's NUTS.
+    PyMC does not hand ``initvals`` to a step method; a start that differs from the model's own
+    starting point, or an ``initval`` in the model, gives the choice away. (Somebody who passes
+    exactly the model's starting point is not recognised.)
 
     Parameters
     ----------
     model : pymc.Model
     held : HeldVariables
+    default : mapping of str to ndarray
+        The model's own starting point.
+    """
 
-    Returns
-    -------
-    ndarray, shape (n, d)
-        Finite rows; there may be fewer than were tried, even none.
+    def __init__(self, model: Model, held: HeldVariables, default: Mapping[str, np.ndarray]):
+        held_rvs = [model.values_to_rvs[v] for v in held.variables]
+        self._in_model = any(model.rvs_to_initial_values[rv] is not None for rv in held_rvs)
+        self._default = held.join(default)
+        self._draws = _prior_draws(model, held)
+
+    def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+        """List where a chain may start: draws from the prior before the point it was told.
+
+        Parameters
+        ----------
+        start : ndarray, shape (d,)
+            Where the chain was told to start.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        list of ndarray, shape (d,)
+            Only ``start`` itself if the user chose it.
+        """
+        if self._in_model or not np.array_equal(start, self._default):
+            return [start]
+        return [*rng.permutation(self._draws), start]
+
+    def covariance(self) -> np.ndarray:
+        """Guess a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
+        dim = self._default.size
+        variance = self._draws.var(axis=0) if len(self._draws) > 1 else np.ones(dim)
+        variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
+        return np.diag(variance) * 2.38**2 / dim
+
+
+def _prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
+    """Draw from the prior, on the unconstrained space: finite rows, shape (n, d).
+
+    The seed is fixed, so that the table belongs to the model; a chain's own generator picks from
+    it. Where a prior cannot be drawn from (it is flat), the draws are the model's starting point
+    plus U(-1, 1), as under PyMC's NUTS.
     """
     free = list(model.free_RVs)
     from_prior = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
@@ -45,32 +82,6 @@ def prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
         points = [jittered(seed) for seed in range(N_DRAWS)]
     table = np.array([held.join(point) for point in points])
     return table[np.isfinite(table).all(axis=1)]
-
-
-def first_covariance(draws: np.ndarray, dim: int) -> np.ndarray:
-    """Guess the first proposal covariance: the prior's standard deviations, scaled for d.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (n, d)
-        From ``prior_draws``.
-    dim : int
-        d.
-
-    Returns
-    -------
-    ndarray, shape (d, d)
-        Diagonal.
-    """
-    variance = draws.var(axis=0) if len(draws) > 1 else np.ones(dim)
-    variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
-    return np.diag(variance) * 2.38**2 / dim
-
-
-def starts_in_model(model: Model, held: HeldVariables) -> bool:
-    """Tell whether the model itself gives a held variable a starting value (``initval``)."""
-    held_rvs = [model.values_to_rvs[v] for v in held.variables]
-    return any(model.rvs_to_initial_values[rv] is not None for rv in held_rvs)
 
 
 def first_possible(

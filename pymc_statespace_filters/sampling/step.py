@@ -24,13 +24,8 @@ from pymc_statespace_filters.sampling.held_variables import (
 )
 from pymc_statespace_filters.sampling.log_density import LogDensity
 from pymc_statespace_filters.sampling.randomness import Batch, draw_seeds, take
-from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov
-from pymc_statespace_filters.sampling.starts import (
-    first_covariance,
-    first_possible,
-    prior_draws,
-    starts_in_model,
-)
+from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov, stage_pair
+from pymc_statespace_filters.sampling.starts import Starts, first_possible
 from pymc_statespace_filters.sampling.transition import EvaluatedPoint, Move, delayed_rejection_move
 
 
@@ -83,7 +78,7 @@ class DRAM(BlockedStep):
     model : pymc.Model, optional
         Default: the model of the ``with`` block.
     initial_point, compile_kwargs, rng, blocked
-        As PyMC passes them to any step method.
+        What PyMC passes to any step method; the first is not used.
 
     Raises
     ------
@@ -96,10 +91,8 @@ class DRAM(BlockedStep):
     -----
     PyMC starts all chains of a step method at one point. The first iteration of warm-up moves each
     to a draw from the prior at which the log-density is finite (under a flat prior, to the model's
-    starting point plus U(-1, 1)), unless ``tune=0`` or starting values were given.
-
-    Where another step method has changed a variable of the model, the current point is evaluated
-    once more, with the seeds it has.
+    starting point plus U(-1, 1)), unless ``tune=0`` or starting values were given. Where another
+    step method has moved, the current point is evaluated again, with its own seeds.
 
     ``sample_stats`` holds for each draw
 
@@ -116,9 +109,8 @@ class DRAM(BlockedStep):
         covariance of the first stage's proposals, shape (d, d); and the geometric mean of its
         standard deviations
     ``n_evaluations``, ``n_failed``, ``failure``
-        evaluations of the model; how many of them failed (the point then counts as impossible);
-        the code of the last failure's reason, a key of ``distribution.FAILURES``, or -1 for a
-        log-density that is NaN or plus infinity
+        evaluations of the model; how many failed, so that the point counts as impossible; and the
+        last one's reason, a key of ``distribution.FAILURES`` or -1: NaN or plus infinity
 
     A chain that stood still after warm-up, or whose evaluations often failed, says so when it ends,
     through PyMC's logger.
@@ -150,6 +142,16 @@ class DRAM(BlockedStep):
     _progressbar_config = staticmethod(progress.columns)
     _make_progressbar_update_functions = staticmethod(progress.update_functions)
 
+    # Of the chain now running, as in DRAMState.
+    _current: EvaluatedPoint | None
+    _adaptation: AdaptationState
+    _batch: Batch | None
+    _record: Record
+    _n_draws: int
+    _disperse: bool
+    # The dictionary last returned: if it comes back, nothing has changed since.
+    _point: dict[str, np.ndarray] | None
+
     def __init__(
         self,
         vars: Sequence[TensorVariable] | None = None,
@@ -167,7 +169,9 @@ class DRAM(BlockedStep):
         blocked: bool = True,
     ):
         model = modelcontext(model)
-        self.settings = DRAMSettings(stages, stage_scale, adaptation, adapt_every, refresh_noise)
+        self.settings = DRAMSettings(
+            stage_pair(stages), stage_scale, adaptation, adapt_every, refresh_noise
+        )
         self.vars = continuous_value_vars(vars, model)
         self.blocked = blocked
         self.rng = get_random_generator(rng)
@@ -175,16 +179,14 @@ class DRAM(BlockedStep):
         seeds = noise_seeds(model)
         check_noise_is_held(model, self.vars, seeds)
         self._seed_names = tuple(f"{name}_seed" for name in seeds)
-        self._held_seeds = tuple(np.array(s.get_value(), dtype=np.int64) for s in seeds.values())
+        self._seed_variables = tuple(seeds.values())
         default = model.initial_point(random_seed=0)
         self._log_density = LogDensity(model, self.vars, default, seeds, compile_kwargs)
         self._held = HeldVariables(self.vars, default)
-        self._default_start = self._held.join(default)
-        self._start_is_given = starts_in_model(model, self._held)
-        self._starts = prior_draws(model, self._held)
+        self._starts = Starts(model, self._held, default)
         dim = self._held.dim
         if proposal_cov is None:
-            self._first_cov = first_covariance(self._starts, dim)
+            self._first_cov = self._starts.covariance()
         else:
             self._first_cov = checked_proposal_cov(proposal_cov, dim)
         self.stats_dtypes = [statistics.dtypes(dim, self._seed_names)]
@@ -219,21 +221,23 @@ class DRAM(BlockedStep):
             warning=closing_warning(self._record) if is_last else None,
         )
         if self.tune:
-            self._adapt(move)
+            self._adaptation = self.settings.adapt(
+                self.settings.adaptation_settings, self._adaptation, move.point.position, move.stage
+            )
         if move.stage > 0 or self._point is None:
             self._point = point | self._held.split(move.point.position)
         return self._point, [stats]
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0
-        self._current: EvaluatedPoint | None = None
-        # The dictionary last returned: if it comes back, nothing has changed since.
-        self._point: dict[str, np.ndarray] | None = None
+        self._current = None
+        self._point = None
         self._adaptation = start_adaptation(self._first_cov)
-        self._batch: Batch | None = None
+        self._batch = None
         self._record = Record()
         self._n_draws = draws
-        self._disperse = tune > 0 and not self._start_is_given
+        self._held_seeds = tuple(np.array(s.get_value()) for s in self._seed_variables)
+        self._disperse = tune > 0
 
     def _stand_at(self, point: dict[str, np.ndarray]) -> tuple[EvaluatedPoint, tuple[int, ...]]:
         """Give the current point with its estimate, and the failure codes of what that took."""
@@ -255,9 +259,7 @@ class DRAM(BlockedStep):
         self, position: np.ndarray, others: tuple[np.ndarray, ...]
     ) -> tuple[EvaluatedPoint, tuple[int, ...]]:
         """Evaluate a first point, dispersed unless somebody chose it."""
-        candidates = [position]
-        if self._disperse and np.array_equal(position, self._default_start):
-            candidates = [*self.rng.permutation(self._starts), position]
+        candidates = self._starts.candidates(position, self.rng) if self._disperse else [position]
         self._disperse = False
 
         def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
@@ -295,10 +297,4 @@ class DRAM(BlockedStep):
             share.normals,
             share.log_uniforms,
             [self._noise(seeds) for seeds in share.seeds[:n_stages]],
-        )
-
-    def _adapt(self, move: Move) -> None:
-        settings = self.settings
-        self._adaptation = settings.adapt(
-            settings.adaptation_settings, self._adaptation, move.point.position, move.stage
         )

@@ -76,7 +76,7 @@ def test_blocks_use_the_later_part(n_blocks, first_used):
     learnt = 2.38**2 / 2 * np.cov(used.T, bias=True)
     # The blend with the covariance in use before weighs at most 0.4 / 100.
     np.testing.assert_allclose(state.cov, learnt, rtol=0.01)
-    assert state.older.count + state.recent.count == len(used)
+    assert state.older.n + state.recent.n == len(used)
 
 
 def test_blocks_change_nothing_between_their_ends():

@@ -98,8 +98,12 @@ def test_every_proposal_has_noise_of_its_own(toy):
 def test_held_noise_is_the_models(toy):
     """Common random numbers: one seed for all; the noise of this toy then cancels."""
     with toy(noise_sd=1.3):
-        idata = sample(DRAM(refresh_noise=False), draws=8000)
+        step = DRAM(refresh_noise=False)
+        idata = sample(step, draws=8000)
+        step._seed_variables[0].set_value(np.array(21))
+        again = sample(step, draws=10)
     assert np.all(idata["sample_stats"]["d_seed"] == 20)
+    assert np.all(again["sample_stats"]["d_seed"] == 21)
     assert max(map(abs, deviations(idata))) < 4.0
 
 
