@@ -1,0 +1,377 @@
+"""Data from a state-space system as a PyMC random variable."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from pymc.distributions.distribution import Continuous
+from pymc.logprob.abstract import _logprob
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
+from pytensor.link.numba.dispatch.basic import numba_njit
+from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters import FAILURES, Filter
+from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.ops import LogLikelihood
+from pymc_statespace_filters.parameters import check_names, missing_parameters
+from pymc_statespace_filters.records import (
+    check_inputs,
+    check_observed,
+    check_seed,
+    check_t0,
+    steps_of,
+)
+from pymc_statespace_filters.simulation import simulator
+
+__all__ = ["FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds"]
+
+
+class StateSpaceRV(RandomVariable):
+    """Draws a record (J, p): parameters theta, steps, inputs, t0 and the (unused) noise seed."""
+
+    name = "StateSpace"
+    signature = "(k),(j),(s,u),(),()->(j,p)"
+    dtype = "float64"
+    __props__ = (*RandomVariable.__props__, "system", "filter")
+    _print_name = ("StateSpace", "\\operatorname{StateSpace}")
+
+    def __init__(self, *, system: StateSpaceModel, filter: Filter, **settings: Any) -> None:
+        self.system = system
+        self.filter = filter
+        super().__init__(**settings)
+
+    def __str__(self) -> str:
+        return f"StateSpaceRV{{{self.filter}}}"
+
+    def _supp_shape_from_params(self, dist_params: Sequence, param_shapes: Any = None) -> list:
+        steps = dist_params[1].shape if param_shapes is None else param_shapes[1]
+        return [steps[-1], self.system.p]
+
+    def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
+        *params, size = arguments
+        theta, steps, inputs, t0, _ = params
+        cores = (1, 1, 2, 0, 0)
+        batch = np.broadcast_shapes(
+            *(np.shape(p)[: np.ndim(p) - n] for p, n in zip(params, cores, strict=True))
+        )
+        batch = batch if size is None else tuple(size)
+        theta, steps, inputs, t0 = (
+            np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
+            for p, n in zip((theta, steps, inputs, t0), cores, strict=False)
+        )
+        simulate = simulator(self.system).function
+        draws = np.empty((*batch, steps.shape[-1], self.system.p))
+        for i in np.ndindex(batch):
+            parts = [np.ascontiguousarray(a[i]) for a in (theta, steps, inputs)]
+            _, draws[i] = simulate(rng, *parts, float(t0[i]))
+        return draws
+
+
+@numba_core_rv_funcify.register(StateSpaceRV)
+def _numba_draw(op: StateSpaceRV, node: Any) -> tuple:
+    compiled = simulator(op.system)
+    simulate = compiled.function
+
+    @numba_njit
+    def draw(rng, theta, steps, inputs, t0, seed):
+        _, observations = simulate(
+            rng,
+            np.ascontiguousarray(theta),
+            np.ascontiguousarray(steps),
+            np.ascontiguousarray(inputs),
+            t0,
+        )
+        return observations
+
+    # PyTensor asks for a whole number here.
+    return draw, None if compiled.key is None else int(compiled.key[:15], 16)
+
+
+@_logprob.register(StateSpaceRV)
+def _log_density(
+    op: StateSpaceRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
+) -> TensorVariable:
+    """log p(d_j | d_1 .. d_{j-1}), one term per observation."""
+    (value,) = values
+    theta, steps, inputs, t0, seed = params
+    likelihood = LogLikelihood(op.system, op.filter)
+    arguments = (theta, steps, value, inputs, t0, seed)
+    cores = (1, 1, 2, 2, 0, 0)
+    batched = any(a.type.ndim > n for a, n in zip(arguments, cores, strict=True))
+    return (Blockwise(likelihood) if batched else likelihood)(*arguments)[0]
+
+
+class StateSpace(Continuous):
+    r"""A record of a state-space system, as a random variable of shape (J, p).
+
+    Its log-density is the log-likelihood by a filter, one term log p(d_j | d_1 .. d_{j-1}) per
+    observation; its draws are forward simulations. The terms are sequential: PSIS-LOO on them is
+    not leave-one-out.
+
+    Parameters
+    ----------
+    name : str
+        Name of the variable.
+    system : StateSpaceModel
+        The equations.
+    filter : EKF, EnKF, BootstrapPF or PFEnKF
+        How the likelihood is computed.
+    params : mapping, optional
+        Parameters by name, numbers or expressions. A parameter not named here is the variable of
+        that name in the PyMC model, else the default in the function's signature.
+    steps, times : array_like, shape (J,)
+        When observations were taken; give one of them. See `log_likelihood`.
+    observed : array_like, shape (J, p) or (J,), optional
+        The data. NaN means missing and is never imputed; a wholly missing row has the term 0.
+    inputs : array_like, shape (rows, n_inputs), optional
+        Row k holds during step k.
+    t0 : float
+        Time of step 0.
+    seed : int
+        The noise inside the filter, held by the model as data of the name ``{name}_seed``;
+        sampling does not change it.
+    dims : (str, str), optional
+        Names of the dimensions, ``({name}_time, observable)`` if not given.
+
+    Raises
+    ------
+    ModelError
+        If data, steps, inputs and system disagree, or a parameter has no value.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.6]], dt=0.01),
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.08]],
+    ...     initial_mean=[1.0],
+    ...     initial_cov=[[0.5]],
+    ... )
+    >>> with pm.Model() as model:
+    ...     a = pm.HalfNormal("a", 1)
+    ...     d = psf.StateSpace("d", system, psf.EKF(), steps=[0, 20, 40], observed=[1.1, 0.7, 0.9])
+    >>> model.named_vars_to_dims["d"]
+    ('d_time', 'observable')
+    """
+
+    rv_type = StateSpaceRV
+
+    def __new__(
+        cls,
+        name: str,
+        system: StateSpaceModel,
+        filter: Filter,
+        *,
+        params: Mapping[str, Any] | None = None,
+        steps: Any = None,
+        times: Any = None,
+        observed: Any = None,
+        inputs: Any = None,
+        t0: float = 0.0,
+        seed: int = 0,
+        dims: Sequence[str] | None = None,
+    ) -> TensorVariable:
+        """Add the variable, its coordinates and its seed to the model of the context."""
+        model = pm.modelcontext(None)
+        _check_kinds(system, filter)
+        t0 = check_t0(t0)
+        theta = _theta(system, dict(params or {}), model)
+        symbolic_steps, at = _steps(steps, times, system.dt, t0)
+        data = _observed(observed, system, at)
+        forces = inputs if isinstance(inputs, Variable) else check_inputs(inputs, system, at)
+        seed_array = check_seed("seed", seed)
+        if seed_array.ndim:
+            raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
+        time_dim, component_dim = _dims(name, dims)
+        full_name = model.name_for(name)
+        _add_coord(model, time_dim, t0 + at * system.dt, name)
+        _add_coord(model, component_dim, list(system.observables), name)
+        noise_seed = pm.Data(f"{full_name}_seed", seed_array) if filter.noisy else seed_array
+        return super().__new__(
+            cls,
+            name,
+            theta,
+            symbolic_steps,
+            forces,
+            t0,
+            noise_seed,
+            system=system,
+            filter=filter,
+            observed=data,
+            dims=(time_dim, component_dim),
+        )
+
+    @classmethod
+    def dist(cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any) -> Any:
+        """The variable outside a model; parameters are theta, steps, inputs, t0 and seed."""
+        types = (("float64", 1), ("int64", 1), ("float64", 2), ("float64", 0), ("int64", 0))
+        symbols = [
+            p if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype=dtype), ndim=ndim)
+            for p, (dtype, ndim) in zip(params, types, strict=True)
+        ]
+        return super().dist(symbols, system=system, filter=filter, **kwargs)
+
+    @classmethod
+    def rv_op(
+        cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any
+    ) -> TensorVariable:
+        """Apply the operation; called by PyMC."""
+        return StateSpaceRV(system=system, filter=filter)(*params, **kwargs)
+
+    def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:  # noqa: N805
+        """A finite record to start from, where the record itself is not observed."""
+        return pt.zeros_like(rv)
+
+
+def _check_kinds(system: Any, filter: Any) -> None:
+    if not isinstance(system, StateSpaceModel):
+        raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
+    if not isinstance(filter, Filter.__value__):
+        raise ModelError(
+            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
+        )
+    filter.check(system)
+
+
+def _theta(system: StateSpaceModel, params: dict[str, Any], model: pm.Model) -> TensorVariable:
+    check_names(system, params)
+    found: dict[str, Any] = dict(system.defaults)
+    for name in system.parameters:
+        if model.name_for(name) in model.named_vars:
+            found[name] = model[name]
+        elif name in model.named_vars:
+            found[name] = model.named_vars[name]
+    found |= params
+    if any(name not in found for name in system.parameters):
+        raise missing_parameters(system, found)
+    parts = []
+    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
+        value = found[name]
+        symbol = value if isinstance(value, Variable) else pt.as_tensor(_array(name, value))
+        same = symbol.type.ndim == len(shape) and all(
+            s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
+        )
+        if not same:
+            raise ModelError(
+                f"parameter {name!r} must have shape {shape}, got {symbol.type.shape}"
+                f"{'' if shape else ' (declare shapes={...} in the system for an array)'}"
+            )
+        parts.append(pt.cast(symbol, "float64").ravel())
+    theta = pt.concatenate(parts) if parts else pt.as_tensor(np.zeros(0))
+    return pt.specify_shape(theta, (system.n_theta,))
+
+
+def _array(name: str, value: Any) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype="float64")
+    except (TypeError, ValueError):
+        raise ModelError(f"parameter {name!r} must be numbers or a symbol, got {value!r}") from None
+    if np.isnan(array).any():
+        raise ModelError(f"parameter {name!r} must not be NaN, got {value!r}")
+    return array
+
+
+def _steps(steps: Any, times: Any, dt: float, t0: float) -> tuple[Any, np.ndarray]:
+    """The steps as given to the graph, and their present numbers."""
+    if isinstance(times, Variable):
+        raise ModelError("times cannot be symbolic; give steps=pm.Data(...) of step numbers")
+    if isinstance(steps, Variable):
+        if times is not None:
+            raise ModelError("give exactly one of steps and times")
+        return steps, steps_of(steps.eval(), None, dt, t0)
+    numbers = steps_of(steps, times, dt, t0)
+    return numbers, numbers
+
+
+def _observed(observed: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
+    """Data as a symbol: PyMC would mask and impute the NaN of an array."""
+    if observed is None:
+        return None
+    if isinstance(observed, Variable):
+        if observed.type.ndim != 2:
+            raise ModelError(
+                f"symbolic observed must have 2 dimensions (observations, observables), "
+                f"got {observed.type.ndim}"
+            )
+        return observed
+    return pt.as_tensor(check_observed(observed, system, steps.size))
+
+
+def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:
+    if dims is None:
+        return f"{name}_time", "observable"
+    if isinstance(dims, str) or len(dims) != 2 or not all(isinstance(d, str) for d in dims):
+        raise ModelError(f"dims must be two names, (time, observable), got {dims!r}")
+    return tuple(dims)
+
+
+def _add_coord(model: pm.Model, dim: str, values: Any, name: str) -> None:
+    if dim in model.coords and list(model.coords[dim]) != list(values):
+        raise ModelError(
+            f"the model has a dimension {dim!r} with other coordinates; "
+            f"give {name!r} its own names with dims=(..., ...)"
+        )
+    if dim not in model.coords:
+        model.add_coord(dim, values)
+
+
+# What samplers, evidence and diagnostics need to know of the variables in a model.
+
+
+def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
+    return {
+        rv.name: rv.owner
+        for rv in model.basic_RVs
+        if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
+    }
+
+
+def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
+    """The shared noise seed of every variable whose likelihood is a random estimate."""
+    seeds = {}
+    for name, node in _state_space_nodes(model).items():
+        if not node.op.filter.noisy:
+            continue
+        seed = node.inputs[-1]
+        if not isinstance(seed, SharedVariable):
+            raise ModelError(
+                f"the noise seed of {name!r} has been frozen into the model "
+                f"(freeze_dims_and_data); use the model as it was before freezing"
+            )
+        seeds[name] = seed
+    return seeds
+
+
+def noisy_parents(model: pm.Model) -> dict[str, list[Variable]]:
+    """For every noisily estimated variable, the free variables that it depends on."""
+    free = set(model.free_RVs)
+    return {
+        name: [v for v in ancestors([node.inputs[2]]) if v in free]
+        for name, node in _state_space_nodes(model).items()
+        if node.op.filter.noisy
+    }
+
+
+def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
+    """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
+    nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
+    return [
+        node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)
+    ]
+
+
+def exactness(model: pm.Model) -> bool:
+    """Whether sampling the model targets its posterior without a bias of a filter's noise."""
+    filters = [node.op.filter for node in _state_space_nodes(model).values()]
+    return all(not f.noisy or f.unbiased for f in filters)
+

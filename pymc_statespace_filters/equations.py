@@ -1,0 +1,176 @@
+"""Reading what a user wrote: the arguments of a function, and the symbols that it returns."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+
+RESERVED = {
+    "x": "the state",
+    "q": "the process noise",
+    "e": "the measurement noise",
+    "u": "the inputs",
+    "t": "the time",
+}
+
+
+@dataclass(frozen=True)
+class Equation:
+    """A function of the user and what its signature asks for."""
+
+    role: str
+    function: Callable
+    symbols: tuple[str, ...]
+    parameters: tuple[str, ...]
+    defaults: tuple[tuple[str, Any], ...]
+
+    def __call__(self, values: Mapping[str, Variable]) -> Any:
+        """Call the function with the symbols and parameters that it asks for, by name."""
+        arguments = {name: values[name] for name in (*self.symbols, *self.parameters)}
+        try:
+            return self.function(**arguments)
+        except ModelError:
+            raise
+        except Exception as error:
+            raise ModelError(
+                f"{self.role} could not be traced with symbolic arguments "
+                f"({', '.join(arguments)}): {type(error).__name__}: {error}. Write it with "
+                f"pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or `if`."
+            ) from error
+
+
+def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
+    """Check a user's function; ``symbols`` are the reserved names that it may ask for."""
+    if not callable(function):
+        raise ModelError(f"{role} must be a function, got {function!r}")
+    found: list[str] = []
+    parameters: list[str] = []
+    defaults: list[tuple[str, Any]] = []
+    for name, argument in inspect.signature(function).parameters.items():
+        if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
+            raise ModelError(f"{role}: argument {argument} is not a plain named argument")
+        if name in symbols:
+            found.append(name)
+        elif name in RESERVED:
+            raise ModelError(
+                f"{role}: the argument name {name!r} is reserved for {RESERVED[name]}, which "
+                f"{role} does not have (it may ask for: {', '.join(symbols) or 'parameters only'})"
+            )
+        else:
+            parameters.append(name)
+        if argument.default is not argument.empty:
+            if name in symbols:
+                raise ModelError(f"{role}: the reserved argument {name!r} takes no default")
+            defaults.append((name, _default(role, name, argument.default)))
+    return Equation(role, function, tuple(found), tuple(parameters), tuple(defaults))
+
+
+def _default(role: str, name: str, value: Any) -> Any:
+    try:
+        array = np.asarray(value, dtype="float64")
+    except (TypeError, ValueError):
+        raise ModelError(f"{role}: the default of {name!r} must be a number, got {value!r}") from None
+    # Nested tuples, because a system is hashable.
+    return float(array) if array.ndim == 0 else _nested_tuple(array.tolist())
+
+
+def _nested_tuple(value: Any) -> Any:
+    return tuple(map(_nested_tuple, value)) if isinstance(value, list) else value
+
+
+def as_symbol(role: str, value: Any) -> TensorVariable:
+    """A number, symbol, array or nested list of these as a double-precision symbol."""
+    if isinstance(value, list | tuple):
+        parts = [as_symbol(role, part) for part in value]
+        if not parts:
+            return pt.as_tensor(np.zeros(0))
+        if len({part.type.ndim for part in parts}) > 1:
+            raise ModelError(f"{role} returns a list whose entries differ in shape")
+        return pt.stack(parts) if all(p.type.ndim for p in parts) else _vector_of(parts)
+    if isinstance(value, Variable):
+        symbol = value if isinstance(value, TensorVariable) else pt.as_tensor(value)
+        if symbol.type.dtype.startswith("complex"):
+            raise ModelError(f"{role} returns complex numbers; states and observations are real")
+        return symbol if symbol.type.dtype == "float64" else pt.cast(symbol, "float64")
+    if value is None:
+        raise ModelError(f"{role} returns None; return one expression per component")
+    try:
+        # A 64-bit array: PyTensor would store a bare 0.5 in single precision.
+        return pt.as_tensor(np.asarray(value, dtype="float64"))
+    except (TypeError, ValueError):
+        raise ModelError(f"{role} returns {value!r}, which is neither symbol nor number") from None
+
+
+def _vector_of(parts: Sequence[TensorVariable]) -> TensorVariable:
+    return pt.stack(list(parts))
+
+
+def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariable:
+    """One expression per component; ``length`` None takes what comes."""
+    symbol = as_symbol(role, value)
+    if symbol.type.ndim != 1:
+        raise ModelError(
+            f"{role} must return one expression per component (a list or a vector), "
+            f"got {symbol.type.ndim} dimensions"
+        )
+    return _of_length(role, symbol, (length,))
+
+
+def as_matrix(
+    role: str, value: Any, rows: int | None = None, columns: int | None = None
+) -> TensorVariable:
+    symbol = as_symbol(role, value)
+    if symbol.type.ndim != 2:
+        raise ModelError(
+            f"{role} must be a matrix (nested lists or pt.stack of rows), "
+            f"got {symbol.type.ndim} dimensions"
+        )
+    return _of_length(role, symbol, (rows, columns))
+
+
+def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]) -> TensorVariable:
+    shape = symbol.type.shape
+    if None in shape:
+        if None in expected:
+            raise ModelError(f"{role}: the shape of what it returns is not known before it runs")
+        return pt.specify_shape(symbol, tuple(expected))
+    wanted = tuple(s if e is None else e for e, s in zip(expected, shape, strict=True))
+    if shape != wanted:
+        raise ModelError(f"{role} must have shape {wanted}, got {shape}")
+    return symbol
+
+
+def constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
+    """Check a covariance given as numbers."""
+    try:
+        matrix = np.array(value, dtype="float64")
+    except (TypeError, ValueError):
+        raise ModelError(f"{role} must be a matrix of numbers, got {value!r}") from None
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ModelError(f"{role} must be a square matrix, got shape {matrix.shape}")
+    if size is not None and matrix.shape[0] != size:
+        raise ModelError(f"{role} must have shape {(size, size)}, got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise ModelError(f"{role} must be finite, got {matrix.tolist()}")
+    scale = np.abs(matrix).max(initial=0.0)
+    if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-10 * scale:
+        raise ModelError(f"{role} must be symmetric, got {matrix.tolist()}")
+    smallest = np.linalg.eigvalsh(matrix).min(initial=np.inf)
+    if smallest < -1e-10 * scale:
+        raise ModelError(
+            f"{role} must not be negative: it has the eigenvalue {smallest:.6g} "
+            f"(it is a covariance, not a standard deviation: {matrix.tolist()})"
+        )
+    if definite and smallest <= 0:
+        raise ModelError(
+            f"{role} must be positive definite, its smallest eigenvalue is {smallest:.6g}: "
+            f"every observed component needs noise of its own ({matrix.tolist()})"
+        )
+    return matrix

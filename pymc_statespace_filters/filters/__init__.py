@@ -1,0 +1,17 @@
+"""The filters: frozen settings, one file each.
+
+A filter has the attributes ``noisy`` (its likelihood is an estimate that depends on a seed),
+``unbiased`` (the estimate has the right mean) and ``has_gradient``, and two methods:
+``check(system)`` raises if it cannot treat the system, ``compile(system)`` gives the machine code
+``(theta, steps, observed, inputs, t0, seed) -> (terms, health)``.
+"""
+
+from pymc_statespace_filters.filters._failures import FAILURES
+from pymc_statespace_filters.filters.bootstrap import BootstrapPF
+from pymc_statespace_filters.filters.ekf import EKF
+from pymc_statespace_filters.filters.enkf import EnKF
+from pymc_statespace_filters.filters.pf_enkf import PFEnKF
+
+type Filter = EKF | EnKF | BootstrapPF | PFEnKF
+
+__all__ = ["EKF", "FAILURES", "BootstrapPF", "EnKF", "Filter", "PFEnKF"]

@@ -1,0 +1,136 @@
+"""Log-likelihoods without PyMC: numbers in, numbers out."""
+
+import warnings
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.filters import FAILURES, Filter
+from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.ops import HEALTH_SIZE, LogLikelihood, evaluator
+from pymc_statespace_filters.parameters import flat_parameters
+from pymc_statespace_filters.records import (
+    check_inputs,
+    check_observed,
+    check_seed,
+    check_t0,
+    steps_of,
+)
+
+
+def log_likelihood(
+    system: StateSpaceModel,
+    filter: Filter,
+    params: Any,
+    observed: Any,
+    *,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    t0: float = 0.0,
+    seed: Any = 0,
+) -> np.ndarray:
+    """Evaluate the log-likelihood of a record, term by term.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+    filter : EKF, EnKF, BootstrapPF or PFEnKF
+    params : mapping
+        Parameter values by name; arrays broadcast to a shape S (a declared parameter's own shape
+        comes last).
+    observed : array_like, shape (J, p), or (J,) if p = 1
+        The record; NaN marks a missing component.
+    steps : array_like of int, shape (J,)
+        The step of each observation; 0 is where the initial state holds. Or give `times`.
+    times : array_like, shape (J,)
+        Times of the observations, on the grid ``t0 + k * dt`` to a millionth of a step.
+    inputs : array_like, shape (rows, n_inputs)
+        Row k holds during step k.
+    t0 : float
+        Time of step 0.
+    seed : int or array_like of int
+        The noise inside the filter; broadcasts with the parameters. Ignored by `EKF`.
+
+    Returns
+    -------
+    ndarray, shape S + (J,)
+        log p(d_j | d_1 .. d_{j-1}); their sum over j is the log-likelihood. A wholly missing row
+        has the term 0; from an observation at which the filter fails on, terms are -inf.
+
+    Warns
+    -----
+    FilterWarning
+        Once, if a filter failed or its particles collapsed.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> terms = psf.log_likelihood(system, psf.EKF(), {"a": 0.9}, [0.3, 1.2], steps=[0, 3])
+    >>> terms.shape
+    (2,)
+    """
+    filter.check(system)
+    t0 = check_t0(t0)
+    at = steps_of(steps, times, system.dt, t0)
+    data = check_observed(observed, system, at.size)
+    forces = check_inputs(inputs, system, at)
+    theta = flat_parameters(system, params)
+    seeds = check_seed("seed", seed)
+    try:
+        shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
+    except ValueError:
+        raise ModelError(
+            f"seed of shape {seeds.shape} does not broadcast with parameters "
+            f"of shape {theta.shape[:-1]}"
+        ) from None
+    theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
+    seeds = np.broadcast_to(seeds, shape)
+    evaluate = evaluator(LogLikelihood(system, filter))
+    terms = np.empty((*shape, at.size))
+    health = np.empty((*shape, HEALTH_SIZE))
+    origin = np.asarray(t0)
+    for index in np.ndindex(shape):
+        point = np.ascontiguousarray(theta[index])
+        terms[index], health[index] = evaluate(
+            point, at, data, forces, origin, np.asarray(seeds[index])
+        )
+    warn_of(filter, health.reshape(-1, HEALTH_SIZE))
+    return terms
+
+
+# Fewer effective particles than this and a single one decides the estimate.
+COLLAPSED = 3.0
+
+
+def warn_of(filter: Filter, health: np.ndarray) -> None:
+    """One warning for what went wrong in some evaluations, given their health (n, 3)."""
+    failed = health[:, 1] != 0
+    if failed.any():
+        reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
+        listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
+        warnings.warn(
+            f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
+            FilterWarning,
+            stacklevel=3,
+        )
+    collapsed = ~failed & (health[:, 0] < COLLAPSED)
+    if collapsed.any():
+        warnings.warn(
+            f"{filter}: at some observation fewer than {COLLAPSED:g} particles carried all the "
+            f"weight, in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
+            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be far too low, by "
+            f"a different amount for every seed.",
+            FilterWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,40 @@
+"""From traced equations to machine code; the only room that knows how PyTensor works inside."""
+
+from pymc_statespace_filters.lowering.compile import (
+    Compiled,
+    Graph,
+    digest,
+    jit,
+    VectorFunction,
+    vector_functions,
+)
+from pymc_statespace_filters.lowering.draws import observation_sampler
+from pymc_statespace_filters.lowering.ensemble import (
+    Machine,
+    call,
+    ensemble_machine,
+    jacobian_of,
+    observation_moments,
+    semidefinite_cholesky,
+    symbols_of,
+)
+from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
+
+__all__ = [
+    "Compiled",
+    "Graph",
+    "Machine",
+    "VectorFunction",
+    "call",
+    "digest",
+    "ensemble_machine",
+    "jacobian_of",
+    "jit",
+    "log_normal",
+    "observation_moments",
+    "observation_sampler",
+    "semidefinite_cholesky",
+    "symbols_of",
+    "vector_functions",
+    "without_missing",
+]

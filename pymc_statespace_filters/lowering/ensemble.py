@@ -1,0 +1,273 @@
+"""What a system gives to the filters that move many members: compiled, member by member."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.gradient import jacobian
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.lowering.compile import (
+    Compiled,
+    Graph,
+    digest,
+    jit,
+    member_function,
+    VectorFunction,
+    vector_functions,
+)
+from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
+from pymc_statespace_filters.model import StateSpaceModel
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """Compiled functions of one system on ensembles ``X`` of shape (states, members).
+
+    ``c`` are the constants of one evaluation, ``c = prepare(theta)``; ``Z`` holds standard normals
+    and may have more columns than there are members; ``k`` is the step, ``t`` its time.
+
+    * ``initialise(c, Z, X)`` draws the state at step 0.
+    * ``propagate(c, inputs, k, t, Z, X)`` moves every member from step k to k + 1, in place.
+    * ``observe(c, inputs, k, t, Z, X, D)`` writes simulated observations (observables, members).
+    * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
+    """
+
+    n: int
+    m: int
+    p: int
+    r: int
+    dt: float
+    free: np.ndarray
+    prepare: Any
+    initialise: Any
+    propagate: Any
+    observe: Any
+    log_density: Any
+    key: str | None
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The constant vector ``c``: parameters first, then square roots of the covariances."""
+
+    theta: TensorVariable
+    initial_mean: TensorVariable
+    initial_chol: TensorVariable
+    process_chol: TensorVariable | None
+    observation_chol: TensorVariable | None
+
+
+def symbols_of(system: StateSpaceModel) -> dict[str, TensorVariable]:
+    """Fresh symbols with the names and sizes of the system's."""
+    sizes = {"x": system.n, "u": system.n_inputs, "d": system.p}
+    symbols = {name: pt.tensor(name, shape=(size,), dtype="float64") for name, size in sizes.items()}
+    return symbols | {"t": pt.tensor("t", shape=(), dtype="float64")}
+
+
+def call(
+    graph: FrozenFunctionGraph,
+    system: StateSpaceModel,
+    values: Mapping[str, TensorVariable],
+) -> TensorVariable:
+    """The output of a traced function at given values; symbols not given are zero."""
+    sizes = {"theta": system.n_theta, "x": system.n, "q": system.m, "u": system.n_inputs}
+    sizes |= {"t": None, "e": system.r, "d": system.p}
+    arguments = [
+        values[name] if name in values else pt.zeros(() if size is None else (size,))
+        for name, size in sizes.items()
+    ]
+    (output,) = graph.bind(arguments)
+    return output
+
+
+@lru_cache(maxsize=256)
+def ensemble_machine(system: StateSpaceModel) -> Machine:
+    """Compile what the ensemble and particle filters need of a system."""
+    blocks = _covariance_blocks(system)
+    c, constants = _constants(system, blocks)
+    symbols = symbols_of(system) | {"theta": constants.theta}
+    z = {size: pt.tensor("z", shape=(size,), dtype="float64") for size in (system.n, system.m, system.r)}
+
+    def members(
+        name: str, arguments: str, output: TensorVariable, target: str, *inputs: str, n_z: int = 0
+    ) -> Compiled:
+        graph_inputs = {"theta": c, **{i: symbols[i] for i in inputs}}
+        if n_z:
+            graph_inputs["z"] = z[n_z]
+        return member_function(name, arguments, Graph(graph_inputs, [output]), target)
+
+    initial = constants.initial_mean + constants.initial_chol @ z[system.n]
+    q = _coloured(constants.process_chol, z[system.m])
+    e = _coloured(constants.observation_chol, z[system.r])
+    parts = {
+        "initialise": members("initialise", "c, Z, X", initial, "X[{i}, member]", n_z=system.n),
+        "propagate": members(
+            "propagate",
+            "c, inputs, k, t, Z, X",
+            call(system.equations.transition, system, symbols | {"q": q}),
+            "X[{i}, member]",
+            *"xut",
+            n_z=system.m,
+        ),
+        "log_density": members(
+            "log_density",
+            "c, inputs, k, t, d, X, out",
+            pt.atleast_1d(_log_density(system, symbols)),
+            "out[member]",
+            *"xutd",
+        ),
+    }
+    if system.gaussian_observation:
+        seen = call(system.equations.observation, system, symbols | {"e": e})
+        parts["observe"] = members(
+            "observe", "c, inputs, k, t, Z, X, D", seen, "D[{i}, member]", *"xut", n_z=system.r
+        )
+    prepare = _prepare(system, blocks)
+    keys = [prepare.key, *(part.key for part in parts.values())]
+    carried = [system.states.index(name) for name in system.carried]
+    return Machine(
+        n=system.n,
+        m=system.m,
+        p=system.p,
+        r=system.r,
+        dt=system.dt,
+        free=np.setdiff1d(np.arange(system.n), carried),
+        prepare=prepare.function,
+        **{name: part.function for name, part in parts.items()},
+        **({} if "observe" in parts else {"observe": None}),
+        key=None if None in keys else digest(repr((system.dt, carried)), *keys),
+    )
+
+
+def _covariance_blocks(system: StateSpaceModel) -> dict[str, FrozenFunctionGraph]:
+    """Covariances whose square root noise is coloured with; an integrator's noise is white."""
+    graphs = vars(system.equations)
+    names = ("initial_cov", "process_noise", "observation_noise")
+    return {name: graphs[name] for name in names if graphs[name] is not None}
+
+
+def _constants(
+    system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]
+) -> tuple[TensorVariable, Constants]:
+    sizes = {name: graph.outputs[0].type.shape[0] for name, graph in blocks.items()}
+    length = system.n_theta + system.n + sum(size**2 for size in sizes.values())
+    c = pt.tensor("c", shape=(length,), dtype="float64")
+    start = system.n_theta + system.n
+    chols: dict[str, TensorVariable] = {}
+    for name, size in sizes.items():
+        chols[name] = c[start : start + size**2].reshape((size, size))
+        start += size**2
+    return c, Constants(
+        theta=c[: system.n_theta],
+        initial_mean=c[system.n_theta : system.n_theta + system.n],
+        initial_chol=chols["initial_cov"],
+        process_chol=chols.get("process_noise"),
+        observation_chol=chols.get("observation_noise"),
+    )
+
+
+def _coloured(chol: TensorVariable | None, z: TensorVariable) -> TensorVariable:
+    return z if chol is None else chol @ z
+
+
+def _log_density(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> TensorVariable:
+    """log p(d | x); Gaussian noise through D Gamma D^T at e = 0 (Eqs. 4.4, 4.12)."""
+    if system.equations.observation_logp is not None:
+        return call(system.equations.observation_logp, system, symbols)
+    mean, cov = observation_moments(system, symbols)
+    return log_normal(*without_missing(symbols["d"], mean, cov))
+
+
+def observation_moments(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> tuple[TensorVariable, TensorVariable]:
+    """h(x, 0) and D Gamma D^T (Eq. 4.4); for additive noise D is the identity."""
+    cov = call(system.equations.observation_noise, system, symbols)
+    if system.additive_noise:
+        return call(system.equations.observation, system, symbols), cov
+    e = pt.tensor("e", shape=(system.r,), dtype="float64")
+    seen = call(system.equations.observation, system, {**symbols, "e": e})
+    noise_jac = jacobian_of(seen, e)
+    at_zero = FrozenFunctionGraph.from_io([e, *symbols.values()], [seen, noise_jac])
+    mean, noise_jac = at_zero.bind([pt.zeros((system.r,)), *symbols.values()])
+    return mean, noise_jac @ cov @ noise_jac.T
+
+
+def jacobian_of(output: TensorVariable, wrt: TensorVariable) -> TensorVariable:
+    """d output / d wrt, shape (len(output), len(wrt)); zeros where there is no connection."""
+    shape = (output.type.shape[0], wrt.type.shape[0])
+    if 0 in shape:
+        return pt.zeros(shape)
+    return pt.specify_shape(
+        jacobian(output, wrt, vectorize=True, disconnected_inputs="ignore"), shape
+    )
+
+
+def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]) -> Compiled:
+    """theta -> c: parameters, initial mean, then the lower square root of every covariance."""
+    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
+    values = {"theta": theta}
+    outputs = [theta, call(system.equations.initial_mean, system, values)]
+    outputs += [call(graph, system, values).ravel() for graph in blocks.values()]
+    graph = Graph({"theta": theta}, [pt.concatenate(outputs)])
+    flat = vector_functions({"moments": VectorFunction("c", graph)})["moments"]
+    sizes = tuple(graph.outputs[0].type.shape[0] for graph in blocks.values())
+    moments, first = flat.function, system.n_theta + system.n
+
+    def prepare(theta):
+        c = np.empty(first + sum_of_squares)
+        values = moments(theta)
+        for i in range(c.size):
+            c[i] = values[i]
+        start = first
+        for size in sizes:
+            semidefinite_cholesky(c[start : start + size * size].reshape(size, size))
+            start += size * size
+        return c
+
+    sum_of_squares = sum(size**2 for size in sizes)
+    return Compiled(jit(prepare), None if flat.key is None else digest(flat.key, repr(sizes)))
+
+
+@jit
+def semidefinite_cholesky(a):
+    """Lower square root in place; a zero pivot gives a zero column, a negative one NaN.
+
+    Covariances without spread in some direction are ordinary here: a known initial state, noise
+    that acts on the velocity alone.
+    """
+    n = a.shape[0]
+    scale = 0.0
+    for i in range(n):
+        scale = max(scale, abs(a[i, i]))
+    for j in range(n):
+        pivot = a[j, j]
+        for k in range(j):
+            pivot -= a[j, k] ** 2
+        if pivot < -1e-10 * scale or pivot != pivot:
+            a[:] = np.nan
+            return
+        root = np.sqrt(pivot) if pivot > 1e-14 * scale else 0.0
+        a[j, j] = root
+        for i in range(j + 1, n):
+            rest = a[i, j]
+            for k in range(j):
+                rest -= a[i, k] * a[j, k]
+            if root > 0.0:
+                a[i, j] = rest / root
+            elif abs(rest) > 1e-7 * scale:
+                a[:] = np.nan
+                return
+            else:
+                a[i, j] = 0.0
+        for i in range(j):
+            a[i, j] = 0.0
+
+

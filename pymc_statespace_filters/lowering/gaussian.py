@@ -1,0 +1,34 @@
+"""Gaussian log-densities as graphs, with components left out."""
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.tensor.linalg import cholesky, solve_triangular
+from pytensor.tensor.variable import TensorVariable
+
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+def without_missing(
+    datum: TensorVariable, mean: TensorVariable, cov: TensorVariable
+) -> tuple[TensorVariable, TensorVariable, TensorVariable]:
+    """Residual, covariance and indicator of what was seen; NaN in ``datum`` marks a missing one.
+
+    A missing component gets residual 0 and an independent unit variance, so that it neither
+    moves the state nor adds to a quadratic form or a log-determinant. The datum is replaced
+    before it is used: a NaN multiplied by zero would survive in a gradient.
+    """
+    missing = pt.isnan(datum)
+    residual = pt.switch(missing, 0.0, pt.switch(missing, 0.0, datum) - mean)
+    either = missing[:, None] | missing[None, :]
+    cov = pt.switch(either, np.eye(datum.type.shape[0]), cov)
+    return residual, cov, 1.0 - pt.cast(missing, "float64")
+
+
+def log_normal(
+    residual: TensorVariable, cov: TensorVariable, seen: TensorVariable
+) -> TensorVariable:
+    """log N(residual; 0, cov) over the components with ``seen`` = 1; NaN if cov is not definite."""
+    chol = cholesky(cov, lower=True)
+    standardised = solve_triangular(chol, residual, lower=True, b_ndim=1)
+    log_det = pt.sum(pt.log(pt.diagonal(chol)))
+    return -0.5 * pt.sum(standardised**2) - log_det - 0.5 * LOG_2PI * pt.sum(seen)

@@ -1,0 +1,168 @@
+"""The log-likelihood of a record as a PyTensor operation, and its derivative as another.
+
+Both are pure: parameters, data and the noise seed are inputs, and equal inputs give equal outputs.
+Nothing that matters is closed over, so that neither merging of equal nodes nor the cache of
+machine code on disk can mix two data sets up.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.gradient import DisconnectedType, grad_not_implemented
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.op import Op
+from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
+
+from pymc_statespace_filters.errors import GradientUnavailableError
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.model import StateSpaceModel
+
+HEALTH_SIZE = 3
+
+_INPUT_TYPES = (
+    ("theta", "float64", 1),
+    ("steps", "int64", 1),
+    ("observed", "float64", 2),
+    ("inputs", "float64", 2),
+    ("t0", "float64", 0),
+    ("seed", "int64", 0),
+)
+
+
+class LogLikelihood(Op):
+    """log p(d_j | d_1 .. d_{j-1}) of every observation, and a record of the filter's health.
+
+    Inputs: ``theta`` (k,), ``steps`` (J,), ``observed`` (J, p), ``inputs`` (steps, n_inputs),
+    ``t0``, ``seed``. Outputs: terms (J,), and health (3,): smallest effective number of
+    particles, code of the failure, index of the failing observation.
+    """
+
+    __props__ = ("system", "filter")
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
+
+    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
+        self.system = system
+        self.filter = filter
+
+    def __str__(self) -> str:
+        # The default would print every equation of the system.
+        return f"{type(self).__name__}{{{self.filter}}}"
+
+    def make_node(self, *inputs: Any) -> Apply:
+        return Apply(self, _typed(inputs), [pt.dvector(), pt.dvector()])
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        return [(input_shapes[1][0],), (HEALTH_SIZE,)]
+
+    def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        for cell, value in zip(output_storage, evaluator(self)(*inputs), strict=True):
+            cell[0] = value
+
+    def pullback(
+        self, inputs: Sequence[Variable], outputs: Sequence[Variable], cotangents: Sequence[Variable]
+    ) -> list[Variable]:
+        if not self.filter.has_gradient:
+            raise GradientUnavailableError(
+                f"The likelihood by {self.filter} is a random estimate without a gradient, so "
+                f"NUTS, HMC, nutpie and find_MAP cannot use it. Sample with "
+                f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
+            )
+        terms_bar = cotangents[0]
+        if isinstance(terms_bar.type, DisconnectedType):
+            theta_bar = pt.zeros_like(inputs[0])
+        else:
+            theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
+        data_bars = [
+            grad_not_implemented(self, i, variable, "only parameters have a gradient")
+            for i, variable in enumerate(inputs[1:], start=1)
+        ]
+        return [theta_bar, *data_bars]
+
+
+class LogLikelihoodGradient(Op):
+    """The vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,)."""
+
+    __props__ = ("system", "filter")
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
+
+    __init__ = LogLikelihood.__init__
+    __str__ = LogLikelihood.__str__
+
+    def make_node(self, *inputs: Any) -> Apply:
+        terms_bar = pt.as_tensor(inputs[-1], dtype="float64")
+        return Apply(self, [*_typed(inputs[:-1]), terms_bar], [pt.dvector()])
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        return [input_shapes[0]]
+
+    def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        (output_storage[0][0],) = evaluator(self)(*inputs)
+
+
+def _typed(inputs: Sequence[Any]) -> list[Variable]:
+    return [
+        pt.as_tensor(value, dtype=dtype, ndim=ndim)
+        if not isinstance(value, Variable)
+        else _checked(value, name, dtype, ndim)
+        for value, (name, dtype, ndim) in zip(inputs, _INPUT_TYPES, strict=True)
+    ]
+
+
+def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
+    if value.type.ndim != ndim:
+        raise TypeError(f"{name} must have {ndim} dimensions, got {value.type}")
+    return value if value.type.dtype == dtype else pt.cast(value, dtype)
+
+
+@cache
+def evaluator(op: Op) -> Any:
+    """A compiled Python function of the operation's inputs; its machine code is cached on disk."""
+    inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in _INPUT_TYPES]
+    if isinstance(op, LogLikelihoodGradient):
+        inputs.append(pt.dvector("terms_bar"))
+    return pytensor.function(
+        inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
+    )
+
+
+@register_funcify_and_cache_key(LogLikelihood)
+def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
+    compiled = op.filter.compile(op.system)
+    run = compiled.function
+
+    @numba_njit
+    def log_likelihood(theta, steps, observed, inputs, t0, seed):
+        return run(
+            np.ascontiguousarray(theta),
+            np.ascontiguousarray(steps),
+            np.ascontiguousarray(observed),
+            np.ascontiguousarray(inputs),
+            t0.item(),
+            seed.item(),
+        )
+
+    return log_likelihood, compiled.key
+
+
+@register_funcify_and_cache_key(LogLikelihoodGradient)
+def _numba_gradient(op: LogLikelihoodGradient, node: Apply | None = None, **kwargs: Any) -> tuple:
+    compiled = op.filter.compile_gradient(op.system)
+    run = compiled.function
+
+    @numba_njit
+    def log_likelihood_gradient(theta, steps, observed, inputs, t0, seed, terms_bar):
+        return run(
+            np.ascontiguousarray(theta),
+            np.ascontiguousarray(steps),
+            np.ascontiguousarray(observed),
+            np.ascontiguousarray(inputs),
+            t0.item(),
+            seed.item(),
+            terms_bar,
+        )
+
+    return log_likelihood_gradient, compiled.key
