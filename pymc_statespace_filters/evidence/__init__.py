@@ -1,0 +1,7 @@
+"""Evidence of a model from its draws, and what follows for the choice between models."""
+
+from pymc_statespace_filters.evidence.chib_jeliazkov import chib_jeliazkov
+from pymc_statespace_filters.evidence.comparison import DimensionCorrection, compare_evidence
+from pymc_statespace_filters.evidence.result import Evidence
+
+__all__ = ["DimensionCorrection", "Evidence", "chib_jeliazkov", "compare_evidence"]

@@ -1,0 +1,245 @@
+"""The posterior as an evidence estimator needs it: unconstrained draws and their log-density.
+
+The unconstrained space is that of the model's value variables: every free variable goes through its
+transform, vectors and matrices are flattened, and the compiled log-density holds the Jacobians.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import xarray as xr
+from numpy.typing import NDArray
+from pymc.model.transform_values import unconstrain_values
+from pymc.pytensorf import compile, join_nonshared_inputs
+
+from pymc_statespace_filters.distribution import noise_seeds
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+
+N_CHECKED = 16  # draws whose stored log-density is recomputed
+STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats
+MIN_DRAWS = 20
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of a posterior with their log-densities, and the means to evaluate more.
+
+    Attributes
+    ----------
+    draws : ndarray (chain, draw, k)
+        Unconstrained.
+    log_density : ndarray (chain, draw)
+        Log prior + log likelihood + log Jacobian of each draw. With a noisy likelihood these are
+        the estimates by which the chain accepted: drawn again, they would belong to another chain.
+    evaluate : callable
+        ``evaluate(x, rng)`` with x (m, k) gives log-densities (m,), never NaN; a noisy likelihood
+        takes fresh noise from `rng` for each.
+    is_noisy : bool
+        Whether `evaluate` gives something else each time.
+    """
+
+    draws: Array
+    log_density: Array
+    evaluate: Callable[[Array, np.random.Generator], Array]
+    is_noisy: bool = False
+
+    def halves(self) -> tuple["Posterior", "Posterior"]:
+        """Split every chain in the middle."""
+        middle = self.draws.shape[1] // 2
+        return (
+            replace(self, draws=self.draws[:, :middle], log_density=self.log_density[:, :middle]),
+            replace(self, draws=self.draws[:, middle:], log_density=self.log_density[:, middle:]),
+        )
+
+
+class ModelDensity:
+    """The compiled log-density of a model over one flat vector, noise seeds as arguments.
+
+    Attributes
+    ----------
+    seed_names : tuple of str
+        The noisy state-space variables, in the order of the columns of a seed array.
+    """
+
+    def __init__(self, model: pm.Model) -> None:
+        if model.discrete_value_vars:
+            names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
+            raise ModelError(
+                f"model must have continuous free variables only; {names} are discrete: "
+                "sum them out of the likelihood first"
+            )
+        if not model.free_RVs:
+            raise ModelError("model must have at least one free variable, it has none")
+        self.model = model
+        shared = noise_seeds(model)
+        self.seed_names = tuple(shared)
+        self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
+        seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
+        self._log_density = self._compiled(model.logp(), seeds)
+        self._log_prior = self._compiled(model.logp(vars=model.free_RVs), {})
+
+    def _compiled(self, output: pt.TensorVariable, seeds: dict) -> Callable:
+        values = [self.model.rvs_to_values[rv] for rv in self.model.free_RVs]
+        (output,), flat = join_nonshared_inputs(self.model.initial_point(), [output], values)
+        function = compile([flat, *seeds.values()], output, givens=seeds, on_unused_input="ignore")
+        function.trust_input = True
+        return function
+
+    def log_density(self, x: Array, seeds: NDArray[np.int64]) -> Array:
+        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf."""
+        rows = [[np.asarray(seed) for seed in row] for row in seeds]
+        values = [self._log_density(point, *row) for point, row in zip(x, rows, strict=True)]
+        found = np.array(values, dtype=np.float64)
+        return np.where(np.isnan(found), -np.inf, found)
+
+    def log_prior(self, x: Array) -> Array:
+        """Log-density of the free variables alone, Jacobians included; x is (m, k)."""
+        return np.array([self._log_prior(point) for point in x], dtype=np.float64)
+
+
+def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> Array:
+    """Map the posterior group to the unconstrained space, shape (chain, draw, k).
+
+    Raises
+    ------
+    ModelError
+        If there is no posterior group, or too few draws in it.
+    DataMismatchError
+        If free variables are missing from it or have other shapes, or if a draw lies outside the
+        support.
+    """
+    if "posterior" not in idata.children:
+        raise ModelError(f"idata must have a group 'posterior', it has {sorted(idata.children)}")
+    posterior = idata["posterior"].to_dataset()
+    missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
+    if missing:
+        raise DataMismatchError(
+            f"idata has no draws of {missing}, free variables of the model; "
+            f"its posterior holds {sorted(map(str, posterior.data_vars))}"
+        )
+    n_chains, n_draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    if n_draws < MIN_DRAWS:
+        raise ModelError(f"idata must have at least {MIN_DRAWS} draws per chain, got {n_draws}")
+
+    shapes = model.eval_rv_shapes()
+    for rv in model.free_RVs:
+        drawn = posterior[rv.name].transpose("chain", "draw", ...).shape[2:]
+        expected = tuple(int(length) for length in shapes[rv.name])
+        if drawn != expected:
+            raise DataMismatchError(
+                f"{rv.name!r} has shape {expected} in the model and {drawn} in idata"
+            )
+    # One call for all draws: not worth machine code.
+    unconstrained = unconstrain_values(
+        posterior, model=model, compile_kwargs={"mode": "FAST_COMPILE"}
+    )
+    columns = [
+        unconstrained[model.rvs_to_values[rv].name].values.reshape(n_chains, n_draws, -1)
+        for rv in model.free_RVs
+    ]
+    draws = np.concatenate(columns, axis=-1).astype(np.float64)
+    outside = int((~np.isfinite(draws).all(axis=-1)).sum())
+    if outside:
+        raise DataMismatchError(
+            f"{outside} of {n_chains * n_draws} draws lie on or outside the support of the model's "
+            "free variables: idata belongs to another model"
+        )
+    return draws
+
+
+def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
+    """Bring the draws of `idata` and their model together.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Posterior draws. ``sample_stats`` may hold the log-density ``lp`` of each draw, and must do
+        so (or hold the noise seeds ``<name>_seed``) if the noise was drawn anew along the chain.
+    density : ModelDensity
+        The compiled model.
+
+    Returns
+    -------
+    Posterior
+    str
+        What happened to the noise: "none", "refreshed" or "held", as in `Evidence`.
+
+    Raises
+    ------
+    ModelError, DataMismatchError
+        As `unconstrained_draws`; and if stored and recomputed log-densities disagree.
+    """
+    draws = unconstrained_draws(idata, density.model)
+    stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
+    seeds = _stored_seeds(stats, density, draws.shape[:2])
+    log_density = _stored_log_density(stats, density, draws, seeds)
+
+    held = bool((seeds == seeds[:1, :1]).all())
+    if not held and (seeds == seeds[:, :1]).all():
+        raise ModelError(
+            "idata must hold chains of one noise seed if the seed was held; its "
+            f"{len(seeds)} chains kept {len(np.unique(seeds[:, 0], axis=0))} different ones: give "
+            "one chain at a time"
+        )
+    noise = "none" if not density.seed_names else "held" if held else "refreshed"
+
+    def evaluate(x: Array, rng: np.random.Generator) -> Array:
+        if held:
+            return density.log_density(x, np.broadcast_to(seeds[0, 0], (len(x), seeds.shape[-1])))
+        size = (len(x), seeds.shape[-1])
+        return density.log_density(x, rng.integers(np.iinfo(np.int64).max, size=size))
+
+    return Posterior(draws, log_density, evaluate, is_noisy=not held), noise
+
+
+def _stored_seeds(
+    stats: xr.Dataset, density: ModelDensity, shape: tuple[int, int]
+) -> NDArray[np.int64]:
+    """Noise seeds behind the draws, (chain, draw, n_seeds); unless stored, the model's own."""
+    columns = [
+        stats[f"{name}_seed"].transpose("chain", "draw").values
+        if f"{name}_seed" in stats
+        else np.full(shape, seed)
+        for name, seed in zip(density.seed_names, density.model_seeds, strict=True)
+    ]
+    return (
+        np.stack(columns, axis=-1).astype(np.int64) if columns else np.empty((*shape, 0), np.int64)
+    )
+
+
+def _stored_log_density(
+    stats: xr.Dataset, density: ModelDensity, draws: Array, seeds: NDArray[np.int64]
+) -> Array:
+    """Log-densities of the draws (chain, draw): the stored ones, else recomputed."""
+    flat_draws = draws.reshape(-1, draws.shape[-1])
+    flat_seeds = seeds.reshape(len(flat_draws), -1)
+    # Several step methods side by side store one column each, none of them that of the whole draw.
+    names = [name for name in STORED_NAMES if name in stats and stats[name].ndim == 2]
+    if not names:
+        log_density = density.log_density(flat_draws, flat_seeds)
+        if impossible := int(np.isneginf(log_density).sum()):
+            raise DataMismatchError(
+                f"{impossible} of {len(flat_draws)} draws of idata have no density under the "
+                "model: they belong to another model or to other data"
+            )
+        return log_density.reshape(draws.shape[:2])
+
+    stored = stats[names[0]].transpose("chain", "draw").values.astype(np.float64)
+    checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
+    recomputed = density.log_density(flat_draws[checked], flat_seeds[checked])
+    expected = stored.ravel()[checked]
+    # Near a bound the transform loses digits, so a minority of the draws may differ.
+    agree = np.isclose(recomputed, expected, rtol=1e-6, atol=1e-4)
+    if agree.mean() < 0.5:
+        worst = int(np.flatnonzero(~agree)[0])
+        raise DataMismatchError(
+            f"sample_stats[{names[0]!r}] of idata is {expected[worst]:.6g} where the model gives "
+            f"{recomputed[worst]:.6g}: the draws belong to another model, other data or other "
+            "settings"
+        )
+    return stored

@@ -1,0 +1,148 @@
+"""What every evidence estimator returns, and the group in which it is stored beside the draws."""
+
+import math
+from dataclasses import dataclass, fields
+from html import escape
+
+import numpy as np
+import xarray as xr
+
+from pymc_statespace_filters.errors import ModelError
+
+GROUP = "evidence"
+NOISE = ("none", "refreshed", "held")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence p(D | M) of one model and what is needed to compare it with others.
+
+    Attributes
+    ----------
+    log_evidence : float
+        Natural logarithm of the evidence (thesis, Eq. 3.5), priors normalised as the PyMC model
+        states them: a Uniform prior contributes its volume.
+    se : float
+        Numerical standard error of `log_evidence`, in nats.
+    estimator : str
+        Name of the function that made it.
+    n_parameters : int
+        k, the free scalar variables: the dimension of the unconstrained parameter vector.
+    n_observations : int
+        J, the observations that are not wholly missing.
+    max_log_likelihood : float
+        Largest log-likelihood met, for the Bayesian information criterion. The likelihood is
+        everything in the model that is not the prior of a free variable, Potentials included.
+    data_fingerprint : str
+        Hash of the observed values: equal for rival models of one record, different for other data.
+    noise : {"none", "refreshed", "held"}
+        "none": the likelihood is a number. "refreshed": the likelihood is an estimate, and the
+        evidence that of its expectation. "held": the chains kept one noise seed, and this is that
+        seed's evidence; `se` then lacks the error of the filter, which takes whole chains at
+        several seeds.
+
+    Examples
+    --------
+    >>> from pymc_statespace_filters import Evidence
+    >>> Evidence(-31.24, 0.02, "chib_jeliazkov", 3, 100, -24.1, "0c5f")
+    Evidence(log_evidence=-31.240 ± 0.020, estimator='chib_jeliazkov', k=3, J=100)
+    """
+
+    log_evidence: float
+    se: float
+    estimator: str
+    n_parameters: int
+    n_observations: int
+    max_log_likelihood: float
+    data_fingerprint: str
+    noise: str = "none"
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.log_evidence):
+            raise ModelError(f"log_evidence must be a finite number, got {self.log_evidence!r}")
+        if not (math.isfinite(self.se) and self.se >= 0):
+            raise ModelError(f"se must be a finite number >= 0, got {self.se!r}")
+        if self.n_parameters < 0 or self.n_observations < 0:
+            raise ModelError(
+                "n_parameters and n_observations must be counts, "
+                f"got {self.n_parameters!r} and {self.n_observations!r}"
+            )
+        if self.noise not in NOISE:
+            raise ModelError(f"noise must be one of {NOISE}, got {self.noise!r}")
+
+    def __repr__(self) -> str:
+        held = "" if self.noise == "none" else f", noise={self.noise!r}"
+        return (
+            f"Evidence(log_evidence={self.log_evidence:.3f} ± {self.se:.3f}, "
+            f"estimator={self.estimator!r}, k={self.n_parameters}, J={self.n_observations}{held})"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<code>{escape(repr(self))}</code>"
+
+
+def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, float]) -> None:
+    """Write `evidence` into the group of `idata`, in place of an earlier one of the same estimator.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Changed in place. The group has the dimension ``estimator``.
+    evidence : Evidence
+        Each field becomes a variable.
+    settings : dict of str to float
+        What the estimator did and met (scale, counts, effective numbers), variables as well.
+    """
+    record = {field.name: getattr(evidence, field.name) for field in fields(evidence)} | settings
+    name = record.pop("estimator")
+    new = xr.Dataset(
+        {key: ("estimator", [value]) for key, value in record.items()},
+        coords={"estimator": [name]},
+    )
+    if GROUP in idata.children:
+        old = idata[GROUP].to_dataset()
+        others = [other for other in old["estimator"].values if other != name]
+        if others:
+            new = xr.concat([old.sel(estimator=others), new], dim="estimator", join="outer")
+    idata[GROUP] = xr.DataTree(new)
+
+
+def stored_evidence(idata: xr.DataTree, name: str) -> Evidence:
+    """Read the one evidence that `idata` carries.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Has the group ``evidence``, as an estimator left it.
+    name : str
+        What to call `idata` in an error.
+
+    Returns
+    -------
+    Evidence
+
+    Raises
+    ------
+    ModelError
+        If there is no such group, or if several estimators wrote into it.
+    """
+    if GROUP not in idata.children:
+        raise ModelError(
+            f"{name!r} has no group {GROUP!r}: call chib_jeliazkov(idata, model) on it first; "
+            f"its groups are {sorted(idata.children)}"
+        )
+    group = idata[GROUP].to_dataset()
+    estimators = [str(estimator) for estimator in np.atleast_1d(group["estimator"].values)]
+    if len(estimators) != 1:
+        raise ModelError(
+            f"{name!r} holds the evidence of several estimators, {estimators}: "
+            "pass the Evidence that you mean"
+        )
+    record = {
+        field.name: group[field.name].values[0].item()
+        if hasattr(group[field.name].values[0], "item")
+        else group[field.name].values[0]
+        for field in fields(Evidence)
+        if field.name != "estimator"
+    }
+    return Evidence(estimator=estimators[0], **record)

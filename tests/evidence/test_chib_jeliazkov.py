@@ -1,0 +1,169 @@
+"""The estimator on posteriors known in closed form, and the ways of being subtly wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence._proposal import (
+    choose_proposal,
+    log_mean_of_chains,
+    log_mean_of_independent,
+)
+from pymc_statespace_filters.evidence.chib_jeliazkov import _estimate_fold, estimate
+from tests.evidence.analytic import Regression, gaussian, half_normal
+
+LOG_EVIDENCE = -3.7  # of `gaussian`
+
+
+def z_scores(make, truth, *, n_runs, n_proposals):
+    scores = []
+    for run in range(n_runs):
+        rng = np.random.default_rng([run, n_proposals])
+        found = estimate(make(rng), n_proposals=n_proposals, rng=rng)
+        scores.append((found.log_evidence - truth) / found.se)
+    return np.array(scores)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_evidence_of_a_conjugate_regression(k):
+    rng = np.random.default_rng([10, k])
+    regression = Regression(k, 30, rng)
+    found = estimate(regression.posterior((4, 5000), rng), n_proposals=5000, rng=rng)
+    assert found.se < 0.02
+    assert abs(found.log_evidence - regression.log_evidence) < 4 * found.se
+
+
+def test_standard_error_in_four_dimensions_with_sticky_chains():
+    rng = np.random.default_rng(11)
+    posterior = gaussian(4, (4, 5000), rng, correlation=0.9)
+    found = estimate(posterior, n_proposals=5000, rng=rng)
+    assert found.se < 0.05
+    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
+
+
+# For 200 independent standard normal scores the mean is within 0.25 of zero and the mean square
+# within [0.7, 1.4] with probability above 0.9995; seeds are fixed.
+@pytest.mark.parametrize(
+    ("k", "correlation", "noise_sd"), [(2, 0.0, 0.0), (4, 0.9, 0.0), (2, 0.9, 1.2)]
+)
+def test_standard_errors_are_calibrated(k, correlation, noise_sd):
+    def make(rng):
+        return gaussian(k, (4, 1000), rng, correlation=correlation, noise_sd=noise_sd)
+
+    z = z_scores(make, LOG_EVIDENCE, n_runs=200, n_proposals=2000)
+    assert abs(z.mean()) < 0.25
+    assert 0.7 < (z**2).mean() < 1.4
+
+
+def test_autocorrelation_enlarges_the_error():
+    rng = np.random.default_rng(12)
+    posterior = gaussian(2, (4, 4000), rng, correlation=0.95)
+    shuffled = rng.permutation(4 * 4000)
+    independent = replace(
+        posterior,
+        draws=posterior.draws.reshape(-1, 2)[shuffled].reshape(4, 4000, 2),
+        log_density=posterior.log_density.ravel()[shuffled].reshape(4, 4000),
+    )
+    sticky = estimate(posterior, n_proposals=20_000, rng=rng)
+    assert sticky.se > 1.5 * estimate(independent, n_proposals=20_000, rng=rng).se
+
+
+def test_proposals_without_density_count_as_zeros():
+    rng = np.random.default_rng(13)
+    found = estimate(half_normal((4, 5000), rng), n_proposals=5000, rng=rng)
+    assert found.se < 0.03
+    assert abs(found.log_evidence - 0.5 * np.log(np.pi / 2)) < 4 * found.se
+    assert found.zero_density > 0.02
+
+
+class TestNoisyLikelihood:
+    """Log-noise of standard deviation 1.2, as in a particle filter tuned as it should be."""
+
+    def posterior(self, rng):
+        return gaussian(2, (4, 5000), rng, noise_sd=1.2)
+
+    def test_stored_estimates_give_the_evidence_of_the_expected_likelihood(self):
+        rng = np.random.default_rng(14)
+        found = estimate(self.posterior(rng), n_proposals=10_000, rng=rng)
+        assert found.se < 0.02
+        assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
+
+    def test_recomputed_estimates_would_not(self):
+        rng = np.random.default_rng(14)
+        posterior = self.posterior(rng)
+        fresh = posterior.evaluate(posterior.draws.reshape(-1, 2), rng).reshape(4, 5000)
+        found = estimate(replace(posterior, log_density=fresh), n_proposals=10_000, rng=rng)
+        assert abs(found.log_evidence - LOG_EVIDENCE) > 15 * found.se
+
+    @pytest.mark.parametrize("shift", [-1.0, 1.0])
+    def test_the_constant_at_the_centre_does_not_matter(self, shift):
+        rng = np.random.default_rng(15)
+        posterior = self.posterior(rng)
+        proposal = choose_proposal(posterior, n_proposals=10_000, rng=rng)
+        shifted = replace(proposal, log_density=proposal.log_density + shift)
+        found = _estimate_fold(shifted, posterior, 10_000, rng=rng, progress=lambda count: None)
+        assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
+
+    def test_two_constants_would_matter(self):
+        rng = np.random.default_rng(15)
+        posterior = self.posterior(rng)
+        one = choose_proposal(posterior, n_proposals=10_000, rng=rng)
+        other = replace(one, log_density=one.log_density + 1.0)
+        numerator = log_mean_of_chains(
+            other.log_arriving(posterior.log_density) + other.log_q(posterior.draws)
+        )
+        denominator = log_mean_of_independent(
+            one.log_leaving(posterior.evaluate(one.sample(10_000, rng), rng))
+        )
+        mixed = one.log_density - numerator.value + denominator.value
+        assert abs(mixed - LOG_EVIDENCE) > 0.2
+
+
+def test_two_separate_modes_are_centred_in_one_of_them():
+    rng = np.random.default_rng(16)
+    sign = rng.choice([-1.0, 1.0], size=(4, 5000, 1))
+    draws = 5 * sign + rng.standard_normal((4, 5000, 2))
+    posterior = gaussian(2, (4, 5000), rng)
+
+    def log_density(x):
+        centred = [-0.5 * ((x - c) ** 2).sum(axis=-1) for c in (-5.0, 5.0)]
+        return np.logaddexp(*centred) - np.log(4 * np.pi) + LOG_EVIDENCE
+
+    posterior = replace(
+        posterior,
+        draws=draws,
+        log_density=log_density(draws),
+        evaluate=lambda x, rng: log_density(x),
+    )
+    found = estimate(posterior, n_proposals=5000, rng=rng)
+    assert abs(found.proposals[0].point[0]) > 3
+    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.4
+
+
+def test_same_seed_same_number():
+    rng = np.random.default_rng(17)
+    posterior = gaussian(2, (2, 500), rng)
+    one, other = (
+        estimate(posterior, n_proposals=500, rng=np.random.default_rng(1)).log_evidence
+        for _ in range(2)
+    )
+    assert one == other
+
+
+def test_draws_that_do_not_vary():
+    rng = np.random.default_rng(18)
+    posterior = gaussian(2, (2, 500), rng)
+    posterior.draws[..., 1] = 0.0
+    with pytest.raises(ModelError, match="vary in every direction"):
+        estimate(posterior, n_proposals=500, rng=rng)
+
+
+def test_no_density_where_the_draws_are():
+    rng = np.random.default_rng(19)
+    posterior = replace(
+        gaussian(2, (2, 500), rng), evaluate=lambda x, rng: np.full(len(x), -np.inf)
+    )
+    with pytest.raises(DataMismatchError, match="another model"):
+        estimate(posterior, n_proposals=500, rng=rng)

@@ -1,0 +1,103 @@
+"""How many observations, and which: the same for rival models of one record."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
+
+RECORD = np.array([[0.1, 2.0], [np.nan, 1.0], [np.nan, np.nan], [0.4, -0.0]])
+
+
+def vector_model(values, name="d"):
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1, shape=2)
+        # As a tensor: an array with missing values would be imputed.
+        pm.MvNormal(name, mu, np.eye(2), observed=pt.as_tensor(values))
+    return model
+
+
+def scalar_model(values, sd=1.0):
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1)
+        pm.Normal("y", mu, sd, observed=pt.as_tensor(values))
+    return model
+
+
+def test_rows_count_unless_wholly_missing():
+    assert observation_count(vector_model(RECORD)) == 3
+
+
+def test_scalars_count_unless_missing():
+    assert observation_count(scalar_model(RECORD)) == 5
+
+
+def test_several_variables_add_up():
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1)
+        pm.Normal("a", mu, 1, observed=[1.0, 2.0])
+        pm.Poisson("b", pm.math.exp(mu), observed=[3, 4, 5])
+    assert observation_count(model) == 5
+
+
+def test_a_model_without_data():
+    with pm.Model() as model:
+        pm.Normal("mu", 0, 1)
+    assert observation_count(model) == 0
+
+
+def test_rivals_on_one_record_share_a_fingerprint():
+    column = RECORD[:, :1]
+    assert data_fingerprint(scalar_model(RECORD)) == data_fingerprint(vector_model(RECORD, "other"))
+    assert data_fingerprint(scalar_model(column)) == data_fingerprint(
+        scalar_model(column[:, 0], sd=2)
+    )
+    assert data_fingerprint(scalar_model(RECORD)) == data_fingerprint(scalar_model(RECORD + 0.0))
+
+
+def test_shared_data_are_read_as_they_are_now():
+    with pm.Model() as model:
+        y = pm.Data("data", [1.0, 2.0])
+        pm.Normal("y", 0, 1, observed=y)
+    before = data_fingerprint(model)
+    pm.set_data({"data": [1.0, 3.0]}, model=model)
+    assert data_fingerprint(model) != before
+
+
+@pytest.mark.parametrize(
+    "other",
+    [RECORD + 1e-12, RECORD[:3], RECORD.T, np.nan_to_num(RECORD), RECORD[::-1]],
+    ids=["value", "length", "shape", "missing", "order"],
+)
+def test_other_data_have_another_fingerprint(other):
+    assert data_fingerprint(scalar_model(other)) != data_fingerprint(scalar_model(RECORD))
+
+
+def test_order_of_the_variables_does_not_matter():
+    def model(*records):
+        with pm.Model() as model:
+            for i, record in enumerate(records):
+                pm.Normal(f"y{i}", 0, 1, observed=record)
+        return model
+
+    a, b = np.array([1.0, 2.0]), np.array([3.0])
+    assert data_fingerprint(model(a, b)) == data_fingerprint(model(b, a))
+    assert data_fingerprint(model(a, b)) != data_fingerprint(model(np.append(a, b)))
+
+
+def test_fingerprint_is_stable_across_processes():
+    program = (
+        "import pymc as pm\n"
+        "from pymc_statespace_filters.evidence.data import data_fingerprint\n"
+        "with pm.Model() as model:\n"
+        "    pm.Normal('y', 0, 1, observed=[1.0, 2.0])\n"
+        "import sys; sys.stdout.write(data_fingerprint(model))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == data_fingerprint(scalar_model(np.array([1.0, 2.0])))

@@ -1,0 +1,146 @@
+"""From draws in a DataTree to the unconstrained space of their model."""
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence.posterior import (
+    ModelDensity,
+    posterior_of,
+    unconstrained_draws,
+)
+
+DATA = np.array([0.3, 1.2, 0.8])
+
+
+@pytest.fixture(scope="module")
+def model():
+    """No transform, log, an interval with a free bound, a simplex; scalars, a vector, a matrix."""
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1)
+        upper = pm.HalfNormal("upper", 1)
+        sd = pm.Uniform("sd", 0, upper)
+        w = pm.Dirichlet("w", np.ones(3))
+        pm.Normal("matrix", 0, 1, shape=(2, 2))
+        pm.Normal("y", mu + w[0], sd, observed=DATA)
+    return model
+
+
+@pytest.fixture(scope="module")
+def density(model):
+    return ModelDensity(model)
+
+
+@pytest.fixture
+def idata(model):
+    rng = np.random.default_rng(1)
+    shape = (2, 30)
+    upper = np.abs(rng.standard_normal(shape))
+    return az.from_dict(
+        {
+            "posterior": {
+                "mu": rng.standard_normal(shape),
+                "upper": upper,
+                "sd": upper * rng.uniform(size=shape),
+                "w": rng.dirichlet(np.ones(3), size=shape),
+                "matrix": rng.standard_normal((*shape, 2, 2)),
+            }
+        }
+    )
+
+
+def test_unconstrained_draws_follow_the_transforms(idata, model):
+    draws = unconstrained_draws(idata, model)
+    posterior = idata["posterior"]
+    assert draws.shape == (2, 30, 1 + 1 + 1 + 2 + 4)
+    np.testing.assert_array_equal(draws[..., 0], posterior["mu"])
+    np.testing.assert_allclose(draws[..., 1], np.log(posterior["upper"]))
+    share = (posterior["sd"] / posterior["upper"]).values
+    np.testing.assert_allclose(draws[..., 2], np.log(share) - np.log1p(-share), rtol=1e-9)
+    np.testing.assert_array_equal(draws[..., 5:], posterior["matrix"].values.reshape(2, 30, 4))
+
+
+def test_log_density_is_that_of_the_model_with_jacobians(idata, model, density):
+    posterior, noise = posterior_of(idata, density)
+    names = [model.rvs_to_values[rv].name for rv in model.free_RVs]
+    x = posterior.draws[1, 7]
+    parts = np.split(x, np.cumsum([1, 1, 1, 2]))
+    point = dict(
+        zip(names, [*(p[0] for p in parts[:3]), parts[3], parts[4].reshape(2, 2)], strict=True)
+    )
+    expected = model.compile_logp()(point)
+    assert noise == "none"
+    assert posterior.log_density[1, 7] == pytest.approx(expected, rel=1e-12)
+    assert posterior.evaluate(x[None], np.random.default_rng(0))[0] == pytest.approx(expected)
+    likelihood = model.compile_logp(vars=model.observed_RVs)(point)
+    assert expected - density.log_prior(x[None])[0] == pytest.approx(likelihood)
+
+
+def test_no_density_is_minus_infinity_never_nan(density):
+    x = np.full((1, 9), np.nan)
+    assert density.log_density(x, np.empty((1, 0), dtype=np.int64))[0] == -np.inf
+
+
+def test_missing_variables_are_named(idata, model):
+    idata["posterior"] = idata["posterior"].to_dataset().drop_vars(["w", "mu"])
+    with pytest.raises(DataMismatchError, match=r"\['mu', 'w'\].*'matrix', 'sd', 'upper'"):
+        unconstrained_draws(idata, model)
+
+
+def test_wrong_shape(idata, model):
+    idata["posterior"] = idata["posterior"].to_dataset().isel(w_dim_0=slice(2))
+    with pytest.raises(DataMismatchError, match=r"'w' has shape \(3,\) in the model and \(2,\)"):
+        unconstrained_draws(idata, model)
+
+
+def test_draws_outside_the_support(idata, model):
+    dataset = idata["posterior"].to_dataset()
+    dataset["upper"] = -dataset["upper"]
+    idata["posterior"] = dataset
+    with pytest.raises(DataMismatchError, match="60 of 60 draws lie on or outside"):
+        unconstrained_draws(idata, model)
+
+
+def test_no_posterior_group(model):
+    with pytest.raises(ModelError, match="group 'posterior'"):
+        unconstrained_draws(az.from_dict({"prior": {"mu": np.zeros((1, 30))}}), model)
+
+
+def test_too_few_draws(idata, model):
+    idata["posterior"] = idata["posterior"].to_dataset().isel(draw=slice(5))
+    with pytest.raises(ModelError, match="at least 20 draws per chain, got 5"):
+        unconstrained_draws(idata, model)
+
+
+def test_discrete_variables_are_refused():
+    with pm.Model() as model:
+        count = pm.Poisson("count", 3)
+        pm.Normal("y", count, 1, observed=DATA)
+    with pytest.raises(ModelError, match=r"\['count'\] are discrete"):
+        ModelDensity(model)
+
+
+class TestStoredLogDensity:
+    def stored(self, idata, values, name="lp"):
+        idata["sample_stats"] = az.from_dict({"sample_stats": {name: values}})["sample_stats"]
+        return idata
+
+    @pytest.mark.parametrize("name", ["lp", "logp"])
+    def test_is_used(self, idata, density, name):
+        log_density = posterior_of(idata, density)[0].log_density
+        marked = log_density + 1e-6
+        found, _ = posterior_of(self.stored(idata, marked, name), density)
+        np.testing.assert_array_equal(found.log_density, marked)
+
+    def test_of_other_data_is_an_error(self, idata, density):
+        log_density = posterior_of(idata, density)[0].log_density
+        with pytest.raises(DataMismatchError, match="another model, other data"):
+            posterior_of(self.stored(idata, log_density + 0.1), density)
+
+    def test_of_several_step_methods_is_recomputed(self, idata, density):
+        log_density = posterior_of(idata, density)[0].log_density
+        columns = np.stack([log_density - 1, log_density - 2], axis=-1)
+        found, _ = posterior_of(self.stored(idata, columns), density)
+        np.testing.assert_array_equal(found.log_density, log_density)
