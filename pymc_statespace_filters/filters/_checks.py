@@ -1,0 +1,32 @@
+"""Checks of a filter's settings, made once when the filter is constructed."""
+
+from collections.abc import Iterable
+from numbers import Integral, Real
+
+import numpy as np
+
+from pymc_statespace_filters.errors import ModelError
+
+
+def check_count(name: str, value: object) -> int:
+    """Return ``value`` as an int of at least 2."""
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+    if not is_integer or int(value) < 2:  # type: ignore[call-overload]
+        raise ModelError(f"{name} must be an integer of at least 2, got {value!r}.")
+    return int(value)  # type: ignore[call-overload]
+
+
+def check_fraction(name: str, value: object) -> float:
+    """Return ``value`` as a float between 0 and 1."""
+    is_real = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    if not is_real or not 0.0 <= float(value) <= 1.0:  # type: ignore[arg-type]
+        raise ModelError(f"{name} must be a number from 0 to 1, got {value!r}.")
+    return float(value)  # type: ignore[arg-type]
+
+
+def check_choice(name: str, value: object, allowed: Iterable[str]) -> None:
+    """Raise unless ``value`` is one of the allowed words."""
+    words = list(allowed)
+    if value not in words:
+        listed = ", ".join(repr(word) for word in words)
+        raise ModelError(f"{name} must be one of {listed}, got {value!r}.")

@@ -1,0 +1,20 @@
+"""How every njit function of the filters is compiled.
+
+Division by zero gives inf or nan as in NumPy, the interpreter lock is released, and multiplications
+may be fused with additions. No flag that lets the compiler assume finite numbers: the guards
+against NaN and infinity would be compiled away.
+"""
+
+from numba import njit
+
+compiled = njit(error_model="numpy", nogil=True, fastmath={"contract"})
+
+pasted = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
+"""For a function with one caller, or a few instructions inside a loop that must become vector code.
+
+It becomes part of its caller before anything is compiled. Compilation optimises a function again at
+every level that it is called from, so this also halves the time a new model waits.
+"""
+
+reducing = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+"""For sums over members, which may be added up in another order and so become vector code."""

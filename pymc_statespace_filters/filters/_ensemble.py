@@ -1,0 +1,124 @@
+"""The Kalman update of an ensemble: moments, gain and nudge, shared by EnKF and PFEnKF.
+
+Members are columns: X (states, members), D (observables, members). Weights are normalised; with
+equal weights 1/N the weighted covariances of Eqs. 4.32-4.33 are those of Eqs. 4.18-4.19.
+"""
+
+import numpy as np
+
+from pymc_statespace_filters.filters._compile import compiled, reducing
+from pymc_statespace_filters.filters._gaussian import (
+    cholesky,
+    solve_lower,
+    solve_lower_transposed,
+)
+
+
+@compiled
+def mark_finite(X, D, alive):
+    """Set ``alive`` where states and simulated observations are all finite; return how many."""
+    for i in range(alive.size):
+        alive[i] = True
+    for A in (X, D):
+        for a in range(A.shape[0]):
+            for i in range(alive.size):
+                alive[i] &= np.isfinite(A[a, i])
+    return count_true(alive)
+
+
+@compiled
+def count_true(flags):
+    """Return how many flags are set."""
+    count = 0
+    for flag in flags:
+        count += flag
+    return count
+
+
+@compiled
+def copy_members(X, out):
+    """Copy X into out, by loops: a slice assignment brings its error message into every filter."""
+    for a in range(X.shape[0]):
+        for i in range(X.shape[1]):
+            out[a, i] = X[a, i]
+
+
+@compiled
+def equal_weights(alive, count, w):
+    """Weight 1/count for the members alive, zero for the others."""
+    for i in range(w.size):
+        w[i] = 1.0 / count if alive[i] else 0.0
+
+
+@reducing
+def spread_factor(w):
+    """1 - sum w^2, as a sum of positive terms: zero if one member has all the weight."""
+    total = 0.0
+    for i in range(w.size):
+        total += w[i] * (1.0 - w[i])
+    return total
+
+
+@reducing
+def mean(w, X, out):
+    """Weighted mean of each row; members of zero weight may be NaN."""
+    for a in range(X.shape[0]):
+        total = 0.0
+        for i in range(w.size):
+            term = w[i] * X[a, i]
+            total += term if w[i] > 0.0 else 0.0
+        out[a] = total
+
+
+@reducing
+def covariance(w, X, x_mean, Y, y_mean, out):
+    """Weighted covariance of the rows of X with those of Y, over 1 - sum w^2."""
+    scale = 1.0 / spread_factor(w)
+    for a in range(X.shape[0]):
+        for b in range(Y.shape[0]):
+            total = 0.0
+            for i in range(w.size):
+                term = w[i] * (X[a, i] - x_mean[a]) * (Y[b, i] - y_mean[b])
+                total += term if w[i] > 0.0 else 0.0
+            out[a, b] = scale * total
+
+
+@compiled
+def forecast_moments(w, X, D, d, moments):
+    """Moments of states and simulated observations (Eqs. 4.16-4.19, 4.30-4.33).
+
+    P_dd is left as its Cholesky factor.
+
+    A missing component of d gets a row and column of the identity in P_dd and of zero in P_xd, so
+    that it moves nothing. Returns False if P_dd is not positive definite.
+    """
+    x_mean, d_mean, P_xd, P_dd = moments
+    mean(w, X, x_mean)
+    mean(w, D, d_mean)
+    covariance(w, X, x_mean, D, d_mean, P_xd)
+    covariance(w, D, d_mean, D, d_mean, P_dd)
+    for b in range(d.size):
+        if np.isnan(d[b]):
+            P_xd[:, b] = 0.0
+            P_dd[:, b] = 0.0
+            P_dd[b, :] = 0.0
+            P_dd[b, b] = 1.0
+    return cholesky(P_dd)
+
+
+@compiled
+def nudge(d, D, alive, free, moments, X):
+    """x^a_i = x^f_i + K (d - d_i) with K = P_xd P_dd^-1 (Eqs. 4.20-4.21, 4.34-4.35), in place.
+
+    Only free states are moved. P_xd becomes the gain.
+    """
+    _, _, K, P_dd_chol = moments
+    for a in free:
+        solve_lower(P_dd_chol, K[a])
+        solve_lower_transposed(P_dd_chol, K[a])
+        for b in range(d.size):
+            if np.isnan(d[b]):
+                continue
+            for i in range(alive.size):
+                step = K[a, b] * (d[b] - D[b, i])
+                X[a, i] += step if alive[i] else 0.0

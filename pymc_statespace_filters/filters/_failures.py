@@ -1,0 +1,13 @@
+"""Why a filter gave up: codes that machine code can return, and their words."""
+
+NONE = 0
+NO_FINITE_MEMBER = 1
+COVARIANCE_NOT_POSITIVE = 2
+ZERO_WEIGHTS = 3
+
+FAILURES: dict[int, str] = {
+    NONE: "no failure",
+    NO_FINITE_MEMBER: "every member or particle became infinite or NaN",
+    COVARIANCE_NOT_POSITIVE: "the covariance of the predicted observation is not positive definite",
+    ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
+}

@@ -1,0 +1,138 @@
+"""Ensemble Kalman filter with perturbed observations (thesis, section 4.3, Eqs. 4.15-4.26)."""
+
+import math
+from dataclasses import KW_ONLY, dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pymc_statespace_filters.filters._base import EnsembleFilter
+from pymc_statespace_filters.filters._checks import check_choice, check_count
+from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._ensemble import (
+    equal_weights,
+    forecast_moments,
+    mark_finite,
+    nudge,
+)
+from pymc_statespace_filters.filters._failures import (
+    COVARIANCE_NOT_POSITIVE,
+    NO_FINITE_MEMBER,
+    NONE,
+    ZERO_WEIGHTS,
+)
+from pymc_statespace_filters.filters._gaussian import log_gaussian
+from pymc_statespace_filters.filters._loop import filter_loop
+from pymc_statespace_filters.filters._random import OBSERVATION, fill_normals, padded
+from pymc_statespace_filters.filters._weights import log_sum
+
+
+@compiled
+def _ensemble_mean(log_w, log_p, d, moments, residual):
+    """Mean over the members of p(d | x^f_i): the log of Eq. 4.26."""
+    return log_sum(log_w, log_p)
+
+
+@compiled
+def _gaussian_fit(log_w, log_p, d, moments, residual):
+    """log N(d; d_bar, P_dd), observed components only."""
+    _, d_mean, _, P_dd_chol = moments
+    n_present = 0
+    for b in range(d.size):
+        present = not np.isnan(d[b])
+        residual[b] = d[b] - d_mean[b] if present else 0.0
+        n_present += present
+    return log_gaussian(residual, P_dd_chol, n_present)
+
+
+_LIKELIHOODS = {"ensemble": _ensemble_mean, "gaussian": _gaussian_fit}
+
+
+@dataclass(frozen=True)
+class EnKF(EnsembleFilter):
+    """Ensemble Kalman filter: nonlinear forecast of every member, linear update by observations.
+
+    Parameters
+    ----------
+    n_members : int
+        Size N of the ensemble, at least 2.
+    likelihood : {"ensemble", "gaussian"}
+        How p(d_j | d_1 .. d_{j-1}) is read off the forecast ensemble. "ensemble" is the mean of
+        p(d_j | x_i) over the members (Eq. 4.26); "gaussian" is the normal density with mean and
+        covariance of the simulated observations.
+
+    Raises
+    ------
+    ModelError
+        If ``n_members`` is not an integer of at least 2 or ``likelihood`` is not one of the two
+        names.
+
+    Notes
+    -----
+    The posterior that this filter implies is biased where the state is far from Gaussian, however
+    large N.
+
+    A member with a non-finite state or simulated observation is left out of the moments and is not
+    updated. In Eq. 4.26 it counts as zero, and the mean still divides by N.
+
+    Examples
+    --------
+    >>> EnKF(1250)
+    EnKF(n_members=1250, likelihood='ensemble')
+    """
+
+    n_members: int
+    _: KW_ONLY
+    likelihood: str = "ensemble"
+
+    needs_simulated_observations: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_members", check_count("n_members", self.n_members))
+        check_choice("likelihood", self.likelihood, _LIKELIHOODS)
+
+    def kernel(self, machine):
+        """Compile the filter for one system; see ``_loop.filter_loop`` for what is returned."""
+        N, n, p, r = self.n_members, machine.n, machine.p, machine.r
+        free = machine.free
+        observe, log_density = machine.observe, machine.log_density
+        likelihood = _LIKELIHOODS[self.likelihood]
+        width = padded(N)
+        log_N = math.log(N)
+
+        @pasted
+        def workspace():
+            noise, simulated = np.empty((r, width)), np.empty((p, N))
+            alive, w, log_w, log_p = np.empty(N, np.bool_), np.empty(N), np.empty(N), np.empty(N)
+            moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
+            return noise, simulated, alive, w, log_w, log_p, moments, np.empty(p)
+
+        @pasted
+        def update(c, inputs, k, t, d, seed, X, work):
+            Z, D, alive, w, log_w, log_p, moments, residual = work
+
+            # Simulated observations
+            fill_normals(seed, OBSERVATION, k, Z)
+            observe(c, inputs, k, t, Z, X, D)  # Eq. 4.15
+            n_alive = mark_finite(X, D, alive)
+            if n_alive == 0:
+                return -np.inf, 0.0, NO_FINITE_MEMBER
+
+            # Moments of the forecast
+            equal_weights(alive, n_alive, w)
+            if not forecast_moments(w, X, D, d, moments):  # Eqs. 4.16-4.19
+                return -np.inf, float(n_alive), COVARIANCE_NOT_POSITIVE
+
+            # Increment of the log-likelihood
+            log_density(c, inputs, k, t, d, X, log_p)
+            for i in range(N):
+                log_w[i] = -log_N if alive[i] else -np.inf
+            increment = likelihood(log_w, log_p, d, moments, residual)  # Eq. 4.26
+            if not np.isfinite(increment):
+                return -np.inf, 0.0, ZERO_WEIGHTS
+
+            # Analysis
+            nudge(d, D, alive, free, moments, X)  # Eqs. 4.20-4.21
+            return increment, float(n_alive), NONE
+
+        return filter_loop(machine, N, workspace, update)

@@ -1,0 +1,105 @@
+"""BootstrapPF against the same equations in NumPy, and unbiased against the exact likelihood."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters._random import RESAMPLING, uniform
+from pymc_statespace_filters.filters.bootstrap import BootstrapPF
+from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, run
+from tests.filters.machines import kalman, linear_machine, scalar_record
+
+
+class TestBootstrapPF(EnsembleFilterLaws):
+    @pytest.fixture
+    def filter_(self):
+        return BootstrapPF(200)
+
+
+SCALAR = scalar_record()
+
+
+def numpy_bootstrap(machine, steps, observed, n_particles, seed, resample_below):
+    """Eqs. 4.28 and 4.43 with systematic resampling in NumPy; also the smallest N_eff."""
+    _, _, H, R, _, _ = machine.matrices
+    X, terms, smallest = None, [], float(n_particles)
+    w = np.full(n_particles, 1 / n_particles)
+    for step, (start, advance, _), d in zip(
+        steps, forecasts(machine, n_particles, steps, seed), observed, strict=True
+    ):
+        X = advance(start if X is None else X)
+        seen = ~np.isnan(d)
+        if not seen.any():
+            terms.append(0.0)
+            continue
+        log_w = np.log(w) + log_gaussian((d[:, None] - H @ X)[seen], np.diag(R)[seen])
+        terms.append(logsumexp(log_w))
+        w = np.exp(log_w - terms[-1])
+        n_effective = 1 / np.sum(w**2)
+        smallest = min(smallest, n_effective)
+        if n_effective < resample_below * n_particles:
+            points = (np.arange(n_particles) + uniform(seed, RESAMPLING, step)) / n_particles
+            X = X[:, np.searchsorted(np.cumsum(w), points, side="right")]
+            w = np.full(n_particles, 1 / n_particles)
+    return np.array(terms), smallest
+
+
+@pytest.mark.parametrize("resample_below", [0, 1 / 3, 1])
+def test_is_its_equations_written_in_numpy(resample_below):
+    filter_ = BootstrapPF(200, resample_below=resample_below)
+    for seed in range(3):
+        expected, smallest = numpy_bootstrap(*OSCILLATOR, 200, seed, resample_below)
+        terms, health = run(filter_, *OSCILLATOR, seed=seed)
+        assert terms == pytest.approx(expected, rel=1e-9)
+        assert health == pytest.approx([smallest, 0, -1])
+
+
+@pytest.mark.parametrize("resampling", ["systematic", "multinomial"])
+@pytest.mark.parametrize("resample_below", [0, 1 / 3, 1])
+def test_the_mean_of_the_likelihood_is_the_exact_one(resample_below, resampling):
+    machine, steps, observed = SCALAR
+    filter_ = BootstrapPF(50, resample_below=resample_below, resampling=resampling)
+    exact = kalman(machine, steps, observed).sum()
+    logs = np.array([run(filter_, machine, steps, observed, seed=s)[0].sum() for s in range(3000)])
+    ratio = np.exp(logs - exact)
+    assert logs.var() < 2
+    # 3.5 standard errors: one false alarm in 2000 seeds, six cases
+    assert abs(ratio.mean() - 1) < 3.5 * ratio.std() / np.sqrt(ratio.size)
+
+
+def test_resampling_at_every_observation_holds_for_equal_weights_too():
+    # The first observable does not see the state, so the weights stay equal and N_eff = N exactly;
+    # multinomial resampling shows in what the second observable then finds
+    blind_first = linear_machine([[1.0]], [[0.5]], [[0.0], [1.0]], np.eye(2), [0.0], [[1.0]])
+    record = (blind_first, [0, 1], np.array([[1.0, np.nan], [np.nan, 1.0]]))
+    always, never = (
+        run(BootstrapPF(64, resample_below=fraction, resampling="multinomial"), *record)
+        for fraction in (1, 0)
+    )
+    assert always[0][0] == never[0][0]
+    assert always[0][1] != never[0][1]
+
+
+@pytest.mark.parametrize("n_particles", [1, 10.0, True])
+def test_count_must_be_an_integer_of_at_least_two(n_particles):
+    with pytest.raises(ModelError, match=r"n_particles must be an integer of at least 2, got"):
+        BootstrapPF(n_particles)
+
+
+@pytest.mark.parametrize("resample_below", [-0.1, 1.1, np.nan, True, "0.5", None])
+def test_threshold_must_be_a_fraction(resample_below):
+    with pytest.raises(ModelError, match=r"resample_below must be a number from 0 to 1, got"):
+        BootstrapPF(10, resample_below=resample_below)
+
+
+def test_unknown_resampling_lists_the_known_ones():
+    with pytest.raises(ModelError, match="must be one of 'systematic', 'multinomial', got 'none'"):
+        BootstrapPF(10, resampling="none")
+
+
+def test_settings():
+    assert BootstrapPF(10, resample_below=1) == BootstrapPF(10, resample_below=1.0)
+    assert BootstrapPF(10) != BootstrapPF(10, resampling="multinomial")
+    assert BootstrapPF.noisy
+    assert BootstrapPF.unbiased

@@ -1,0 +1,86 @@
+"""Small Gaussian algebra against NumPy and SciPy."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from pymc_statespace_filters.filters._gaussian import (
+    cholesky,
+    log_gaussian,
+    semidefinite_cholesky,
+    solve_lower,
+    solve_lower_transposed,
+)
+
+
+def random_covariance(n, seed, rank=None):
+    A = np.random.default_rng(seed).standard_normal((n, n if rank is None else rank))
+    return A @ A.T
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_cholesky_is_numpys_with_zeros_above(n):
+    A = random_covariance(n, seed=n)
+    L = A.copy()
+    assert cholesky(L)
+    assert pytest.approx(np.linalg.cholesky(A), rel=1e-10, abs=1e-12) == L
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        [[0.0]],
+        [[-1.0]],
+        [[np.nan]],
+        [[np.inf]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[0.01, 0.1], [0.1, 1.0]],  # singular: the last pivot is rounding noise
+        [[1.0, np.nan], [np.nan, 1.0]],
+    ],
+)
+def test_cholesky_says_what_is_not_positive_definite(A):
+    assert not cholesky(np.array(A))
+
+
+def test_semidefinite_factor_of_a_singular_matrix_reproduces_it():
+    A = random_covariance(4, seed=1, rank=2)
+    L, active = A.copy(), np.empty(4, dtype=bool)
+    assert semidefinite_cholesky(L, np.zeros(4), active)
+    assert active.tolist() == [True, True, False, False]
+    assert np.all(L[:, 2:] == 0)
+    assert L @ L.T == pytest.approx(A, rel=1e-10)
+
+
+def test_semidefinite_factor_leaves_out_variances_below_the_floor():
+    L, active = np.diag([1.0, 1e-20, 4.0]), np.empty(3, dtype=bool)
+    assert semidefinite_cholesky(L, np.full(3, 1e-18), active)
+    assert active.tolist() == [True, False, True]
+    assert L.tolist() == np.diag([1.0, 0.0, 2.0]).tolist()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_semidefinite_factor_refuses_what_is_not_finite(bad):
+    assert not semidefinite_cholesky(np.diag([1.0, bad]), np.zeros(2), np.empty(2, dtype=bool))
+
+
+def test_triangular_solves():
+    L = np.linalg.cholesky(random_covariance(5, seed=2))
+    b = np.arange(1.0, 6.0)
+    x, y = b.copy(), b.copy()
+    solve_lower(L, x)
+    solve_lower_transposed(L, y)
+    assert L @ x == pytest.approx(b)
+    assert L.T @ y == pytest.approx(b)
+
+
+def test_log_gaussian_counts_only_the_components_that_are_there():
+    A = random_covariance(3, seed=3)
+    r = np.array([0.3, -1.0, 2.0])
+    assert log_gaussian(r.copy(), np.linalg.cholesky(A), 3) == pytest.approx(
+        multivariate_normal(np.zeros(3), A).logpdf(r)
+    )
+    padded = np.eye(4)
+    padded[1:, 1:] = np.linalg.cholesky(A)
+    assert log_gaussian(np.append(0.0, r), padded, 3) == pytest.approx(
+        multivariate_normal(np.zeros(3), A).logpdf(r)
+    )

@@ -1,0 +1,153 @@
+"""PFEnKF against the same equations in NumPy, and against the exact likelihood."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters._random import RESAMPLING, uniform
+from pymc_statespace_filters.filters.pf_enkf import PFEnKF
+from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, run
+from tests.filters.machines import kalman, linear_machine, scalar_record
+
+SCALAR = scalar_record()
+
+
+class TestPFEnKF(EnsembleFilterLaws):
+    @pytest.fixture
+    def filter_(self):
+        return PFEnKF(200)
+
+
+def kernel_density(X, w, V):
+    """Log of sum_l w_l |H|^-1 K(H^-1 (x_l - v)) at the columns of V (Eqs. 4.36, 4.38, 4.39)."""
+    n = X.shape[0]
+    n_effective = 1 / np.sum(w**2)
+    cov = np.cov(X, aweights=w).reshape(n, n)  # over 1 - sum w^2
+    kernel = multivariate_normal(np.zeros(n), cov * n_effective ** (-2 / (n + 4)))
+    differences = (V.T[:, None, :] - X.T[None, :, :]).reshape(-1, n)
+    log_k = kernel.logpdf(differences).reshape(V.shape[1], X.shape[1])
+    return logsumexp(log_k + np.log(w), axis=1)
+
+
+def numpy_pf_enkf(machine, steps, observed, N, seed, likelihood, resample_below):
+    """Eqs. 4.29-4.44 in NumPy, with systematic resampling."""
+    _, _, H, R, _, _ = machine.matrices
+    X, terms, w, equal = None, [], np.full(N, 1 / N), np.full(N, 1 / N)
+    for step, (start, advance, noise), d in zip(
+        steps, forecasts(machine, N, steps, seed), observed, strict=True
+    ):
+        X = advance(start if X is None else X)
+        seen = ~np.isnan(d)
+        if not seen.any():
+            terms.append(0.0)
+            continue
+
+        def log_p(states, d=d, seen=seen):
+            return log_gaussian((d[:, None] - H @ states)[seen], np.diag(R)[seen])
+
+        D = (H @ X + noise)[seen]
+        covariance = np.cov(np.concatenate([X, D]), aweights=w)
+        n = machine.n
+        K = covariance[:n, n:] @ np.linalg.inv(covariance[n:, n:])
+        X_a = X + K @ (d[seen][:, None] - D)
+        factor = w if likelihood == "as_printed" else equal
+        log_w = np.log(factor) + log_p(X_a)
+        log_w += kernel_density(X, w, X_a) - kernel_density(X_a, equal, X_a)
+        new = np.exp(log_w - logsumexp(log_w))
+        terms.append(
+            {
+                "predictive": logsumexp(np.log(w) + log_p(X)),
+                "weights": logsumexp(log_w),
+                "as_printed": logsumexp(np.log(new) + log_p(X_a)),
+            }[likelihood]
+        )
+        X, w = X_a, new
+        if 1 / np.sum(w**2) < resample_below * N:
+            points = (np.arange(N) + uniform(seed, RESAMPLING, step)) / N
+            X = X[:, np.searchsorted(np.cumsum(w), points, side="right")]
+            w = equal
+    return np.array(terms)
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "resample_below"),
+    [("predictive", 0.9), ("weights", 0), ("as_printed", 0)],
+)
+def test_is_its_equations_written_in_numpy(likelihood, resample_below):
+    filter_ = PFEnKF(150, likelihood=likelihood, resample_below=resample_below)
+    for seed in range(2):
+        expected = numpy_pf_enkf(*OSCILLATOR, 150, seed, likelihood, resample_below)
+        terms, health = run(filter_, *OSCILLATOR, seed=seed)
+        assert terms == pytest.approx(expected, rel=1e-8)
+        assert health[1:].tolist() == [0, -1]
+
+
+def test_approaches_kalman():
+    record = SCALAR
+    exact = kalman(*record).sum()
+    filter_ = PFEnKF(1000, likelihood="weights")
+    errors = np.array([run(filter_, *record, seed=s)[0].sum() - exact for s in range(40)])
+    # the kernel's smoothing leaves a bias of some hundredths; 4 standard errors of the mean
+    assert abs(errors.mean()) < 0.05 + 4 * errors.std() / np.sqrt(40)
+    assert errors.std() < 0.3
+
+
+def test_as_printed_is_too_high_by_tenths_of_a_nat_per_observation():
+    record = SCALAR
+    terms, _ = run(PFEnKF(1000, likelihood="as_printed"), *record)
+    n_observed = np.count_nonzero(terms)
+    assert 0.3 * n_observed < terms.sum() - kalman(*record).sum() < 1.5 * n_observed
+
+
+def test_without_any_spread_it_is_the_bootstrap_filter():
+    # No noise and no spread at the start: all particles are one, and the proposal moves nothing
+    machine = linear_machine([[1.0]], [[0.0]], [[1.0]], [[0.5]], [2.0], [[0.0]])
+    steps, observed = np.arange(3), np.array([[1.5], [2.5], [2.0]])
+    exact = kalman(machine, steps, observed)
+    terms, health = run(PFEnKF(100, likelihood="weights"), machine, steps, observed)
+    assert terms == pytest.approx(exact, rel=1e-10)
+    assert health == pytest.approx([100, 0, -1])
+
+
+def test_a_state_known_exactly_does_not_spoil_the_densities():
+    machine, steps, observed = SCALAR
+    F, G, _, R, m0, L0 = machine.matrices
+    with_clock = linear_machine(
+        np.diag([F[0, 0], 1.0]), [[G[0, 0]], [0.0]], [[1.0, 0.0]], R,
+        [m0[0], 7.1], np.diag([L0[0, 0], 0.0]),
+    )  # fmt: skip
+    filter_ = PFEnKF(1000, likelihood="weights")
+    plain, _ = run(filter_, machine, steps, observed)
+    clocked, _ = run(filter_, with_clock, steps, observed)
+    assert clocked == pytest.approx(plain, rel=1e-9)
+
+
+def test_total_degeneracy_goes_on_with_bootstrap_weights():
+    # A sensor of sd 1e-4 and 20 particles, never resampled: one particle has all the weight at once
+    machine = linear_machine([[1.0]], [[1.0]], [[1.0]], [[1e-8]], [0.0], [[1.0]])
+    steps, observed = np.arange(6), np.linspace(0, 3, 6)[:, None]
+    terms, health = run(PFEnKF(20, resample_below=0), machine, steps, observed)
+    assert np.all(np.isfinite(terms))
+    assert 1 <= health[0] < 20
+    assert health[1] == 0
+
+
+def test_unknown_names_list_the_known_ones():
+    names = "'predictive', 'weights', 'as_printed'"
+    with pytest.raises(ModelError, match=f"likelihood must be one of {names}, got 'ensemble'"):
+        PFEnKF(10, likelihood="ensemble")
+    with pytest.raises(ModelError, match="resampling must be one of"):
+        PFEnKF(10, resampling="residual")
+    with pytest.raises(ModelError, match="n_particles must be"):
+        PFEnKF(1)
+    with pytest.raises(ModelError, match="resample_below must be"):
+        PFEnKF(10, resample_below=2)
+
+
+def test_settings():
+    assert PFEnKF(10) == PFEnKF(10, likelihood="predictive")
+    assert PFEnKF(10) != PFEnKF(10, likelihood="weights")
+    assert PFEnKF.noisy
+    assert not PFEnKF.unbiased

@@ -1,0 +1,115 @@
+"""Resampling: exact ancestors at given points, and the right law of the points."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pymc_statespace_filters.filters._resampling import (
+    POINTS,
+    choose_ancestors,
+    copy_ancestors,
+    multinomial,
+    systematic,
+)
+
+
+def ancestors_at(weights, points):
+    out = np.full(len(points), -1)
+    choose_ancestors(np.array(weights, dtype=float), np.append(points, np.nan), out)
+    return out.tolist()
+
+
+def draw(scheme, weights, seed, step=0):
+    w = np.array(weights, dtype=float)
+    points, out = np.empty(w.size + 1), np.empty(w.size, dtype=np.int64)
+    POINTS[scheme](seed, step, points)
+    choose_ancestors(w, points, out)
+    return out
+
+
+def test_ancestor_is_the_particle_whose_interval_holds_the_point():
+    # v = 0.1, 0.3, 0.6, 1.0 in binary-exact eighths: 1/8, 3/8, 5/8, 1
+    weights = [0.125, 0.25, 0.25, 0.375]
+    points = [0.0, 0.12, 0.125, 0.37, 0.375, 0.6, 0.625, 0.999]
+    assert ancestors_at(weights, points) == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_first_and_last_particle_can_be_chosen_and_none_beyond():
+    assert ancestors_at([0.25] * 4, [1e-300, np.nextafter(1, 0)]) == [0, 3]
+    assert ancestors_at([0.25] * 4, [1.0]) == [3]
+
+
+def test_zero_weights_are_never_chosen_not_even_at_the_ends():
+    weights = [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]
+    points = np.sort(np.concatenate([[0.0, 0.5, 1.0], np.random.default_rng(0).uniform(size=100)]))
+    assert set(ancestors_at(weights, points)) == {1, 3}
+
+
+def test_all_weight_on_one_particle():
+    for where in range(3):
+        weights = np.zeros(3)
+        weights[where] = 1.0
+        for scheme in POINTS:
+            assert draw(scheme, weights, seed=2).tolist() == [where] * 3
+
+
+def test_rounding_of_the_total_does_not_shift_the_end():
+    weights = np.full(10, 0.1)  # adds up to 0.9999999999999999
+    assert ancestors_at(weights, [np.nextafter(1, 0)]) == [9]
+
+
+def test_systematic_counts_are_the_floor_or_ceiling_of_what_is_expected():
+    rng = np.random.default_rng(1)
+    for seed in range(50):
+        w = rng.dirichlet(np.full(37, 0.3))
+        counts = np.bincount(draw("systematic", w, seed), minlength=37)
+        assert counts.sum() == 37
+        assert np.all(np.abs(counts - 37 * w) < 1 + 1e-9)
+
+
+def test_equal_weights_are_a_no_op_under_systematic_resampling():
+    for seed in range(20):
+        assert draw("systematic", np.full(64, 1 / 64), seed).tolist() == list(range(64))
+
+
+@pytest.mark.parametrize("scheme", POINTS)
+def test_expected_counts_are_n_times_the_weights(scheme):
+    w, n_seeds = np.array([0.05, 0.0, 0.4, 0.25, 0.3]), 8000
+    counts = sum(np.bincount(draw(scheme, w, seed), minlength=5) for seed in range(n_seeds))
+    # each mean count has sd at most sqrt(5/4 / 8000); 4 sd: one false alarm in 3000 seeds
+    assert counts[1] == 0
+    assert np.all(np.abs(counts / n_seeds - 5 * w) < 4 * np.sqrt(1.25 / n_seeds))
+
+
+def test_multinomial_counts_have_the_multinomial_variance():
+    w, n_seeds = np.array([0.1, 0.2, 0.3, 0.4]), 4000
+    counts = np.array([np.bincount(draw("multinomial", w, s), minlength=4) for s in range(n_seeds)])
+    # sample variances of bounded counts: relative sd about sqrt(2 / 4000); 5 sd
+    assert counts.var(axis=0) == pytest.approx(4 * w * (1 - w), rel=5 * np.sqrt(2 / n_seeds))
+
+
+def test_multinomial_points_are_sorted_uniforms():
+    points = np.empty(5001)
+    multinomial(3, 0, points)
+    assert np.all(np.diff(points[:5000]) >= 0)
+    assert stats.kstest(points[:5000], "uniform").pvalue > 1e-3
+    spacings = np.diff(points[:5000]) * 5001  # the gaps of sorted uniforms are exponential
+    assert stats.kstest(spacings, "expon").pvalue > 1e-3
+
+
+def test_systematic_points_share_one_offset_which_is_uniform_over_seeds_and_steps():
+    points, offsets = np.empty(9), []
+    for seed in range(30):
+        for step in range(30):
+            systematic(seed, step, points)
+            offsets.append(points[0] * 8)
+            assert np.allclose(np.diff(points[:8]), 1 / 8)
+    assert stats.kstest(offsets, "uniform").pvalue > 1e-3
+
+
+def test_columns_are_copied_from_their_ancestors():
+    X = np.arange(12.0).reshape(2, 6)
+    original = X.copy()
+    ancestors = np.array([0, 0, 3, 3, 5, 5])
+    copy_ancestors(ancestors, X, np.empty_like(X))
+    assert np.array_equal(X, original[:, ancestors])
