@@ -1,0 +1,164 @@
+"""DRAM on real StateSpace variables: a particle filter's noise, seeds and failures."""
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.distribution import FAILURES
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.ops import LogLikelihood
+from pymc_statespace_filters.sampling import DRAM
+from tests.sampling.test_dram import sample
+from tests.sampling.test_noise import Redrawing
+
+STEPS = np.arange(1, 21)
+
+
+def decay(x, q, phi):
+    return [phi * x[0] + q[0]]
+
+
+def level(x):
+    return [x[0]]
+
+
+def process_noise(spread):
+    return [[spread**2]]
+
+
+LINEAR = psf.StateSpaceModel(
+    transition=decay,
+    observation=level,
+    observation_noise=[[0.4]],
+    process_noise=process_noise,
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+TRUTH = {"phi": 0.7, "spread": 0.7}
+DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=3)["observations"].to_numpy()
+
+
+def linear_model(filter):
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 0.5)
+        pm.HalfNormal("spread", 1.0)
+        psf.StateSpace("d", LINEAR, filter, steps=STEPS, observed=DATA)
+    return model
+
+
+def exact_moments():
+    """Means and standard deviations by quadrature over the exact Kalman likelihood."""
+    phi, spread = np.linspace(-1.5, 2.0, 161), np.linspace(0.005, 4.0, 200)
+    grid = np.meshgrid(phi, spread, indexing="ij")
+    params = dict(zip(("phi", "spread"), grid, strict=True))
+    terms = psf.log_likelihood(LINEAR, psf.EKF(), params, DATA, steps=STEPS)
+    log_posterior = terms.sum(axis=-1) - 0.5 * ((grid[0] - 0.5) / 0.5) ** 2 - 0.5 * grid[1] ** 2
+    weight = np.exp(log_posterior - log_posterior.max())
+    weight /= weight.sum()
+    moments = {}
+    for name, values in params.items():
+        mean = np.sum(weight * values)
+        moments[name] = mean, np.sqrt(np.sum(weight * (values - mean) ** 2))
+    return moments
+
+
+def worst_deviations(idata):
+    """Largest error of a mean and of a standard deviation, in Monte Carlo standard errors."""
+    in_mean, in_sd = [], []
+    for name, (mean, sd) in exact_moments().items():
+        draws = idata["posterior"][name].to_numpy()
+        in_mean.append(abs(draws.mean() - mean) / az.mcse(draws, method="mean"))
+        in_sd.append(abs(draws.std() - sd) / az.mcse(draws, method="sd"))
+    return max(in_mean), max(in_sd)
+
+
+FEW = psf.BootstrapPF(20)
+
+
+@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
+def test_the_toy_is_as_noisy_as_claimed():
+    seeds = np.arange(2000)
+    terms = psf.log_likelihood(LINEAR, FEW, TRUTH, DATA, steps=STEPS, seed=seeds)
+    assert 1.5 < terms.sum(axis=-1).var() < 3.0
+
+
+@pytest.mark.parametrize("stages", [1, (2, 2)])
+def test_few_particles_exact_posterior(stages):
+    """Four comparisons at 4 standard errors: one false alarm in 4000 seeds."""
+    with linear_model(FEW):
+        idata = sample(DRAM(stages=stages), draws=25_000)
+    assert max(worst_deviations(idata)) < 4.0
+
+
+def test_the_same_test_finds_redrawn_estimates():
+    with linear_model(FEW):
+        idata = sample(Redrawing(stages=1), draws=25_000)
+    assert max(worst_deviations(idata)) > 8.0
+
+
+def test_the_filter_runs_once_in_an_evaluation():
+    with linear_model(FEW):
+        step = DRAM()
+    nodes = step._log_density._function.maker.fgraph.apply_nodes
+    assert sum(isinstance(node.op, LogLikelihood) for node in nodes) == 1
+
+
+def test_the_seed_of_a_draw_reproduces_its_estimate():
+    with linear_model(FEW) as model:
+        held = model["d_seed"].get_value()
+        idata = sample(DRAM(), draws=100, tune=200)
+        assert model["d_seed"].get_value() == held
+        logp = model.compile_logp()
+        stats, posterior = idata["sample_stats"], idata["posterior"]
+        for draw in range(0, 100, 20):
+            model["d_seed"].set_value(stats["d_seed"][1, draw].to_numpy())
+            at = posterior.isel(chain=1, draw=draw)
+            point = {"phi": at["phi"].to_numpy(), "spread_log__": np.log(at["spread"].to_numpy())}
+            np.testing.assert_allclose(logp(point), stats["lp"][1, draw], rtol=1e-10)
+
+
+@pytest.mark.parametrize("mp_ctx", ["fork", "forkserver"])
+def test_in_processes(mp_ctx):
+    with linear_model(FEW):
+        step = DRAM()
+        one = sample(step, draws=50, tune=100)
+        two = sample(step, draws=50, tune=100, cores=2, mp_ctx=mp_ctx)
+    for group, name in (("posterior", "phi"), ("sample_stats", "d_seed")):
+        np.testing.assert_array_equal(one[group][name], two[group][name])
+
+
+def cubed(x, q, phi):
+    return [phi * x[0] + x[0] ** 3 + q[0]]
+
+
+@pytest.mark.parametrize("filter", [FEW, psf.EKF()], ids=["particles", "EKF"])
+def test_failures_come_with_the_filters_reason(filter):
+    explosive = psf.StateSpaceModel(
+        transition=cubed,
+        observation=level,
+        observation_noise=[[0.4]],
+        process_noise=[[1e-4]],
+        initial_mean=[0.05],
+        initial_cov=[[1e-4]],
+    )
+    with pm.Model():
+        pm.Normal("phi", 0.0, 3.0)
+        psf.StateSpace("d", explosive, filter, steps=[20], observed=[0.0])
+        idata = sample(DRAM(), draws=500, tune=500, discard_tuned_samples=False)
+    stats = idata["warmup_sample_stats"]
+    codes = set(np.unique(stats["failure"]))
+    assert stats["n_failed"].sum() > 0
+    assert codes - {0} <= set(FAILURES) - {0}
+    assert np.isfinite(stats["lp"]).all()
+
+
+def test_a_filter_needs_all_its_parameters_held():
+    with (
+        linear_model(FEW) as model,
+        pytest.raises(ModelError, match=r"of d also depends on spread"),
+    ):
+        DRAM([model["phi"]])
+    with linear_model(psf.EKF()) as model:
+        DRAM([model["phi"]])
