@@ -127,7 +127,7 @@ def test_another_variables_move_keeps_the_noise(toy):
     """The prior of the other variable is re-evaluated, the estimate is not."""
     with toy(noise_sd=1.3) as model:
         other = pm.Normal("other", model["mu"], 1.0)
-        idata = sample([DRAM([model["mu"]]), pm.Metropolis([other])], draws=20_000)
+        idata = sample([DRAM([model["mu"]]), pm.Metropolis([other])], draws=10_000)
     assert max(map(abs, deviations(idata))) < 4.0
     draws = idata["posterior"]["other"].to_numpy()
     mean, sd = exact_posterior()

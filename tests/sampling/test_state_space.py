@@ -94,7 +94,7 @@ def test_few_particles_exact_posterior(stages):
 
 def test_the_same_test_finds_redrawn_estimates():
     with linear_model(FEW):
-        idata = sample(Redrawing(stages=1), draws=25_000)
+        idata = sample(Redrawing(stages=1), draws=12_000)
     assert max(worst_deviations(idata)) > 8.0
 
 
