@@ -23,8 +23,8 @@ PYTEST = -m pytest -n 2 --dist loadfile
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
 
-demo: $(VENV)/.installed  ## three rival models of a double well: tables and pictures in out/
-	$(IN)/python examples/double_well.py
+demo: $(VENV)/.installed  ## three rival models of a double well, in out/; CSV=yours for your own record
+	$(IN)/python examples/double_well.py $(if $(CSV),--csv $(CSV))
 
 demo-quick: $(VENV)/.installed  ## the same with short chains, to see that it runs
 	$(IN)/python examples/double_well.py --quick

@@ -1,22 +1,52 @@
 """Likelihoods, sampling and model choice for nonlinear state-space models in PyMC."""
 
 from pymc_statespace_filters.distribution import StateSpace
+from pymc_statespace_filters.errors import (
+    DataMismatchError,
+    EvidenceWarning,
+    FilterWarning,
+    GradientUnavailableError,
+    LoweringError,
+    ModelError,
+    SamplingWarning,
+    StateSpaceFiltersError,
+)
+from pymc_statespace_filters.evidence import (
+    DimensionCorrection,
+    Evidence,
+    chib_jeliazkov,
+    compare_evidence,
+)
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
 from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
 from pymc_statespace_filters.records import nearest_steps
+from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.simulation import simulate
 
 __all__ = [
+    "DRAM",
     "EKF",
     "BootstrapPF",
+    "DataMismatchError",
+    "DimensionCorrection",
     "EnKF",
     "EulerMaruyama",
+    "Evidence",
+    "EvidenceWarning",
+    "FilterWarning",
+    "GradientUnavailableError",
+    "LoweringError",
+    "ModelError",
     "PFEnKF",
+    "SamplingWarning",
     "StateSpace",
+    "StateSpaceFiltersError",
     "StateSpaceModel",
+    "chib_jeliazkov",
+    "compare_evidence",
     "cubic",
     "freeplay",
     "hysteresis",

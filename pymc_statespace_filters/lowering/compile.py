@@ -31,8 +31,9 @@ from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
 MAX_EXPRESSIONS = 1500
 MAX_OUTPUT_ELEMENTS = 200
 
-# NaN and infinity keep their meaning: failures are found by them.
-FAST_MATH = {"contract", "reassoc", "nsz", "arcp", "afn"}
+# NaN and infinity keep their meaning: failures are found by them. With reassociation allowed beside
+# "nsz", x - x becomes 0 for every x, and numba's isfinite, which is made of it, is always true.
+FAST_MATH = {"contract", "nsz", "arcp"}
 
 # How generated code reads element i of an input; members are columns.
 _ELEMENT = {

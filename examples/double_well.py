@@ -1,0 +1,180 @@
+"""Which equation moves a particle between two wells? Three rivals, one noisy, sparse record.
+
+A particle in a double-well potential is pushed by noise and seen every 0.2 seconds. The record was
+made by ``dx = (4 x - 4 x^3) dt + 0.6 dW``; three models compete for it:
+
+    M1: dx = (alpha x) dt + 0.6 dW + sigma_m dW_m
+    M2: dx = (alpha x + beta x^3) dt + 0.6 dW + sigma_m dW_m
+    M3: dx = (alpha x + beta x^3 + gamma x^5) dt + 0.6 dW + sigma_m dW_m
+
+For each, the posterior is sampled by DRAM and the evidence computed by the method of Chib and
+Jeliazkov; the table of model probabilities, with what the noise of the computation leaves open,
+and pictures go to ``out/``. A record of your own, two columns time and value, takes the place of
+the simulated one with ``--csv``.
+"""
+
+import argparse
+import os
+from pathlib import Path
+
+import arviz as az
+import matplotlib
+import numpy as np
+import pandas as pd
+import pymc as pm
+
+import pymc_statespace_filters as psf
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+DT = 0.01
+NOISE_VARIANCE = 0.08
+RECORD_SEED = 20
+
+
+def drift(x, alpha, beta=0.0, gamma=0.0):
+    return [alpha * x[0] + beta * x[0] ** 3 + gamma * x[0] ** 5]
+
+
+def diffusion(sigma_m):
+    return [[0.6, sigma_m]]
+
+
+def position(x):
+    return [x[0]]
+
+
+double_well = psf.StateSpaceModel(
+    transition=psf.EulerMaruyama(drift, diffusion, dt=DT),
+    observation=position,
+    observation_noise=[[NOISE_VARIANCE]],
+    initial_mean=[1.0],
+    initial_cov=[[0.5]],
+    states=["x"],
+    observables=["position"],
+)
+
+RIVALS = {"M1": ("alpha",), "M2": ("alpha", "beta"), "M3": ("alpha", "beta", "gamma")}
+
+
+def simulated_record(path: Path) -> None:
+    """Write 101 observations of 20 seconds, in both wells, to a CSV of time and value."""
+    truth = {"alpha": 4.0, "beta": -4.0, "sigma_m": 0.0}
+    steps = np.arange(0, 2001, 20)
+    record = psf.simulate(double_well, truth, steps=steps, random_seed=RECORD_SEED)
+    values = record["observations"].values[:, 0]
+    pd.DataFrame({"time": steps * DT, "value": values}).to_csv(path, index=False)
+
+
+def read_record(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and values of a CSV with the columns time and value; an empty value is missing."""
+    table = pd.read_csv(path)
+    times, values = table.iloc[:, 0].to_numpy(float), table.iloc[:, 1].to_numpy(float)
+    return psf.nearest_steps(times, DT, t0=times[0]), values
+
+
+def rival(coefficients: tuple[str, ...], filter, steps, values) -> pm.Model:
+    """The PyMC model of one rival."""
+    with pm.Model() as model:
+        for name in coefficients:
+            pm.Normal(name, 0, 10)
+        pm.HalfNormal("sigma_m", 1)
+        psf.StateSpace("d", double_well, filter, steps=steps, observed=values)
+    return model
+
+
+def filters(n_particles: int) -> dict:
+    return {
+        "bootstrap": psf.BootstrapPF(n_particles),
+        "ekf": psf.EKF(),
+        "enkf": psf.EnKF(n_particles),
+        "pf_enkf": psf.PFEnKF(n_particles),
+    }
+
+
+def study(args: argparse.Namespace) -> pd.DataFrame:
+    """Sample every rival, compute its evidence, write tables and pictures."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.csv or args.out / "record.csv"
+    if args.csv is None:
+        simulated_record(path)
+    steps, values = read_record(path)
+    results, summaries = {}, {}
+    for name, coefficients in RIVALS.items():
+        model = rival(coefficients, filters(args.particles)[args.filter], steps, values)
+        with model:
+            idata = pm.sample(
+                args.draws,
+                tune=args.tune,
+                chains=args.chains,
+                cores=min(args.chains, os.cpu_count() or 1),
+                step=psf.DRAM(),
+                random_seed=args.seed,
+                progressbar=args.progressbar,
+            )
+            psf.chib_jeliazkov(
+                idata, n_proposals=2000, random_seed=args.seed, progressbar=args.progressbar
+            )
+        results[name] = idata
+        summaries[name] = az.summary(idata, var_names=[*coefficients, "sigma_m"])
+    table = psf.compare_evidence(results)
+    table.to_csv(args.out / "model_probabilities.csv")
+    pd.concat(summaries, names=["model", "parameter"]).to_csv(args.out / "parameters.csv")
+    draw_record(steps * DT, values, args.out / "record.png")
+    draw_posterior(results, args.out / "posterior.png")
+    draw_probabilities(table, args.out / "model_probabilities.png")
+    return table
+
+
+def draw_record(times, values, path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
+    axes.plot(times, values, "o", markersize=4)
+    axes.set(xlabel="time [s]", ylabel="position", title="The record")
+    figure.savefig(path, dpi=150)
+
+
+def draw_posterior(results: dict, path: Path) -> None:
+    names = ["alpha", "beta", "gamma", "sigma_m"]
+    figure, rows = plt.subplots(1, len(names), figsize=(12, 3), layout="constrained")
+    for axes, name in zip(rows, names, strict=True):
+        for model, idata in results.items():
+            if name in idata["posterior"]:
+                draws = idata["posterior"][name].values.ravel()
+                axes.hist(draws, bins=60, density=True, histtype="step", label=model)
+        axes.set(xlabel=name, yticks=[])
+        axes.legend(frameon=False)
+    rows[0].set_ylabel("posterior density")
+    figure.savefig(path, dpi=150)
+
+
+def draw_probabilities(table: pd.DataFrame, path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(4, 3), layout="constrained")
+    table = table.sort_index()
+    spread = [table["prob"] - table["prob_low"], table["prob_high"] - table["prob"]]
+    axes.bar(table.index, table["prob"], yerr=np.clip(spread, 0, None), capsize=5, color="C0")
+    axes.set(ylabel="model probability", ylim=(0, 1.05))
+    figure.savefig(path, dpi=150)
+
+
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--csv", type=Path, help="a record of your own: columns time, value")
+    parser.add_argument("--filter", choices=list(filters(2)), default="bootstrap")
+    parser.add_argument("--particles", type=int, default=500)
+    parser.add_argument("--draws", type=int, default=2000)
+    parser.add_argument("--tune", type=int, default=1000)
+    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--quick", action="store_true", help="a short form, for a first look")
+    parser.add_argument("--no-progressbar", dest="progressbar", action="store_false")
+    args = parser.parse_args(argv)
+    if args.quick:
+        args.filter, args.draws, args.tune, args.chains = "ekf", 500, 500, 2
+    return args
+
+
+if __name__ == "__main__":
+    pd.set_option("display.width", 120, "display.max_columns", 20)
+    print(study(arguments()).round(3))
