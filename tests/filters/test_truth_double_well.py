@@ -1,0 +1,98 @@
+"""What each filter gets wrong on the double well, measured against the point-mass filter.
+
+The record crosses the barrier once, after an excursion that no Gaussian update follows.
+"""
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
+from tests.references.records import (
+    DOUBLE_WELL,
+    PRECISE_DOUBLE_WELL,
+    Record,
+    double_well,
+    double_well_with_surprises,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
+
+
+def log_likelihoods(filter, reference, record, n_seeds):
+    """Total log-likelihoods (n_seeds,) from the package."""
+    terms = psf.log_likelihood(
+        DOUBLE_WELL_SYSTEM,
+        filter,
+        double_well_parameters(reference),
+        record.observed,
+        steps=record.steps,
+        seed=np.arange(n_seeds),
+    )
+    return terms.sum(axis=-1)
+
+
+def assert_mean(sample, expected, expected_se=0.0):
+    """Within four standard errors: a right answer fails once in 16 000 (the seeds are fixed)."""
+    standard_error = np.hypot(sample.std(ddof=1) / np.sqrt(len(sample)), expected_se)
+    assert abs(sample.mean() - expected) < 4.0 * standard_error
+
+
+def test_ekf_loses_eighteen_nats_at_the_crossing():
+    record = double_well()
+    terms = psf.log_likelihood(
+        DOUBLE_WELL_SYSTEM,
+        psf.EKF(),
+        double_well_parameters(DOUBLE_WELL),
+        record.observed,
+        steps=record.steps,
+    )
+    error = terms - DOUBLE_WELL.point_mass_filter().run(*record).terms
+    assert error.sum() == pytest.approx(-18.1475, abs=1e-3)
+    crossing = int(np.flatnonzero(np.diff(np.sign(record.observed)))[0])
+    assert error[crossing + 1 : crossing + 4].sum() < -17.0
+
+
+# Bias and its standard error, from the independent filters of tests/references/faulty_filters.py.
+@pytest.mark.parametrize(
+    ("filter", "n_seeds", "bias", "bias_se"),
+    [
+        (psf.EnKF(1000), 100, -6.02, 0.09),
+        pytest.param(psf.PFEnKF(500), 40, -2.69, 0.34, marks=pytest.mark.slow),
+        pytest.param(
+            psf.PFEnKF(500, likelihood="weights"), 40, -3.02, 0.31, marks=pytest.mark.slow
+        ),
+    ],
+    ids=["enkf", "pf_enkf", "pf_enkf_weights"],
+)
+def test_bias_is_that_of_the_algorithm(filter, n_seeds, bias, bias_se):
+    truth = DOUBLE_WELL.point_mass_filter().run(*double_well()).terms.sum()
+    error = log_likelihoods(filter, DOUBLE_WELL, double_well(), n_seeds) - truth
+    assert_mean(error, bias, bias_se)
+
+
+def test_bootstrap_likelihood_has_the_right_mean():
+    truth = DOUBLE_WELL.point_mass_filter().run(*double_well()).terms.sum()
+    error = log_likelihoods(psf.BootstrapPF(1000), DOUBLE_WELL, double_well(), 400) - truth
+    assert error.var() < 2.5
+    assert_mean(np.exp(error), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("reference", "whole_record", "nats_per_observation"),
+    [(DOUBLE_WELL, double_well(), 0.33), (PRECISE_DOUBLE_WELL, double_well_with_surprises(), 1.16)],
+    ids=["noisy_sensor", "precise_sensor"],
+)
+def test_likelihood_as_printed_counts_the_observation_twice(
+    reference, whole_record, nats_per_observation
+):
+    """Its limit is known: the mean of p(d_j | x) under the state's density given d_j as well."""
+    record = Record(*(part[:101] for part in whole_record))
+    answer = reference.point_mass_filter().run(*record)
+    printed = log_likelihoods(
+        psf.PFEnKF(500, likelihood="as_printed"), reference, record, n_seeds=8
+    )
+    excess = (printed - answer.terms.sum()) / len(record.steps)
+    limit = (answer.seen_twice.sum() - answer.terms.sum()) / len(record.steps)
+    assert limit == pytest.approx(nats_per_observation, abs=0.01)
+    assert excess.mean() == pytest.approx(limit, abs=0.05)
