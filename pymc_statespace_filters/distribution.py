@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 from pymc.distributions.distribution import Continuous
 from pymc.logprob.abstract import _logprob
@@ -20,7 +21,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import FAILURES, Filter
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.ops import LogLikelihood
+from pymc_statespace_filters.ops import LogLikelihood, cache_key, check_record
 from pymc_statespace_filters.parameters import check_names, missing_parameters
 from pymc_statespace_filters.records import (
     check_inputs,
@@ -31,7 +32,7 @@ from pymc_statespace_filters.records import (
 )
 from pymc_statespace_filters.simulation import simulator
 
-__all__ = ["FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds"]
+__all__ = ["FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds", "noisy_parents"]
 
 
 class StateSpaceRV(RandomVariable):
@@ -67,10 +68,11 @@ class StateSpaceRV(RandomVariable):
             np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
             for p, n in zip((theta, steps, inputs, t0), cores, strict=False)
         )
-        simulate = simulator(self.system).function
+        simulate, check = simulator(self.system).function, check_record(self.system)
         draws = np.empty((*batch, steps.shape[-1], self.system.p))
         for i in np.ndindex(batch):
             parts = [np.ascontiguousarray(a[i]) for a in (theta, steps, inputs)]
+            check(*parts[1:])
             _, draws[i] = simulate(rng, *parts, float(t0[i]))
         return draws
 
@@ -78,10 +80,11 @@ class StateSpaceRV(RandomVariable):
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _numba_draw(op: StateSpaceRV, node: Any) -> tuple:
     compiled = simulator(op.system)
-    simulate = compiled.function
+    simulate, check, key = compiled.function, check_record(op.system), cache_key(op.system, compiled)
 
     @numba_njit
     def draw(rng, theta, steps, inputs, t0, seed):
+        check(steps, inputs)
         _, observations = simulate(
             rng,
             np.ascontiguousarray(theta),
@@ -92,7 +95,7 @@ def _numba_draw(op: StateSpaceRV, node: Any) -> tuple:
         return observations
 
     # PyTensor asks for a whole number here.
-    return draw, None if compiled.key is None else int(compiled.key[:15], 16)
+    return draw, None if key is None else int(key[:15], 16)
 
 
 @_logprob.register(StateSpaceRV)
@@ -185,18 +188,18 @@ class StateSpace(Continuous):
         model = pm.modelcontext(None)
         _check_kinds(system, filter)
         t0 = check_t0(t0)
-        theta = _theta(system, dict(params or {}), model)
+        theta = _theta(system, {} if params is None else params, model)
         symbolic_steps, at = _steps(steps, times, system.dt, t0)
         data = _observed(observed, system, at)
-        forces = inputs if isinstance(inputs, Variable) else check_inputs(inputs, system, at)
+        forces = _inputs(inputs, system, at)
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
-        time_dim, component_dim = _dims(name, dims)
         full_name = model.name_for(name)
+        time_dim, component_dim = _dims(full_name, dims)
         _add_coord(model, time_dim, t0 + at * system.dt, name)
         _add_coord(model, component_dim, list(system.observables), name)
-        noise_seed = pm.Data(f"{full_name}_seed", seed_array) if filter.noisy else seed_array
+        noise_seed = _add_seed(model, full_name, seed_array) if filter.noisy else seed_array
         return super().__new__(
             cls,
             name,
@@ -214,19 +217,22 @@ class StateSpace(Continuous):
     @classmethod
     def dist(cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any) -> Any:
         """The variable outside a model; parameters are theta, steps, inputs, t0 and seed."""
-        types = (("float64", 1), ("int64", 1), ("float64", 2), ("float64", 0), ("int64", 0))
+        dtypes = ("float64", "int64", "float64", "float64", "int64")
         symbols = [
-            p if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype=dtype), ndim=ndim)
-            for p, (dtype, ndim) in zip(params, types, strict=True)
+            pt.cast(p, dtype) if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype))
+            for p, dtype in zip(params, dtypes, strict=True)
         ]
         return super().dist(symbols, system=system, filter=filter, **kwargs)
 
     @classmethod
     def rv_op(
-        cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any
+        cls, *params: Any, system: StateSpaceModel, filter: Filter, rng: Any = None, **kwargs: Any
     ) -> TensorVariable:
         """Apply the operation; called by PyMC."""
-        return StateSpaceRV(system=system, filter=filter)(*params, **kwargs)
+        rng = pt.random.shared_rng(seed=None) if rng is None else rng
+        operation = StateSpaceRV(system=system, filter=filter)
+        _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
+        return draw
 
     def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:  # noqa: N805
         """A finite record to start from, where the record itself is not observed."""
@@ -243,15 +249,9 @@ def _check_kinds(system: Any, filter: Any) -> None:
     filter.check(system)
 
 
-def _theta(system: StateSpaceModel, params: dict[str, Any], model: pm.Model) -> TensorVariable:
+def _theta(system: StateSpaceModel, params: Mapping[str, Any], model: pm.Model) -> TensorVariable:
     check_names(system, params)
-    found: dict[str, Any] = dict(system.defaults)
-    for name in system.parameters:
-        if model.name_for(name) in model.named_vars:
-            found[name] = model[name]
-        elif name in model.named_vars:
-            found[name] = model.named_vars[name]
-    found |= params
+    found = dict(system.defaults) | _model_variables(system, model) | dict(params)
     if any(name not in found for name in system.parameters):
         raise missing_parameters(system, found)
     parts = []
@@ -269,6 +269,15 @@ def _theta(system: StateSpaceModel, params: dict[str, Any], model: pm.Model) -> 
         parts.append(pt.cast(symbol, "float64").ravel())
     theta = pt.concatenate(parts) if parts else pt.as_tensor(np.zeros(0))
     return pt.specify_shape(theta, (system.n_theta,))
+
+
+def _model_variables(system: StateSpaceModel, model: pm.Model) -> dict[str, Variable]:
+    """Parameters that the model names; what a submodel lacks, the model around it may have."""
+    enclosing = _model_variables(system, model.parent) if model.parent is not None else {}
+    names = {name: model.name_for(name) for name in system.parameters}
+    return enclosing | {
+        name: model.named_vars[full] for name, full in names.items() if full in model.named_vars
+    }
 
 
 def _array(name: str, value: Any) -> np.ndarray:
@@ -303,8 +312,26 @@ def _observed(observed: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
                 f"symbolic observed must have 2 dimensions (observations, observables), "
                 f"got {observed.type.ndim}"
             )
+        if isinstance(observed, SharedVariable):
+            check_observed(observed.get_value(), system, steps.size)
         return observed
     return pt.as_tensor(check_observed(observed, system, steps.size))
+
+
+def _inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
+    """Inputs as numbers, or as a symbol of two dimensions: data, or an expression of parameters."""
+    if not isinstance(inputs, Variable):
+        return check_inputs(inputs, system, steps)
+    if isinstance(inputs, SharedVariable):
+        check_inputs(inputs.get_value(), system, steps)
+    if inputs.type.ndim == 1 and system.n_inputs == 1:
+        inputs = inputs[:, None]
+    if not system.n_inputs or inputs.type.ndim != 2:
+        raise ModelError(
+            f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
+            f"{list(system.inputs)}, got {inputs.type}"
+        )
+    return inputs
 
 
 def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:
@@ -312,17 +339,28 @@ def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:
         return f"{name}_time", "observable"
     if isinstance(dims, str) or len(dims) != 2 or not all(isinstance(d, str) for d in dims):
         raise ModelError(f"dims must be two names, (time, observable), got {dims!r}")
-    return tuple(dims)
+    time_dim, component_dim = dims
+    return time_dim, component_dim
+
+
+def _add_seed(model: pm.Model, name: str, seed: np.ndarray) -> SharedVariable:
+    # What pm.Data does, which would cut the seed to 32 bits.
+    shared = pytensor.shared(seed, name=f"{name}_seed")
+    model.register_data_var(shared)
+    return shared
 
 
 def _add_coord(model: pm.Model, dim: str, values: Any, name: str) -> None:
-    if dim in model.coords and list(model.coords[dim]) != list(values):
-        raise ModelError(
-            f"the model has a dimension {dim!r} with other coordinates; "
-            f"give {name!r} its own names with dims=(..., ...)"
-        )
     if dim not in model.coords:
         model.add_coord(dim, values)
+        return
+    known = model.coords[dim]  # None for a dimension that the user made without coordinates
+    length = model.dim_lengths[dim].eval() if known is None else len(known)
+    if length != len(values) or (known is not None and list(known) != list(values)):
+        raise ModelError(
+            f"the model has a dimension {dim!r} of length {length} with other coordinates; "
+            f"give {name!r} its own names with dims=(..., ...)"
+        )
 
 
 # What samplers, evidence and diagnostics need to know of the variables in a model.
@@ -353,10 +391,10 @@ def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
 
 
 def noisy_parents(model: pm.Model) -> dict[str, list[Variable]]:
-    """For every noisily estimated variable, the free variables that it depends on."""
+    """For every noisily estimated variable, the free variables that its likelihood reads."""
     free = set(model.free_RVs)
     return {
-        name: [v for v in ancestors([node.inputs[2]]) if v in free]
+        name: [v for v in ancestors(node.inputs[2:], blockers=free) if v in free]
         for name, node in _state_space_nodes(model).items()
         if node.op.filter.noisy
     }

@@ -7,6 +7,7 @@ machine code on disk can mix two data sets up.
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
-from pymc_statespace_filters.errors import GradientUnavailableError
+from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.lowering import Compiled, jit, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 HEALTH_SIZE = 3
@@ -129,13 +131,53 @@ def evaluator(op: Op) -> Any:
     )
 
 
+def check_record(system: StateSpaceModel) -> Any:
+    """Compile a check of what `pm.set_data` may have exchanged: machine code reads on regardless."""
+    n_inputs, last_row = system.n_inputs, int(system.observation_uses_inputs)
+
+    @jit
+    def check(steps, inputs):
+        for j in range(steps.size):
+            if steps[j] < 0 or (j > 0 and steps[j] <= steps[j - 1]):
+                raise ModelError("steps must not be negative and must increase strictly")
+        if n_inputs and inputs.shape[1] != n_inputs:
+            raise ModelError("inputs must have one column for each input of the system")
+        if n_inputs and steps.size and inputs.shape[0] < steps[-1] + last_row:
+            raise ModelError("inputs has too few rows: row k holds during step k")
+
+    return check
+
+
+def _check_observed(system: StateSpaceModel) -> Any:
+    p = system.p
+
+    @jit
+    def check(steps, observed):
+        if observed.shape[0] != steps.size or observed.shape[1] != p:
+            raise ModelError("observed must have a row for every step, a column for every observable")
+
+    return check
+
+
+def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
+    """What the machine code of this file is made of, on top of a compiled function."""
+    checked = (system.p, system.n_inputs, system.observation_uses_inputs)
+    return key_of(f"{_THIS_FILE} for {checked}", compiled.key)
+
+
+_THIS_FILE = Path(__file__).read_text()
+
+
 @register_funcify_and_cache_key(LogLikelihood)
 def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
     compiled = op.filter.compile(op.system)
     run = compiled.function
+    check, check_observed = check_record(op.system), _check_observed(op.system)
 
     @numba_njit
     def log_likelihood(theta, steps, observed, inputs, t0, seed):
+        check(steps, inputs)
+        check_observed(steps, observed)
         return run(
             np.ascontiguousarray(theta),
             np.ascontiguousarray(steps),
@@ -145,16 +187,19 @@ def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs
             seed.item(),
         )
 
-    return log_likelihood, compiled.key
+    return log_likelihood, cache_key(op.system, compiled)
 
 
 @register_funcify_and_cache_key(LogLikelihoodGradient)
 def _numba_gradient(op: LogLikelihoodGradient, node: Apply | None = None, **kwargs: Any) -> tuple:
     compiled = op.filter.compile_gradient(op.system)
     run = compiled.function
+    check, check_observed = check_record(op.system), _check_observed(op.system)
 
     @numba_njit
     def log_likelihood_gradient(theta, steps, observed, inputs, t0, seed, terms_bar):
+        check(steps, inputs)
+        check_observed(steps, observed)
         return run(
             np.ascontiguousarray(theta),
             np.ascontiguousarray(steps),
@@ -165,4 +210,4 @@ def _numba_gradient(op: LogLikelihoodGradient, node: Apply | None = None, **kwar
             terms_bar,
         )
 
-    return log_likelihood_gradient, compiled.key
+    return log_likelihood_gradient, cache_key(op.system, compiled)
