@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
@@ -53,7 +54,7 @@ def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
     found: list[str] = []
     parameters: list[str] = []
     defaults: list[tuple[str, Any]] = []
-    for name, argument in inspect.signature(function).parameters.items():
+    for name, argument in _signature(role, function).items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
             raise ModelError(f"{role}: argument {argument} is not a plain named argument")
         if name in symbols:
@@ -72,11 +73,23 @@ def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
     return Equation(role, function, tuple(found), tuple(parameters), tuple(defaults))
 
 
+def _signature(role: str, function: Callable) -> Mapping[str, inspect.Parameter]:
+    try:
+        return inspect.signature(function).parameters
+    except (TypeError, ValueError):  # built-in functions may have none
+        raise ModelError(
+            f"{role}: {function!r} does not tell the names of its arguments; wrap it in a "
+            f"function of your own"
+        ) from None
+
+
 def _default(role: str, name: str, value: Any) -> Any:
     try:
         array = np.asarray(value, dtype="float64")
     except (TypeError, ValueError):
-        raise ModelError(f"{role}: the default of {name!r} must be a number, got {value!r}") from None
+        array = np.asarray(np.nan)
+    if value is None or not np.isfinite(array).all():
+        raise ModelError(f"{role}: the default of {name!r} must be a finite number, got {value!r}")
     # Nested tuples, because a system is hashable.
     return float(array) if array.ndim == 0 else _nested_tuple(array.tolist())
 
@@ -101,6 +114,11 @@ def as_symbol(role: str, value: Any) -> TensorVariable:
         return symbol if symbol.type.dtype == "float64" else pt.cast(symbol, "float64")
     if value is None:
         raise ModelError(f"{role} returns None; return one expression per component")
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        raise ModelError(
+            f"{role} returns a numpy array of symbols, {_short(value)}: numpy does not see into "
+            f"symbols. Return a list, and use pytensor.tensor (pt.roll, pt.stack, @) for arrays"
+        )
     try:
         # A 64-bit array: PyTensor would store a bare 0.5 in single precision.
         return pt.as_tensor(np.asarray(value, dtype="float64"))
@@ -136,7 +154,7 @@ def as_matrix(
 
 
 def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]) -> TensorVariable:
-    shape = symbol.type.shape
+    shape = _static_shape(symbol)
     if None in shape:
         if None in expected:
             raise ModelError(f"{role}: the shape of what it returns is not known before it runs")
@@ -144,7 +162,17 @@ def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]
     wanted = tuple(s if e is None else e for e, s in zip(expected, shape, strict=True))
     if shape != wanted:
         raise ModelError(f"{role} must have shape {wanted}, got {shape}")
-    return symbol
+    return symbol if symbol.type.shape == shape else pt.specify_shape(symbol, shape)
+
+
+def _static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
+    """The shape as far as it is known; some operations (pt.roll) only compute it."""
+    if None not in symbol.type.shape:
+        return symbol.type.shape
+    lengths = constant_fold(
+        [symbol.shape[i] for i in range(symbol.type.ndim)], raise_not_constant=False
+    )
+    return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
 
 
 def constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
@@ -174,3 +202,8 @@ def constant_covariance(role: str, value: Any, size: int | None, *, definite: bo
             f"every observed component needs noise of its own ({matrix.tolist()})"
         )
     return matrix
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -7,6 +7,7 @@ small enough, and call PyTensor's own array code otherwise; a caller cannot tell
 """
 
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,12 +18,14 @@ import numba
 import numpy as np
 import pytensor
 import pytensor.scalar as ps
+from pytensor.compile.mode import get_mode
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FunctionGraph
 from pytensor.graph.traversal import io_toposort
 from pytensor.link.numba.dispatch.basic import numba_funcify, numba_funcify_and_cache_key
 
 from pymc_statespace_filters.errors import LoweringError
+from pymc_statespace_filters.lowering.loops import use_loops
 from pymc_statespace_filters.lowering.scalars import Arena, Value
 from pymc_statespace_filters.lowering.source import Writer, depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
@@ -191,6 +194,12 @@ def digest(*parts: str) -> str:
     return hashlib.sha256("\0".join((_source_digest(), *parts)).encode()).hexdigest()
 
 
+def key_of(what: str, *keys: str | None) -> str | None:
+    """The key of code made of ``what`` and compiled parts; None if a part cannot be cached."""
+    known = [key for key in keys if key is not None]
+    return digest(what, *known) if len(known) == len(keys) else None
+
+
 @cache
 def _source_digest() -> str:
     """Machine code on disk must not outlive the code that it was made by."""
@@ -210,7 +219,17 @@ def _array_vector_function(name: str, function: VectorFunction) -> Compiled:
         f"out[{i}].item()" if scalar else f"out[{i}].copy()"
         for i, scalar in enumerate(function.scalar)
     ]
-    body = [f"out = array_code({_whole(used)})", f"return {', '.join(results)}"]
+    nothing = [
+        "nan" if scalar else f"np.full({output.type.shape[0]}, nan)"
+        for scalar, output in zip(function.scalar, graph.outputs, strict=True)
+    ]
+    body = [
+        "try:",
+        f"    out = array_code({_whole(used)})",
+        f"    return {', '.join(results)}",
+        "except Exception:",  # a singular matrix, say
+        f"    return {', '.join(nothing)}",
+    ]
     return _build_on_arrays(name, function.arguments, body, array_code=compiled)
 
 
@@ -222,16 +241,25 @@ def _array_member_function(name: str, arguments: str, graph: Graph, target: str)
     used_members = _used({n: v for n, v in graph.inputs.items() if n in _MEMBER_INPUTS}, graph.outputs)
     before = array_code(list(used_common.values()), shared)
     inside = array_code([*used_members.values(), *shared], graph.outputs)
-    calls = ", ".join([_whole(used_members), "*shared"]) if used_members else "*shared"
+    whole, _, element = target.partition("[")
+    row = "i, " if "{i}" in element else ""
+    members = [_whole(used_members)] if used_members else []
+    calls = ", ".join([*members, *(f"shared[{i}]" for i in range(len(shared)))])
     body = [
-        f"shared = before({_whole(used_common)})",
-        f"for member in range({arguments.split(', ')[-1]}.shape[-1]):",
-        f"    out = inside({calls})[0]",
+        "try:",
+        f"    shared = before({_whole(used_common)})",
+        "except Exception:",  # a singular matrix, say
+        f"    {whole}[:] = nan",
+        "    return",
+        f"for member in range({whole}.shape[-1]):",
+        "    try:",
+        f"        result = inside({calls})[0]",
+        "    except Exception:",
+        f"        {whole}[..., member] = nan",
+        "    else:",
+        "        for i in range(result.size):",
+        f"            {whole}[{row}member] = result[i]",
     ]
-    if "{i}" in target:
-        body += ["    for i in range(out.size):", f"        {target.format(i='i')} = out[i]"]
-    else:
-        body += [f"    {target} = out[0]"]
     return _build_on_arrays(name, arguments, body, before=before, inside=inside)
 
 
@@ -239,9 +267,7 @@ def _build_on_arrays(name: str, arguments: str, body: list[str], **parts: Compil
     source = f"def {name}({arguments}):\n" + "".join(f"    {line}\n" for line in body)
     namespace = _GLOBALS | {part: compiled.function for part, compiled in parts.items()}
     exec(compile(source, f"<{name} of a state-space system>", "exec"), namespace)
-    keys = [compiled.key for compiled in parts.values()]
-    key = None if None in keys else digest(source, *keys)
-    return Compiled(jit(namespace[name]), key)
+    return Compiled(jit(namespace[name]), key_of(source, *(part.key for part in parts.values())))
 
 
 def _whole(inputs: Mapping[str, Variable]) -> str:
@@ -272,12 +298,22 @@ def _frontier(
 
 
 def array_code(inputs: list, outputs: Sequence[Variable]) -> Compiled:
-    function = pytensor.function(
-        inputs, list(outputs), mode="NUMBA", on_unused_input="ignore", trust_input=True
-    )
-    graph: FunctionGraph = function.maker.fgraph
-    try:
-        code, key = numba_funcify_and_cache_key(graph)
-    except NotImplementedError as error:
-        raise LoweringError(f"A function of the system has no compiled form: {error}") from error
+    # PyMC's checks of parameters become minus infinity: nothing may raise inside a filter.
+    mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
+    with warnings.catch_warnings():
+        # Python code called back from machine code: slow, not cacheable, and it holds the lock.
+        warnings.filterwarnings("error", "Numba will use object mode", UserWarning)
+        try:
+            function = pytensor.function(
+                inputs, list(outputs), mode=mode, on_unused_input="ignore", trust_input=True
+            )
+            graph: FunctionGraph = function.maker.fgraph
+            use_loops(graph)
+            code, key = numba_funcify_and_cache_key(graph)
+        except (NotImplementedError, UserWarning) as error:
+            raise LoweringError(
+                f"A function of the system holds an operation without a compiled form ({error}) "
+                f"Write the function without it, in terms of pytensor.tensor operations that "
+                f"numba supports."
+            ) from error
     return Compiled(code, None if key is None else digest(str(key)))

@@ -7,6 +7,7 @@ identity matrices are mostly zeros and ones, and what they would cost is removed
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import pytensor.scalar as ps
@@ -30,6 +31,9 @@ _COMPARISONS = (ps.LT, ps.GT, ps.LE, ps.GE, ps.EQ, ps.NEQ, ps.IsNan, ps.IsInf)
 _LOGICAL = (ps.AND, ps.OR, ps.XOR, ps.Invert)
 _CLOSED_ON_INTEGERS = (ps.Add, ps.Sub, ps.Mul, ps.Neg, ps.Abs, ps.IntDiv, ps.Mod, ps.Sqr,
                        ps.ScalarMaximum, ps.ScalarMinimum, ps.Sign, *_LOGICAL)  # fmt: skip
+
+
+_CASTS = {FLOAT: ps.Cast(ps.float64), INTEGER: ps.Cast(ps.int64), BOOLEAN: ps.Cast(ps.bool)}
 
 
 def is_constant(value: Value) -> bool:
@@ -73,8 +77,12 @@ class Arena:
         if all(map(is_constant, args)):
             return _fold(op, args)
         rule = self._rules.get(type(op))
-        simplified = rule(op, *args) if rule else None
-        return self._intern(op, args, _result_kind(op, args)) if simplified is None else simplified
+        simplified, kind = rule(op, *args) if rule else None, _result_kind(op, args)
+        if simplified is None:
+            return self._intern(op, args, kind)
+        # What a neutral element left may be a truth value where a number is meant.
+        same = kind_of(simplified) == kind
+        return simplified if same else self.apply(_CASTS[kind], simplified)
 
     def _intern(self, op: ps.ScalarOp | None, args: tuple, kind: str) -> Expression:
         key = (op, kind, *((a.number if isinstance(a, Expression) else (type(a), repr(a)))
@@ -83,9 +91,14 @@ class Arena:
             self._interned[key] = Expression(op, args, kind, len(self._interned))
         return self._interned[key]
 
+    def _reduced(self, op: ps.ScalarOp, args: tuple) -> Value:
+        return reduce(lambda a, b: self.apply(op, a, b), args)
+
     # Rules: return None for "keep as it is".
 
     def _add(self, op: ps.ScalarOp, *args: Value) -> Value | None:
+        if _all_boolean(args):
+            return self._reduced(ps.or_, args)
         kept = [a for a in args if not _is(a, 0)]
         if not kept:
             return 0.0
@@ -98,6 +111,8 @@ class Arena:
         return total
 
     def _mul(self, op: ps.ScalarOp, *args: Value) -> Value | None:
+        if _all_boolean(args):
+            return self._reduced(ps.and_, args)
         if any(_is(a, 0) for a in args):
             return 0.0
         kept = [a for a in args if not _is(a, 1)]
@@ -125,12 +140,11 @@ class Arena:
         return a if _is(b, 1) else 0.0 if _is(a, 0) else None
 
     def _neg(self, op: ps.ScalarOp, a: Value) -> Value | None:
-        negated_twice = isinstance(a, Expression) and isinstance(a.op, ps.Neg)
-        return a.args[0] if negated_twice else None
+        return a.args[0] if isinstance(a, Expression) and isinstance(a.op, ps.Neg) else None
 
     def _pow(self, op: ps.ScalarOp, base: Value, exponent: Value) -> Value | None:
         """Small whole powers become products: they vectorise, libm's ``pow`` does not."""
-        if not is_constant(exponent):
+        if isinstance(exponent, Expression):
             return None
         if exponent == 0:
             return 1.0
@@ -160,6 +174,11 @@ class Arena:
         return a if kind_of(a) == _kind_of_dtype(op.o_type.dtype) else None
 
 
+def _all_boolean(args: tuple) -> bool:
+    """PyTensor's sums and products of truth values are truth values, like numpy's."""
+    return all(kind_of(a) == BOOLEAN for a in args)
+
+
 def _kind_of_dtype(dtype: str) -> str:
     return BOOLEAN if dtype == "bool" else INTEGER if "int" in dtype else FLOAT
 
@@ -169,8 +188,10 @@ def _result_kind(op: ps.ScalarOp, args: tuple) -> str:
         return BOOLEAN
     if isinstance(op, ps.Cast):
         return _kind_of_dtype(op.o_type.dtype)
+    if isinstance(op, ps.Identity | ps.Second):
+        return kind_of(args[-1])
     kinds = {kind_of(a) for a in (args[1:] if isinstance(op, ps.Switch) else args)}
-    if kinds == {BOOLEAN} and isinstance(op, (*_LOGICAL, ps.Switch)):
+    if kinds == {BOOLEAN} and isinstance(op, (*_LOGICAL, ps.Switch, ps.Add, ps.Mul)):
         return BOOLEAN
     whole = FLOAT not in kinds and isinstance(op, (*_CLOSED_ON_INTEGERS, ps.Switch))
     return INTEGER if whole else FLOAT

@@ -5,8 +5,9 @@ constants. Operations that only move elements (indexing, joining, reshaping) are
 those arrays; elementwise operations, sums and small linear algebra are written out.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
+from typing import Any
 
 import numpy as np
 import pytensor.scalar as ps
@@ -31,7 +32,7 @@ from pytensor.tensor.subtensor import (
     unflatten_index_variables,
 )
 
-from pymc_statespace_filters.lowering.scalars import Arena, is_constant, plain
+from pymc_statespace_filters.lowering.scalars import Arena, Value, is_constant, plain
 
 
 class NotUnrollableError(Exception):
@@ -141,10 +142,13 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     (array,) = arguments
     axes = tuple(range(array.ndim)) if node.op.axis is None else tuple(node.op.axis)
     kept = [axis for axis in range(array.ndim) if axis not in axes]
+    # A sum of truth values counts them.
+    counts = node.inputs[0].type.dtype == "bool" and node.outputs[0].type.dtype != "bool"
+    cast = ps.Cast(ps.get_scalar_type(node.outputs[0].type.dtype))
     rows = np.transpose(array, (*kept, *axes)).reshape(*(array.shape[a] for a in kept), -1)
     out = np.empty(rows.shape[:-1], dtype=object)
     for index in np.ndindex(out.shape):
-        terms = list(rows[index])
+        terms = [arena.apply(cast, term) for term in rows[index]] if counts else list(rows[index])
         identity = plain(np.asarray(getattr(node.op.scalar_op, "identity", 0)))
         out[index] = reduce(lambda a, b: arena.apply(node.op.scalar_op, a, b), terms or [identity])
     return [out]
@@ -157,7 +161,7 @@ def _matmul(arena: Arena, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _inner(arena: Arena, a: Sequence, b: Sequence):
+def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
     products = [arena.apply(ps.mul, x, y) for x, y in zip(a, b, strict=True)]
     return arena.apply(ps.add, *products) if len(products) > 1 else products[0] if products else 0.0
 
@@ -238,8 +242,8 @@ def _inc_subtensor(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     updates = np.broadcast_to(update, np.shape(positions))
     out = target.copy()
     for index in np.ndindex(np.shape(positions)):
-        place = np.unravel_index(np.asarray(positions)[index], target.shape)
-        new = updates[index]
+        place: Any = np.unravel_index(np.asarray(positions)[index], target.shape)
+        new: Any = updates[index]
         out[place] = new if node.op.set_instead_of_inc else arena.apply(ps.add, out[place], new)
     return [out]
 
@@ -265,7 +269,9 @@ def _check(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     """A parameter check of a PyMC distribution: where it fails the log-density is minus infinity."""
     value, *conditions = arguments
     for condition in conditions:
-        holds = reduce(lambda a, b: arena.apply(ps.and_, a, b), condition.flat, True)
+        holds: Value = True
+        for each in condition.flat:
+            holds = arena.apply(ps.and_, holds, each)
         value = _elementwise(arena, ps.switch, _as_array(holds), value, _as_array(float("-inf")))
     return [value]
 
