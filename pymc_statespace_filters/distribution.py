@@ -19,7 +19,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import FAILURES, Filter
+from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.ops import LogLikelihood, cache_key, check_record
 from pymc_statespace_filters.parameters import check_names, missing_parameters
@@ -32,7 +32,7 @@ from pymc_statespace_filters.records import (
 )
 from pymc_statespace_filters.simulation import simulator
 
-__all__ = ["FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds", "noisy_parents"]
+__all__ = ["COLLAPSED", "FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds", "noisy_parents"]
 
 
 class StateSpaceRV(RandomVariable):
@@ -80,7 +80,8 @@ class StateSpaceRV(RandomVariable):
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _numba_draw(op: StateSpaceRV, node: Any) -> tuple:
     compiled = simulator(op.system)
-    simulate, check, key = compiled.function, check_record(op.system), cache_key(op.system, compiled)
+    simulate, check = compiled.function, check_record(op.system)
+    key = cache_key(op.system, compiled)
 
     @numba_njit
     def draw(rng, theta, steps, inputs, t0, seed):
@@ -134,6 +135,8 @@ class StateSpace(Continuous):
         When observations were taken; give one of them. See `log_likelihood`.
     observed : array_like, shape (J, p) or (J,), optional
         The data. NaN means missing and is never imputed; a wholly missing row has the term 0.
+        To exchange data later give `steps`, `observed` and `inputs` as ``pm.Data``, with
+        ``dims=("{name}_time", "observable")``; ``pm.Data`` holds no NaN, ``pytensor.shared`` does.
     inputs : array_like, shape (rows, n_inputs), optional
         Row k holds during step k.
     t0 : float
@@ -234,7 +237,7 @@ class StateSpace(Continuous):
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 
-    def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:  # noqa: N805
+    def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:
         """A finite record to start from, where the record itself is not observed."""
         return pt.zeros_like(rv)
 
@@ -403,13 +406,10 @@ def noisy_parents(model: pm.Model) -> dict[str, list[Variable]]:
 def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
     nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
-    return [
-        node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)
-    ]
+    return [node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)]
 
 
 def exactness(model: pm.Model) -> bool:
     """Whether sampling the model targets its posterior without a bias of a filter's noise."""
     filters = [node.op.filter for node in _state_space_nodes(model).values()]
     return all(not f.noisy or f.unbiased for f in filters)
-

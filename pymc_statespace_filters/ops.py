@@ -55,18 +55,25 @@ class LogLikelihood(Op):
         return f"{type(self).__name__}{{{self.filter}}}"
 
     def make_node(self, *inputs: Any) -> Apply:
+        """Apply to symbols or numbers; the names and types are in `_INPUT_TYPES`."""
         return Apply(self, _typed(inputs), [pt.dvector(), pt.dvector()])
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """As many terms as steps."""
         return [(input_shapes[1][0],), (HEALTH_SIZE,)]
 
     def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        """Evaluate in PyTensor's modes without numba: by the same machine code."""
         for cell, value in zip(output_storage, evaluator(self)(*inputs), strict=True):
             cell[0] = value
 
     def pullback(
-        self, inputs: Sequence[Variable], outputs: Sequence[Variable], cotangents: Sequence[Variable]
+        self,
+        inputs: Sequence[Variable],
+        outputs: Sequence[Variable],
+        cotangents: Sequence[Variable],
     ) -> list[Variable]:
+        """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
         if not self.filter.has_gradient:
             raise GradientUnavailableError(
                 f"The likelihood by {self.filter} is a random estimate without a gradient, so "
@@ -86,7 +93,7 @@ class LogLikelihood(Op):
 
 
 class LogLikelihoodGradient(Op):
-    """The vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,)."""
+    """Vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,)."""
 
     __props__ = ("system", "filter")
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
@@ -95,13 +102,16 @@ class LogLikelihoodGradient(Op):
     __str__ = LogLikelihood.__str__
 
     def make_node(self, *inputs: Any) -> Apply:
+        """Apply to the inputs of `LogLikelihood` and the cotangent of its terms."""
         terms_bar = pt.as_tensor(inputs[-1], dtype="float64")
         return Apply(self, [*_typed(inputs[:-1]), terms_bar], [pt.dvector()])
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """The shape of theta."""
         return [input_shapes[0]]
 
     def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        """Evaluate in PyTensor's modes without numba: by the same machine code."""
         (output_storage[0][0],) = evaluator(self)(*inputs)
 
 
@@ -132,7 +142,7 @@ def evaluator(op: Op) -> Any:
 
 
 def check_record(system: StateSpaceModel) -> Any:
-    """Compile a check of what `pm.set_data` may have exchanged: machine code reads on regardless."""
+    """Compile a check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
     n_inputs, last_row = system.n_inputs, int(system.observation_uses_inputs)
 
     @jit
@@ -154,7 +164,7 @@ def _check_observed(system: StateSpaceModel) -> Any:
     @jit
     def check(steps, observed):
         if observed.shape[0] != steps.size or observed.shape[1] != p:
-            raise ModelError("observed must have a row for every step, a column for every observable")
+            raise ModelError("observed must have a row for each step, a column for each observable")
 
     return check
 

@@ -1,6 +1,7 @@
-"""Small linear systems for tests of the machinery: cheap to compile, exact by Kalman's formulas."""
+"""Small linear systems for tests of the machinery: quick to compile, exact by Kalman's formulas."""
 
 import numpy as np
+
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
@@ -55,3 +56,12 @@ def pair_terms(a, b=0.2, observed=PAIR_DATA, steps=STEPS):
         observed=observed,
         steps=steps,
     )
+
+
+def forced_terms(a, observed=FORCED_DATA, steps=STEPS, force=FORCE):
+    """The exact terms of FORCED."""
+    one = np.eye(1)
+    return kalman_log_likelihood(
+        [[a]], one, one, 0.5 * one, [0.0], one, observed=observed, steps=steps,
+        forcing=np.reshape(force, (-1, 1)),
+    )  # fmt: skip

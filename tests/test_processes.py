@@ -1,0 +1,117 @@
+"""Compiled models in other processes: children of every kind, and the machine code kept on disk."""
+
+import json
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.ops import cache_key
+from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
+
+ROOT = Path(__file__).parents[1]
+POINT = {"a": np.array(0.6)}
+
+
+def evaluate(pickled, point):
+    """Call a pickled function of a point."""
+    return pickle.loads(pickled)(point)
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork\\(\\) may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+def test_a_compiled_model_gives_the_same_bits_in_a_child(method):
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {method} on this platform")
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.2)
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
+    logp = model.compile_logp()
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        there = pool.submit(evaluate, cloudpickle.dumps(logp), POINT).result(timeout=120)
+    assert there == logp(POINT)
+
+
+# What a script of the user's does, in a process of its own: settings on the command line.
+SCRIPT = """
+import json, sys
+import numpy as np, pymc as pm
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.ops import cache_key
+from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
+
+results = []
+for system, observed in json.loads(sys.argv[1]):
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.2)
+        psf.StateSpace(
+            "d", forced(**system), psf.EKF(), steps=STEPS, observed=observed, inputs=FORCE
+        )
+    results.append(model.compile_logp([model["d"]], sum=False)({"a": np.array(0.6)})[0].tolist())
+key = cache_key(forced(), psf.EnKF(20).compile(forced()))
+print(json.dumps([results, key]))
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run the script on a cache of machine code that only this test has."""
+    cache = tmp_path / "cache"
+
+    def run(*cases):
+        flags = f"base_compiledir={cache},blas__ldflags="
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", SCRIPT, json.dumps(cases)],
+            cwd=ROOT,
+            env=os.environ | {"PYTENSOR_FLAGS": flags, "PYTHONHASHSEED": "random"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        results, key = json.loads(done.stdout)
+        machine_code = {p for p in cache.rglob("*") if p.suffix in {".nbc", ".nbi"}}
+        return results, key, machine_code
+
+    return run
+
+
+def here(system, observed):
+    return psf.log_likelihood(
+        forced(**system), psf.EKF(), POINT, observed, steps=STEPS, inputs=FORCE
+    )
+
+
+def test_machine_code_is_found_again_and_never_mixed_up(run):
+    """Other data and other constants meet the cache that the first ones filled."""
+    data, other_data = FORCED_DATA.tolist(), (2 * FORCED_DATA).tolist()
+    first, (cold, key, machine_code) = [{}, data], run([{}, data])
+    assert machine_code
+    np.testing.assert_allclose(cold[0], here(*first), rtol=1e-13)
+
+    warm, same_key, same_machine_code = run(first)
+    assert same_machine_code == machine_code
+    assert same_key == key == cache_key(FORCED, psf.EnKF(20).compile(FORCED))
+    assert warm == cold
+
+    cases = [
+        [{}, other_data],
+        [{"observation_noise": [[0.6]]}, data],
+        [{"process_noise": [[1.1]]}, data],
+        [{"initial_cov": [[3.0]]}, data],
+    ]
+    others, _, _ = run(*cases)
+    for terms, case in zip(others, cases, strict=True):
+        np.testing.assert_allclose(terms, here(*case), rtol=1e-13)
+    # The changes are such that the numbers tell them apart.
+    assert len({round(sum(terms), 6) for terms in (*cold, *others)}) == 5
