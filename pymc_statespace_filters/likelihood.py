@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.filters import FAILURES, Filter
+from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.ops import HEALTH_SIZE, LogLikelihood, evaluator
 from pymc_statespace_filters.parameters import flat_parameters
@@ -107,10 +107,6 @@ def log_likelihood(
         )
     warn_of(filter, health.reshape(-1, HEALTH_SIZE))
     return terms
-
-
-# Fewer effective particles than this and a single one decides the estimate.
-COLLAPSED = 3.0
 
 
 def warn_of(filter: Filter, health: np.ndarray) -> None:

@@ -6,7 +6,7 @@ A filter has the attributes ``noisy`` (its likelihood is an estimate that depend
 ``(theta, steps, observed, inputs, t0, seed) -> (terms, health)``.
 """
 
-from pymc_statespace_filters.filters._failures import FAILURES
+from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.enkf import EnKF
@@ -14,4 +14,4 @@ from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 
 type Filter = EKF | EnKF | BootstrapPF | PFEnKF
 
-__all__ = ["EKF", "FAILURES", "BootstrapPF", "EnKF", "Filter", "PFEnKF"]
+__all__ = ["COLLAPSED", "EKF", "FAILURES", "BootstrapPF", "EnKF", "Filter", "PFEnKF"]

@@ -1,5 +1,8 @@
 """Why a filter gave up: codes that machine code can return, and their words."""
 
+# Fewer effective particles than this, and one of them decides the estimate.
+COLLAPSED = 3.0
+
 NONE = 0
 NO_FINITE_MEMBER = 1
 COVARIANCE_NOT_POSITIVE = 2

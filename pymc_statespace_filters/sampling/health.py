@@ -12,6 +12,10 @@ from pymc_statespace_filters.sampling.log_density import NOT_A_NUMBER
 TOLERATED_FAILURES = 0.01
 
 
+# Share of the draws that may rest on collapsed particles: a rare surprise costs only mixing.
+TOLERATED_COLLAPSES = 0.5
+
+
 class Record(NamedTuple):
     """Counts of a chain in its present phase, warm-up or sampling.
 
@@ -23,15 +27,18 @@ class Record(NamedTuple):
         Evaluations of the model.
     failures : tuple of (int, int)
         Pairs of a failure's code and its count.
+    collapsed : int
+        Iterations that ended at an estimate which hardly more than one particle decided.
     """
 
     iterations: int = 0
     moved: int = 0
     evaluations: int = 0
     failures: tuple[tuple[int, int], ...] = ()
+    collapsed: int = 0
 
-    def include(self, moved: bool, codes: tuple[int, ...]) -> "Record":
-        """Take in an iteration: whether it moved, and each evaluation's failure code (0: none)."""
+    def include(self, moved: bool, codes: tuple[int, ...], collapsed: bool = False) -> "Record":
+        """Take in an iteration: whether it moved, each evaluation's failure code (0: none)."""
         failures = self.failures
         if any(codes):
             counts = dict(failures)
@@ -39,7 +46,11 @@ class Record(NamedTuple):
                 counts[code] = counts.get(code, 0) + 1
             failures = tuple(counts.items())
         return Record(
-            self.iterations + 1, self.moved + moved, self.evaluations + len(codes), failures
+            self.iterations + 1,
+            self.moved + moved,
+            self.evaluations + len(codes),
+            failures,
+            self.collapsed + collapsed,
         )
 
     @property
@@ -73,6 +84,13 @@ def closing_warning(record: Record) -> SamplerWarning | None:
             f"DRAM accepted none of {record.iterations} proposals after warm-up: the chain stands "
             "still. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
             "likelihood is noisy, give its filter more particles."
+        )
+    if record.collapsed > TOLERATED_COLLAPSES * record.iterations:
+        return _warning(
+            f"In {record.collapsed} of {record.iterations} draws hardly more than one particle "
+            "decided the estimated likelihood at some observation (sample_stats n_effective). The "
+            "chain is then slow to leave estimates that came out too high; see whether the "
+            "posterior stays the same with more particles, or with psf.EnKF."
         )
     n_failed = sum(count for _, count in record.failures)
     if n_failed > TOLERATED_FAILURES * record.evaluations:

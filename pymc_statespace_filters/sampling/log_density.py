@@ -6,6 +6,7 @@ comes out of the same call, so that a failure has a reason and costs no second e
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pymc.model import Model
@@ -17,6 +18,24 @@ from pymc_statespace_filters.distribution import health_outputs
 
 # Reason of a failure that no filter reports.
 NOT_A_NUMBER = -1
+
+
+class Evaluation(NamedTuple):
+    """What one call gives.
+
+    Attributes
+    ----------
+    log_density : float
+        Never NaN nor plus infinity; a failed evaluation is minus infinity.
+    failure : int
+        0, or the code of the reason: a key of ``distribution.FAILURES``, or ``NOT_A_NUMBER``.
+    n_effective : float
+        Smallest effective number of particles in any filter, infinity without noisy filters.
+    """
+
+    log_density: float
+    failure: int
+    n_effective: float
 
 
 class LogDensity:
@@ -81,7 +100,7 @@ class LogDensity:
 
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: Sequence[np.ndarray]
-    ) -> tuple[float, int]:
+    ) -> Evaluation:
         """Evaluate once.
 
         Parameters
@@ -95,17 +114,16 @@ class LogDensity:
 
         Returns
         -------
-        log_density : float
-            Never NaN nor plus infinity; a failed evaluation is minus infinity.
-        failure : int
-            0, or the code of the reason: a key of ``distribution.FAILURES``, or ``NOT_A_NUMBER``.
+        Evaluation
         """
         call = self._call or self.prepare()
         value, *healths = call(position, *others, *seeds)
         log_density = float(value)
+        n_effective = np.inf
         for health in healths:
+            n_effective = min(n_effective, float(health[0]))
             if health[1] != 0.0:
-                return -np.inf, int(health[1])
+                return Evaluation(-np.inf, int(health[1]), n_effective)
         if not log_density < np.inf:
-            return -np.inf, NOT_A_NUMBER
-        return log_density, 0
+            return Evaluation(-np.inf, NOT_A_NUMBER, n_effective)
+        return Evaluation(log_density, 0, n_effective)

@@ -29,8 +29,9 @@ def dtypes(dim: int, seed_names: Sequence[str]) -> dict[str, Any]:
         "failure": np.int64,
         # A subarray type: the only way to have a matrix per draw stored as numbers.
         "proposal_cov": np.dtype((np.float64, (dim, dim))),
+        "exact": np.bool_,
         WARNING: SamplerWarning,
-    } | dict.fromkeys(seed_names, np.int64)
+    } | (dict.fromkeys(seed_names, np.int64) | {"n_effective": np.float64} if seed_names else {})
 
 
 def dtypes_shapes(dim: int, seed_names: Sequence[str]) -> dict[str, tuple[Any, Any]]:
@@ -46,6 +47,7 @@ def of_draw(
     codes: Sequence[int],
     *,
     seed_names: Sequence[str],
+    exact: bool,
     accept_rate: float,
     adaptation: AdaptationState,
     warning: SamplerWarning | None,
@@ -58,6 +60,8 @@ def of_draw(
     codes : sequence of int
         Failure code (0: none) of every evaluation that the draw took.
     seed_names : sequence of str
+    exact : bool
+        Whether the chain's target is the posterior itself, without the bias of a filter's noise.
     accept_rate : float
     adaptation : AdaptationState
         As it was when the move was made.
@@ -80,7 +84,10 @@ def of_draw(
         "n_failed": len(failed),
         "failure": failed[-1] if failed else 0,
         "proposal_cov": adaptation.cov,
+        "exact": exact,
         WARNING: warning,
     }
-    stats.update(zip(seed_names, move.point.seeds, strict=True))
+    if seed_names:
+        stats["n_effective"] = move.point.n_effective
+        stats.update(zip(seed_names, move.point.seeds, strict=True))
     return stats

@@ -13,7 +13,7 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.distribution import noise_seeds
+from pymc_statespace_filters.distribution import COLLAPSED, exactness, noise_seeds
 from pymc_statespace_filters.sampling import progress, statistics
 from pymc_statespace_filters.sampling.adaptation import AdaptationState, start_adaptation
 from pymc_statespace_filters.sampling.health import Record, closing_warning
@@ -178,6 +178,7 @@ class DRAM(BlockedStep):
 
         seeds = noise_seeds(model)
         check_noise_is_held(model, self.vars, seeds)
+        self._exact = exactness(model) and (refresh_noise or not seeds)
         self._seed_names = tuple(f"{name}_seed" for name in seeds)
         self._seed_variables = tuple(seeds.values())
         default = model.initial_point(random_seed=0)
@@ -210,12 +211,14 @@ class DRAM(BlockedStep):
         move = self._move(current)
         codes += move.failures
         self._current = move.point
-        self._record = self._record.include(move.stage > 0, codes)
+        collapsed = move.point.n_effective < COLLAPSED
+        self._record = self._record.include(move.stage > 0, codes, collapsed)
         is_last = not self.tune and self._record.iterations == self._n_draws
         stats = statistics.of_draw(
             move,
             codes,
             seed_names=self._seed_names,
+            exact=self._exact,
             accept_rate=self._record.accept_rate,
             adaptation=self._adaptation,
             warning=closing_warning(self._record) if is_last else None,
@@ -280,8 +283,7 @@ class DRAM(BlockedStep):
         others: tuple[np.ndarray, ...],
         seeds: tuple[np.ndarray, ...],
     ) -> EvaluatedPoint:
-        log_density, failure = self._log_density(position, others, seeds)
-        return EvaluatedPoint(position, others, seeds, log_density, failure)
+        return EvaluatedPoint(position, others, seeds, *self._log_density(position, others, seeds))
 
     def _move(self, current: EvaluatedPoint) -> Move:
         settings = self.settings

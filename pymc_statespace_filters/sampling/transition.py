@@ -22,6 +22,8 @@ class EvaluatedPoint(NamedTuple):
     log_density : float
     failure : int
         0, or the code of the reason why the log-density is minus infinity.
+    n_effective : float
+        Smallest effective number of particles behind the estimate; infinity if it has no noise.
     """
 
     position: np.ndarray
@@ -29,6 +31,7 @@ class EvaluatedPoint(NamedTuple):
     seeds: tuple[np.ndarray, ...]
     log_density: float
     failure: int
+    n_effective: float = np.inf
 
 
 class Move(NamedTuple):
