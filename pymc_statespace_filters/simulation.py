@@ -8,7 +8,13 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.lowering import Compiled, digest, ensemble_machine, jit, observation_sampler
+from pymc_statespace_filters.lowering import (
+    Compiled,
+    ensemble_machine,
+    jit,
+    key_of,
+    observation_sampler,
+)
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import check_inputs, check_t0, steps_of
@@ -44,8 +50,7 @@ def simulator(system: StateSpaceModel) -> Compiled:
                 propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), x)
         return states, observations
 
-    keys = (machine.key, sampler.key)
-    return Compiled(jit(simulate), None if None in keys else digest("simulate", *keys))
+    return Compiled(jit(simulate), key_of("simulate", machine.key, sampler.key))
 
 
 def simulate(

@@ -29,7 +29,7 @@ def describe(graph: FrozenFunctionGraph | None) -> str:
     if graph is None:
         return "none"
     numbers: dict[Variable, str] = {v: f"i{i}:{v.type}" for i, v in enumerate(graph.inputs)}
-    lines = []
+    lines: list[str] = []
     for node in graph.toposort():
         arguments = [_describe_input(numbers, variable) for variable in node.inputs]
         for i, output in enumerate(node.outputs):

@@ -3,7 +3,7 @@
 from typing import Any, ClassVar
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.lowering import Compiled, Machine, digest, ensemble_machine
+from pymc_statespace_filters.lowering import Compiled, Machine, ensemble_machine, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 
@@ -31,5 +31,4 @@ class EnsembleFilter:
     def compile(self, system: StateSpaceModel) -> Compiled:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         machine = ensemble_machine(system)
-        key = None if machine.key is None else digest(repr(self), machine.key)
-        return Compiled(self.kernel(machine), key)
+        return Compiled(self.kernel(machine), key_of(repr(self), machine.key))

@@ -25,9 +25,9 @@ from pymc_statespace_filters.lowering import (
     Graph,
     VectorFunction,
     call,
-    digest,
     jacobian_of,
     jit,
+    key_of,
     log_normal,
     observation_moments,
     symbols_of,
@@ -299,6 +299,5 @@ def _save(system: StateSpaceModel) -> Any:
 
 
 def _compiled(function: Any, parts: Mapping[str, Compiled], system: StateSpaceModel) -> Compiled:
-    keys = [part.key for part in parts.values()]
-    key = None if None in keys else digest(function.__name__, repr((system.dt, system.n)), *keys)
-    return Compiled(jit(function), key)
+    what = f"{function.__name__} {system.dt!r} {system.n}"
+    return Compiled(jit(function), key_of(what, *(part.key for part in parts.values())))

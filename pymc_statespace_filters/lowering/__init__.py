@@ -3,9 +3,10 @@
 from pymc_statespace_filters.lowering.compile import (
     Compiled,
     Graph,
+    VectorFunction,
     digest,
     jit,
-    VectorFunction,
+    key_of,
     vector_functions,
 )
 from pymc_statespace_filters.lowering.draws import observation_sampler
@@ -30,6 +31,7 @@ __all__ = [
     "ensemble_machine",
     "jacobian_of",
     "jit",
+    "key_of",
     "log_normal",
     "observation_moments",
     "observation_sampler",

@@ -3,16 +3,17 @@
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
 
-from pymc_statespace_filters.lowering.compile import Compiled, array_code, digest, jit
+from pymc_statespace_filters.lowering.compile import Compiled, array_code, jit, key_of
 from pymc_statespace_filters.lowering.ensemble import ensemble_machine, symbols_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 
 def observation_sampler(system: StateSpaceModel) -> Compiled:
     """``observe(rng, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1) to out (p,)."""
-    if system.equations.observation_draw is not None:
-        return _distribution_sampler(system)
+    if (draw := system.equations.observation_draw) is not None:
+        return _distribution_sampler(system, draw)
     machine = ensemble_machine(system)
     observe_members, p, r = machine.observe, system.p, system.r
 
@@ -22,9 +23,8 @@ def observation_sampler(system: StateSpaceModel) -> Compiled:
     return Compiled(jit(observe), machine.key)
 
 
-def _distribution_sampler(system: StateSpaceModel) -> Compiled:
+def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> Compiled:
     """The user's distributions, drawn by PyTensor's own code."""
-    graph = system.equations.observation_draw
     symbols = symbols_of(system) | {
         "theta": pt.tensor("theta", shape=(system.n_theta,), dtype="float64"),
         "q": pt.zeros((system.m,)),
@@ -49,5 +49,4 @@ def _distribution_sampler(system: StateSpaceModel) -> Compiled:
     )
     namespace = {"np": np, "draw_code": draw_code, "n_theta": n_theta, "no_inputs": no_inputs}
     exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
-    key = None if code.key is None else digest(source, repr(n_theta), code.key)
-    return Compiled(jit(namespace["observe"]), key)
+    return Compiled(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))

@@ -14,10 +14,10 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.lowering.compile import (
     Compiled,
     Graph,
-    digest,
-    jit,
-    member_function,
     VectorFunction,
+    jit,
+    key_of,
+    member_function,
     vector_functions,
 )
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
@@ -75,7 +75,7 @@ def call(
     values: Mapping[str, TensorVariable],
 ) -> TensorVariable:
     """The output of a traced function at given values; symbols not given are zero."""
-    sizes = {"theta": system.n_theta, "x": system.n, "q": system.m, "u": system.n_inputs}
+    sizes: dict[str, int | None] = {"theta": system.n_theta, "x": system.n, "q": system.m, "u": system.n_inputs}
     sizes |= {"t": None, "e": system.r, "d": system.p}
     arguments = [
         values[name] if name in values else pt.zeros(() if size is None else (size,))
@@ -140,7 +140,7 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
         prepare=prepare.function,
         **{name: part.function for name, part in parts.items()},
         **({} if "observe" in parts else {"observe": None}),
-        key=None if None in keys else digest(repr((system.dt, carried)), *keys),
+        key=key_of(repr((system.dt, carried)), *keys),
     )
 
 
@@ -233,7 +233,7 @@ def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph])
         return c
 
     sum_of_squares = sum(size**2 for size in sizes)
-    return Compiled(jit(prepare), None if flat.key is None else digest(flat.key, repr(sizes)))
+    return Compiled(jit(prepare), key_of(repr(sizes), flat.key))
 
 
 @jit

@@ -14,7 +14,6 @@ from pymc_statespace_filters.lowering.scalars import (
     INTEGER,
     Expression,
     Value,
-    is_constant,
     kind_of,
 )
 
@@ -64,9 +63,9 @@ class Writer:
         return self._names[value] if isinstance(value, Expression) else _literal(value)
 
     def as_float(self, value: Value) -> str:
-        kind, name = kind_of(value), self.name(value)
-        if is_constant(value):
+        if not isinstance(value, Expression):
             return _literal(float(value))
+        kind, name = value.kind, self.name(value)
         return name if kind == FLOAT else _cast(name, kind, FLOAT)
 
     def _code(self, expression: Expression) -> str:
