@@ -40,8 +40,8 @@ OSCILLATOR_LAWS = {
     "pf_enkf": Law((125, 500), n_seeds=20, bias=0.05, scatter=0.30, slope=(-0.5, -0.33)),
     "pf_enkf_weights": Law((125, 500), n_seeds=20, bias=0.40, scatter=0.30, slope=(-0.5, -0.33)),
 }
-# What the others add is one line each, and the compilation of two more sizes.
-QUICK = ("enkf", "bootstrap", "pf_enkf_weights")
+# The others run with the slow tests: compiling them at two sizes takes longer than running them.
+QUICK = ("enkf", "bootstrap")
 # The same over the whole range; the bias of the kernel densities is still there at the end.
 WHOLE_RANGE = (250, 1000, 4000, 16_000)
 SLOW_LAWS = {
@@ -164,7 +164,7 @@ def test_same_check_passes_a_right_filter_and_fails_a_wrong_one(name, fault):
 def test_pf_enkf_approaches_the_truth_where_weights_matter():
     found = measure(
         package_errors(
-            lambda n: psf.PFEnKF(n, resample_below=0.0),
+            lambda n: psf.PFEnKF(n, likelihood="weights", resample_below=0.0),
             DOUBLE_WELL_SYSTEM,
             double_well_parameters(BROAD_DOUBLE_WELL),
             broad_double_well(),
@@ -176,12 +176,19 @@ def test_pf_enkf_approaches_the_truth_where_weights_matter():
 
 
 @pytest.mark.parametrize(
-    "fault", [Fault.NONE, Fault.WEIGHTS_FORGOTTEN, Fault.EXTRA_PREVIOUS_WEIGHT]
+    "fault",
+    [
+        Fault.NONE,
+        Fault.WEIGHTS_FORGOTTEN,
+        Fault.EXTRA_PREVIOUS_WEIGHT,
+        Fault.NO_FORECAST_DETERMINANT,
+        Fault.NO_ANALYSIS_DETERMINANT,
+    ],
 )
 def test_same_check_fails_wrong_weights(fault):
     found = measure(
         reference_errors(
-            faulty_filters.pf_enkf,
+            faulty_filters.pf_enkf_weights,
             BROAD_DOUBLE_WELL,
             broad_double_well(),
             broad_truth(),
