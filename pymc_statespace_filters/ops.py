@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType, grad_not_implemented
@@ -178,9 +177,23 @@ def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
 _THIS_FILE = Path(__file__).read_text()
 
 
+@cache
+def _kernel(system: StateSpaceModel, filter: Filter) -> Compiled:
+    return filter.compile(system)
+
+
+@cache
+def _gradient_kernel(system: StateSpaceModel, filter: Filter) -> Compiled:
+    return filter.compile_gradient(system)
+
+
+# Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
+# combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
+
+
 @register_funcify_and_cache_key(LogLikelihood)
 def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
-    compiled = op.filter.compile(op.system)
+    compiled = _kernel(op.system, op.filter)
     run = compiled.function
     check, check_observed = check_record(op.system), _check_observed(op.system)
 
@@ -189,10 +202,10 @@ def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs
         check(steps, inputs)
         check_observed(steps, observed)
         return run(
-            np.ascontiguousarray(theta),
-            np.ascontiguousarray(steps),
-            np.ascontiguousarray(observed),
-            np.ascontiguousarray(inputs),
+            theta.copy(),
+            steps.copy(),
+            observed.copy(),
+            inputs.copy(),
             t0.item(),
             seed.item(),
         )
@@ -202,7 +215,7 @@ def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs
 
 @register_funcify_and_cache_key(LogLikelihoodGradient)
 def _numba_gradient(op: LogLikelihoodGradient, node: Apply | None = None, **kwargs: Any) -> tuple:
-    compiled = op.filter.compile_gradient(op.system)
+    compiled = _gradient_kernel(op.system, op.filter)
     run = compiled.function
     check, check_observed = check_record(op.system), _check_observed(op.system)
 
@@ -211,13 +224,13 @@ def _numba_gradient(op: LogLikelihoodGradient, node: Apply | None = None, **kwar
         check(steps, inputs)
         check_observed(steps, observed)
         return run(
-            np.ascontiguousarray(theta),
-            np.ascontiguousarray(steps),
-            np.ascontiguousarray(observed),
-            np.ascontiguousarray(inputs),
+            theta.copy(),
+            steps.copy(),
+            observed.copy(),
+            inputs.copy(),
             t0.item(),
             seed.item(),
-            terms_bar,
+            terms_bar.copy(),
         )
 
     return log_likelihood_gradient, cache_key(op.system, compiled)
