@@ -183,7 +183,7 @@ def _kernel(system: StateSpaceModel, filter: Filter) -> Compiled:
 
 
 @cache
-def _gradient_kernel(system: StateSpaceModel, filter: Filter) -> Compiled:
+def _gradient_kernel(system: StateSpaceModel, filter: Any) -> Compiled:
     return filter.compile_gradient(system)
 
 

@@ -58,10 +58,18 @@ def pair_terms(a, b=0.2, observed=PAIR_DATA, steps=STEPS):
     )
 
 
-def forced_terms(a, observed=FORCED_DATA, steps=STEPS, force=FORCE):
-    """The exact terms of FORCED."""
-    one = np.eye(1)
+def forced_terms(
+    a, observed=FORCED_DATA, steps=STEPS, force=FORCE, observation_noise=0.5, initial_cov=1.0
+):
+    """The exact terms of FORCED, or of one with other constants."""
     return kalman_log_likelihood(
-        [[a]], one, one, 0.5 * one, [0.0], one, observed=observed, steps=steps,
+        [[a]],
+        [[1.0]],
+        [[1.0]],
+        [[observation_noise]],
+        [0.0],
+        [[initial_cov]],
+        observed=observed,
+        steps=steps,
         forcing=np.reshape(force, (-1, 1)),
-    )  # fmt: skip
+    )
