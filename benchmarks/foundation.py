@@ -149,7 +149,10 @@ print(time.perf_counter() - start)
 def cold_rows() -> list[tuple[str, float, str]]:
     """First call of a model in a process of its own, with an empty and then a filled cache."""
     rows = []
-    for gradient, goals in ((False, ("goal 5 s", "goal 1.5 s")), (True, ("goal 10 s", "goal 1.5 s"))):
+    for gradient, goals in (
+        (False, ("goal 5 s", "goal 1.5 s")),
+        (True, ("goal 10 s", "goal 1.5 s")),
+    ):
         with tempfile.TemporaryDirectory() as cache:
             flags = f"base_compiledir={cache}"
             what = "value and gradient" if gradient else "value"
@@ -172,7 +175,12 @@ def sampling_rows() -> list[tuple[str, float, str]]:
     model, draws = model_with(psf.EKF()), 20_000
     _, value = compiled(model)
     at = np.array([4.0, -4.0, np.log(0.1)])
-    settings = {"chains": 1, "step": None, "progressbar": False, "compute_convergence_checks": False}
+    settings = {
+        "chains": 1,
+        "step": None,
+        "progressbar": False,
+        "compute_convergence_checks": False,
+    }
     with model:
         settings["step"] = psf.DRAM(stages=1)
         times = []

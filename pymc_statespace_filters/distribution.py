@@ -8,21 +8,16 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 from pymc.distributions.distribution import Continuous
-from pymc.logprob.abstract import _logprob
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
-from pytensor.graph.traversal import ancestors
-from pytensor.link.numba.dispatch.basic import numba_njit
-from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
-from pytensor.tensor.blockwise import Blockwise
-from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.likelihood import check_kinds
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.ops import LogLikelihood, cache_key, check_record
 from pymc_statespace_filters.parameters import check_names, missing_parameters
+from pymc_statespace_filters.random_variable import StateSpaceRV
 from pymc_statespace_filters.records import (
     check_inputs,
     check_observed,
@@ -30,87 +25,6 @@ from pymc_statespace_filters.records import (
     check_t0,
     steps_of,
 )
-from pymc_statespace_filters.simulation import simulator
-
-__all__ = ["COLLAPSED", "FAILURES", "StateSpace", "exactness", "health_outputs", "noise_seeds", "noisy_parents"]
-
-
-class StateSpaceRV(RandomVariable):
-    """Draws a record (J, p): parameters theta, steps, inputs, t0 and the (unused) noise seed."""
-
-    name = "StateSpace"
-    signature = "(k),(j),(s,u),(),()->(j,p)"
-    dtype = "float64"
-    __props__ = (*RandomVariable.__props__, "system", "filter")
-    _print_name = ("StateSpace", "\\operatorname{StateSpace}")
-
-    def __init__(self, *, system: StateSpaceModel, filter: Filter, **settings: Any) -> None:
-        self.system = system
-        self.filter = filter
-        super().__init__(**settings)
-
-    def __str__(self) -> str:
-        return f"StateSpaceRV{{{self.filter}}}"
-
-    def _supp_shape_from_params(self, dist_params: Sequence, param_shapes: Any = None) -> list:
-        steps = dist_params[1].shape if param_shapes is None else param_shapes[1]
-        return [steps[-1], self.system.p]
-
-    def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
-        *params, size = arguments
-        theta, steps, inputs, t0, _ = params
-        cores = (1, 1, 2, 0, 0)
-        batch = np.broadcast_shapes(
-            *(np.shape(p)[: np.ndim(p) - n] for p, n in zip(params, cores, strict=True))
-        )
-        batch = batch if size is None else tuple(size)
-        theta, steps, inputs, t0 = (
-            np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
-            for p, n in zip((theta, steps, inputs, t0), cores, strict=False)
-        )
-        simulate, check = simulator(self.system).function, check_record(self.system)
-        draws = np.empty((*batch, steps.shape[-1], self.system.p))
-        for i in np.ndindex(batch):
-            parts = [np.ascontiguousarray(a[i]) for a in (theta, steps, inputs)]
-            check(*parts[1:])
-            _, draws[i] = simulate(rng, *parts, float(t0[i]))
-        return draws
-
-
-@numba_core_rv_funcify.register(StateSpaceRV)
-def _numba_draw(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system)
-    simulate, check = compiled.function, check_record(op.system)
-    key = cache_key(op.system, compiled)
-
-    @numba_njit
-    def draw(rng, theta, steps, inputs, t0, seed):
-        check(steps, inputs)
-        _, observations = simulate(
-            rng,
-            np.ascontiguousarray(theta),
-            np.ascontiguousarray(steps),
-            np.ascontiguousarray(inputs),
-            t0,
-        )
-        return observations
-
-    # PyTensor asks for a whole number here.
-    return draw, None if key is None else int(key[:15], 16)
-
-
-@_logprob.register(StateSpaceRV)
-def _log_density(
-    op: StateSpaceRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
-) -> TensorVariable:
-    """log p(d_j | d_1 .. d_{j-1}), one term per observation."""
-    (value,) = values
-    theta, steps, inputs, t0, seed = params
-    likelihood = LogLikelihood(op.system, op.filter)
-    arguments = (theta, steps, value, inputs, t0, seed)
-    cores = (1, 1, 2, 2, 0, 0)
-    batched = any(a.type.ndim > n for a, n in zip(arguments, cores, strict=True))
-    return (Blockwise(likelihood) if batched else likelihood)(*arguments)[0]
 
 
 class StateSpace(Continuous):
@@ -189,7 +103,7 @@ class StateSpace(Continuous):
     ) -> TensorVariable:
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
-        _check_kinds(system, filter)
+        check_kinds(system, filter)
         t0 = check_t0(t0)
         theta = _theta(system, {} if params is None else params, model)
         symbolic_steps, at = _steps(steps, times, system.dt, t0)
@@ -240,16 +154,6 @@ class StateSpace(Continuous):
     def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:
         """A finite record to start from, where the record itself is not observed."""
         return pt.zeros_like(rv)
-
-
-def _check_kinds(system: Any, filter: Any) -> None:
-    if not isinstance(system, StateSpaceModel):
-        raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
-    if not isinstance(filter, Filter.__value__):
-        raise ModelError(
-            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
-        )
-    filter.check(system)
 
 
 def _theta(system: StateSpaceModel, params: Mapping[str, Any], model: pm.Model) -> TensorVariable:
@@ -364,52 +268,3 @@ def _add_coord(model: pm.Model, dim: str, values: Any, name: str) -> None:
             f"the model has a dimension {dim!r} of length {length} with other coordinates; "
             f"give {name!r} its own names with dims=(..., ...)"
         )
-
-
-# What samplers, evidence and diagnostics need to know of the variables in a model.
-
-
-def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
-    return {
-        rv.name: rv.owner
-        for rv in model.basic_RVs
-        if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
-    }
-
-
-def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
-    """The shared noise seed of every variable whose likelihood is a random estimate."""
-    seeds = {}
-    for name, node in _state_space_nodes(model).items():
-        if not node.op.filter.noisy:
-            continue
-        seed = node.inputs[-1]
-        if not isinstance(seed, SharedVariable):
-            raise ModelError(
-                f"the noise seed of {name!r} has been frozen into the model "
-                f"(freeze_dims_and_data); use the model as it was before freezing"
-            )
-        seeds[name] = seed
-    return seeds
-
-
-def noisy_parents(model: pm.Model) -> dict[str, list[Variable]]:
-    """For every noisily estimated variable, the free variables that its likelihood reads."""
-    free = set(model.free_RVs)
-    return {
-        name: [v for v in ancestors(node.inputs[2:], blockers=free) if v in free]
-        for name, node in _state_space_nodes(model).items()
-        if node.op.filter.noisy
-    }
-
-
-def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
-    """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
-    nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
-    return [node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)]
-
-
-def exactness(model: pm.Model) -> bool:
-    """Whether sampling the model targets its posterior without a bias of a filter's noise."""
-    filters = [node.op.filter for node in _state_space_nodes(model).values()]
-    return all(not f.noisy or f.unbiased for f in filters)

@@ -144,6 +144,7 @@ def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariabl
 def as_matrix(
     role: str, value: Any, rows: int | None = None, columns: int | None = None
 ) -> TensorVariable:
+    """A matrix, of the given numbers of rows and columns where they are given."""
     symbol = as_symbol(role, value)
     if symbol.type.ndim != 2:
         raise ModelError(
@@ -173,6 +174,14 @@ def _static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
         [symbol.shape[i] for i in range(symbol.type.ndim)], raise_not_constant=False
     )
     return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
+
+
+def positive(name: str, value: Any) -> float:
+    """A positive number, such as a length of time."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not number or not np.isfinite(value) or value <= 0:
+        raise ModelError(f"{name} must be a positive number, got {value!r}")
+    return float(value)
 
 
 def constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:

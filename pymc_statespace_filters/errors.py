@@ -1,7 +1,8 @@
 """One small tree of named errors and warnings.
 
-A mistake in what the user wrote is an exception raised before any number is computed. A failure inside a
-filter is a value (minus infinity and a counted reason); what is said about it afterwards is a warning.
+A mistake in what the user wrote is an exception raised before any number is computed. A failure
+inside a filter is a value (minus infinity and a counted reason); what is said about it afterwards
+is a warning.
 """
 
 
@@ -10,7 +11,7 @@ class StateSpaceFiltersError(Exception):
 
 
 class ModelError(StateSpaceFiltersError, ValueError):
-    """An argument of a system, a filter or a data set is wrong; the message names it and its value."""
+    """An argument of a system, a filter or a data set is wrong; the message names it."""
 
 
 class DataMismatchError(StateSpaceFiltersError, ValueError):
@@ -24,8 +25,8 @@ class LoweringError(StateSpaceFiltersError):
 class GradientUnavailableError(StateSpaceFiltersError):
     """A gradient sampler was pointed at a likelihood that is an estimate and has no gradient.
 
-    Not a subclass of ``NotImplementedError``: PyMC takes that one for "sample this variable with Slice",
-    which on an estimated likelihood gives silently wrong answers.
+    Not a subclass of ``NotImplementedError``: PyMC takes that one for "sample this variable with
+    Slice", which on an estimated likelihood gives silently wrong answers.
     """
 
 

@@ -98,5 +98,3 @@ def _constant_diffusion(value: Any) -> tuple[tuple[float, ...], ...]:
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ModelError(f"diffusion must be a finite matrix (states x noises), got {value!r}")
     return tuple(map(tuple, matrix.tolist()))
-
-

@@ -15,6 +15,7 @@ from pymc_statespace_filters.records import (
     check_inputs,
     check_observed,
     check_seed,
+    check_system,
     check_t0,
     steps_of,
 )
@@ -80,7 +81,7 @@ def log_likelihood(
     >>> terms.shape
     (2,)
     """
-    filter.check(system)
+    check_kinds(system, filter)
     t0 = check_t0(t0)
     at = steps_of(steps, times, system.dt, t0)
     data = check_observed(observed, system, at.size)
@@ -125,8 +126,20 @@ def warn_of(filter: Filter, health: np.ndarray) -> None:
         warnings.warn(
             f"{filter}: at some observation fewer than {COLLAPSED:g} particles carried all the "
             f"weight, in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
-            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be far too low, by "
-            f"a different amount for every seed.",
+            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be tens of nats too "
+            f"low, by a different amount for every seed; more particles lessen this only slowly. "
+            f"EKF() and EnKF(n, likelihood='gaussian') do not collapse, but have a bias of their "
+            f"own where the state is not Gaussian.",
             FilterWarning,
             stacklevel=3,
         )
+
+
+def check_kinds(system: Any, filter: Any) -> None:
+    """Raise unless these are a system and a filter that can treat it."""
+    check_system(system)
+    if not isinstance(filter, Filter.__value__):
+        raise ModelError(
+            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
+        )
+    filter.check(system)

@@ -12,14 +12,23 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.equations import (
-    RESERVED,
     Equation,
     as_matrix,
     as_vector,
     constant_covariance,
+    positive,
     read_equation,
 )
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.names import (
+    carried_names,
+    check_defaults,
+    checked_names,
+    parameter_names,
+    parameter_symbols,
+    shapes_of,
+    size_of,
+)
 from pymc_statespace_filters.observations import Observation, read_observation
 from pymc_statespace_filters.tracing import describe, freeze
 
@@ -126,15 +135,16 @@ class StateSpaceModel:
         covariances = [e for e in (noise, mean, cov) if isinstance(e, Equation)]
         equations = [*step.equations, *seen.equations, *covariances]
 
-        names, defaults = _parameters(equations)
-        parameter_shapes = _shapes(names, shapes)
-        n_inputs = len(_names("inputs", inputs, None))
+        names, defaults = parameter_names(equations)
+        parameter_shapes = shapes_of(names, shapes)
+        check_defaults(defaults, names, parameter_shapes)
+        n_inputs = len(checked_names("inputs", inputs, None))
         if n_inputs == 0 and any("u" in e.symbols for e in equations):
             asking = next(e.role for e in equations if "u" in e.symbols)
             raise ModelError(f'{asking} asks for u, but no inputs are named; give inputs=["..."]')
 
-        theta = pt.tensor("theta", shape=(sum(map(_size, parameter_shapes)),), dtype="float64")
-        values = _parameter_symbols(theta, names, parameter_shapes)
+        theta = pt.tensor("theta", shape=(sum(map(size_of, parameter_shapes)),), dtype="float64")
+        values = parameter_symbols(theta, names, parameter_shapes)
         m0 = as_vector("initial_mean", mean(values) if isinstance(mean, Equation) else mean)
         n = m0.type.shape[0]
         if n == 0:
@@ -166,11 +176,11 @@ class StateSpaceModel:
             p=traced.datum.type.shape[0],
             r=traced.noise.type.shape[0],
             n_inputs=n_inputs,
-            states=_names("states", states, [f"x{i}" for i in range(n)]),
-            observables=_names(
+            states=checked_names("states", states, [f"x{i}" for i in range(n)]),
+            observables=checked_names(
                 "observables", observables, [f"y{i}" for i in range(traced.datum.type.shape[0])]
             ),
-            inputs=_names("inputs", inputs, None),
+            inputs=checked_names("inputs", inputs, None),
             additive_noise=traced.additive,
             gaussian_observation=traced.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in seen.equations),
@@ -185,7 +195,7 @@ class StateSpaceModel:
                 initial_cov=frozen(covs["initial_cov"]),
             ),
         )
-        self._set(carried=_carried(carried, self.states))
+        self._set(carried=carried_names(carried, self.states))
 
     # Attributes are set once, here; the class annotations are what a system is made of.
     parameters: tuple[str, ...]
@@ -211,6 +221,9 @@ class StateSpaceModel:
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"a system is immutable; make a new one to change {name!r}")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"a system is immutable; {name!r} cannot be deleted")
 
     def _identity(self) -> tuple:
         return tuple(self.__dict__[name] for name in StateSpaceModel.__annotations__)
@@ -243,7 +256,7 @@ class StateSpaceModel:
     @property
     def n_theta(self) -> int:
         """Length of the flat parameter vector."""
-        return sum(map(_size, self.parameter_shapes))
+        return sum(map(size_of, self.parameter_shapes))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -281,16 +294,14 @@ def _transition(transition: Any, process_noise: Any, dt: float | None) -> Any:
             )
         if dt is not None:
             raise ModelError(f"dt={dt!r} is given beside an integrator, which has its own dt")
-        _positive("dt", transition.dt)
+        positive("dt", transition.dt)
         return transition
-    return _Map(read_equation("transition", transition, "xqut"), _positive("dt", 1.0 if dt is None else dt))
-
-
-def _positive(name: str, value: Any) -> float:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not np.isfinite(value) or value <= 0:
-        raise ModelError(f"{name} must be a positive number, got {value!r}")
-    return float(value)
+    equation = read_equation("transition", transition, "xqut")
+    if process_noise is not None and "q" not in equation.symbols:
+        raise ModelError(
+            "process_noise is given, but the transition does not ask for q, the process noise"
+        )
+    return _Map(equation, positive("dt", 1.0 if dt is None else dt))
 
 
 def _initial_mean(value: Any) -> Any:
@@ -301,7 +312,9 @@ def _initial_mean(value: Any) -> Any:
     except (TypeError, ValueError):
         raise ModelError(f"initial_mean must be numbers or a function, got {value!r}") from None
     if mean.ndim != 1 or not np.isfinite(mean).all():
-        raise ModelError(f"initial_mean must be a finite vector, one entry per state, got {value!r}")
+        raise ModelError(
+            f"initial_mean must be a finite vector, one entry per state, got {value!r}"
+        )
     return mean
 
 
@@ -325,68 +338,3 @@ def _covariance_graph(
     if isinstance(covariance, Equation):
         return as_matrix(role, covariance(values), size, size)
     return pt.as_tensor(constant_covariance(role, covariance, size, definite=False))
-
-
-def _parameters(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
-    names: dict[str, None] = {}
-    defaults: dict[str, Any] = {}
-    for equation in equations:
-        names |= dict.fromkeys(equation.parameters)
-        for name, value in equation.defaults:
-            if defaults.setdefault(name, value) != value:
-                raise ModelError(
-                    f"parameter {name!r} has two defaults, {defaults[name]} and {value}"
-                )
-    return tuple(names), tuple(defaults.items())
-
-
-def _shapes(
-    names: tuple[str, ...], shapes: Mapping[str, Sequence[int]] | None
-) -> tuple[tuple[int, ...], ...]:
-    declared = dict(shapes or {})
-    unknown = sorted(set(declared) - set(names))
-    if unknown:
-        raise ModelError(f"shapes names unknown parameters {unknown}; parameters are {list(names)}")
-    for name, shape in declared.items():
-        whole = isinstance(shape, Sequence) and all(isinstance(s, int) and s > 0 for s in shape)
-        if not whole:
-            raise ModelError(f"shapes[{name!r}] must be a tuple of positive integers, got {shape!r}")
-    return tuple(tuple(declared.get(name, ())) for name in names)
-
-
-def _size(shape: tuple[int, ...]) -> int:
-    return int(np.prod(shape, dtype=int))
-
-
-def _parameter_symbols(
-    theta: TensorVariable, names: Sequence[str], shapes: Sequence[tuple[int, ...]]
-) -> dict[str, TensorVariable]:
-    symbols, start = {}, 0
-    for name, shape in zip(names, shapes, strict=True):
-        stop = start + _size(shape)
-        part = theta[start] if shape == () else theta[start:stop].reshape(shape)
-        symbols[name], start = part, stop
-    return symbols
-
-
-def _names(role: str, names: Sequence[str] | None, default: list[str] | None) -> tuple[str, ...]:
-    if names is None:
-        return tuple(default or ())
-    if isinstance(names, str) or not all(isinstance(n, str) for n in names):
-        raise ModelError(f"{role} must be a list of names, got {names!r}")
-    if len(set(names)) != len(names):
-        raise ModelError(f"{role} must differ from each other, got {list(names)}")
-    if default is not None and len(names) != len(default):
-        raise ModelError(f"{role} must name {len(default)} components, got {list(names)}")
-    return tuple(names)
-
-
-def _carried(carried: Sequence[str], states: tuple[str, ...]) -> tuple[str, ...]:
-    names = _names("carried", carried, None)
-    unknown = [name for name in names if name not in states]
-    if unknown:
-        raise ModelError(f"carried names unknown states {unknown}; states are {list(states)}")
-    return names
-
-
-__all__ = ["RESERVED", "Equations", "StateSpaceModel"]

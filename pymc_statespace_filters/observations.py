@@ -64,7 +64,9 @@ def read_observation(
 ) -> "_GaussianObservation | _DensityObservation":
     """Check which of the three forms was given; exactly one density must result."""
     if observation_dist is not None and (observation is not None or observation_logp is not None):
-        raise ModelError("observation_dist replaces observation and observation_logp; give it alone")
+        raise ModelError(
+            "observation_dist replaces observation and observation_logp; give it alone"
+        )
     if observation_dist is None and observation_logp is None:
         if observation is None:
             raise ModelError("give observation, observation_dist or observation_logp")
@@ -78,7 +80,9 @@ class _GaussianObservation:
     def __init__(self, observation: Callable, covariance: Any) -> None:
         self.observation = read_equation("observation", observation, "xeut")
         self.covariance = (
-            read_equation("observation_noise", covariance, "") if callable(covariance) else covariance
+            read_equation("observation_noise", covariance, "")
+            if callable(covariance)
+            else covariance
         )
 
     @property
@@ -126,8 +130,7 @@ class _DensityObservation:
     ) -> None:
         if observation is None and observation_noise is not None:
             raise ModelError(
-                "observation_noise has no observation to belong to: "
-                "a density brings its own noise"
+                "observation_noise has no observation to belong to: a density brings its own noise"
             )
         if observation is not None and observation_noise is None:
             raise ModelError("observation needs observation_noise, the covariance of its noise")
@@ -167,9 +170,7 @@ class _DensityObservation:
         )
 
 
-def _trace_distributions(
-    dist: Equation, values: Values, n_observables: int | None
-) -> Observation:
+def _trace_distributions(dist: Equation, values: Values, n_observables: int | None) -> Observation:
     returned = dist(values)
     variables = list(returned) if isinstance(returned, list | tuple) else [returned]
     if n_observables is not None and len(variables) != n_observables:
@@ -182,7 +183,8 @@ def _trace_distributions(
     return Observation(
         noise=pt.tensor("e", shape=(0,), dtype="float64"),
         datum=datum,
-        logp=pt.sum(pt.stack(terms)),
+        # A partly missing row counts as missing.
+        logp=pt.switch(pt.any(pt.isnan(datum)), 0.0, pt.sum(pt.stack(terms))),
         draw=pt.stack([pt.cast(variable, "float64") for variable in variables]),
     )
 

@@ -21,6 +21,7 @@ def check_names(system: StateSpaceModel, params: Mapping[str, Any]) -> None:
 
 
 def missing_parameters(system: StateSpaceModel, found: Mapping[str, Any]) -> ModelError:
+    """The error that lists which parameters have no value."""
     missing = [name for name in system.parameters if name not in found]
     return ModelError(
         f"no value for the parameters {missing}: the system needs {list(system.parameters)}, "
@@ -39,7 +40,9 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
         part = _numbers(name, values[name])
         core = part.ndim - len(shape)
         if core < 0 or part.shape[core:] != shape:
-            raise ModelError(f"parameter {name!r} must have shape (..., *{shape}), got {part.shape}")
+            raise ModelError(
+                f"parameter {name!r} must have shape (..., *{shape}), got {part.shape}"
+            )
         batches.append(part.shape[:core])
         parts.append(part.reshape(*part.shape[:core], int(np.prod(shape, dtype=int))))
     try:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from pymc_statespace_filters.equations import positive
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.model import StateSpaceModel
 
@@ -11,16 +12,22 @@ from pymc_statespace_filters.model import StateSpaceModel
 GRID_TOLERANCE = 1e-6
 
 
+def check_system(system: Any) -> None:
+    """Raise unless this is a system."""
+    if not isinstance(system, StateSpaceModel):
+        raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
+
+
 def check_steps(steps: Any) -> np.ndarray:
     """Integer steps, not negative, strictly increasing."""
     array = np.asarray(steps)
+    if array.size == 0:
+        raise ModelError("steps is empty: a record has at least one observation")
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise ModelError(
             f"steps must be a vector of integers (step numbers; real timestamps are `times`), "
             f"got {_short(steps)}"
         )
-    if array.size == 0:
-        raise ModelError("steps is empty: a record has at least one observation")
     if array[0] < 0:
         raise ModelError(f"steps must not be negative, got {array[0]}")
     if (np.diff(array.astype("int64")) <= 0).any():
@@ -32,9 +39,7 @@ def check_steps(steps: Any) -> np.ndarray:
     return array.astype("int64")
 
 
-def steps_of(
-    steps: Any, times: Any, dt: float, t0: float
-) -> np.ndarray:
+def steps_of(steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
     """The step numbers of a record, given as steps or as times on the grid ``t0 + k * dt``."""
     if (steps is None) == (times is None):
         raise ModelError("give exactly one of steps and times")
@@ -81,8 +86,7 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     array([ 0, 10, 20])
     """
     array = _floats("times", times, 1)
-    if not np.isfinite(dt) or dt <= 0:
-        raise ModelError(f"dt must be a positive number, got {dt!r}")
+    dt, t0 = positive("dt", dt), check_t0(t0)
     return check_steps(np.round((array - t0) / dt).astype("int64"))
 
 
@@ -113,7 +117,9 @@ def check_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.
             )
         return np.zeros((0, 0))
     if not system.n_inputs:
-        raise ModelError("inputs are given, but the system names none (StateSpaceModel(inputs=[...]))")
+        raise ModelError(
+            "inputs are given, but the system names none (StateSpaceModel(inputs=[...]))"
+        )
     array = _floats("inputs", inputs, None)
     if array.ndim == 1 and system.n_inputs == 1:
         array = array[:, None]
@@ -137,10 +143,13 @@ def check_seed(name: str, seed: Any) -> np.ndarray:
     array = np.asarray(seed)
     if array.dtype.kind not in "iu":
         raise ModelError(f"{name} must be an integer, got {_short(seed)}")
+    if (array > np.iinfo("int64").max).any():
+        raise ModelError(f"{name} must be below 2**63, got {_short(seed)}")
     return array.astype("int64")
 
 
 def check_t0(t0: Any) -> float:
+    """A finite time of step 0."""
     number = isinstance(t0, int | float | np.number) and not isinstance(t0, bool)
     if not number or not np.isfinite(t0):
         raise ModelError(f"t0 must be a finite number, got {t0!r}")
@@ -167,5 +176,3 @@ def _floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
-
-

@@ -17,7 +17,7 @@ from pymc_statespace_filters.lowering import (
 )
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.parameters import flat_parameters
-from pymc_statespace_filters.records import check_inputs, check_t0, steps_of
+from pymc_statespace_filters.records import check_inputs, check_system, check_t0, steps_of
 
 
 @lru_cache(maxsize=256)
@@ -98,13 +98,22 @@ def simulate(
     >>> dict(record.sizes)
     {'step': 41, 'state': 1, 'obs': 3, 'observable': 1}
     """
+    check_system(system)
     t0 = check_t0(t0)
     at = steps_of(steps, times, system.dt, t0)
     forces = check_inputs(inputs, system, at)
     theta = flat_parameters(system, params)
     if theta.ndim != 1:
-        raise ModelError(f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}")
-    rng = np.random.default_rng(random_seed)
+        raise ModelError(
+            f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}"
+        )
+    try:
+        rng = np.random.default_rng(random_seed)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"random_seed must be None, an integer that is not negative or a "
+            f"numpy.random.Generator, got {random_seed!r}"
+        ) from None
     states, observations = simulator(system).function(rng, theta, at, forces, t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(

@@ -7,7 +7,9 @@ import numpy as np
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FrozenFunctionGraph
-from pytensor.graph.traversal import graph_inputs
+from pytensor.graph.traversal import ancestors, graph_inputs
+from pytensor.tensor.random.type import RandomType
+from pytensor.tensor.subtensor import Subtensor, unflatten_index_variables
 
 from pymc_statespace_filters.errors import ModelError
 
@@ -16,12 +18,39 @@ def freeze(inputs: Sequence[Variable], outputs: Sequence[Variable]) -> FrozenFun
     """The graph from ``inputs`` to ``outputs``, immutable and hashable."""
     for variable in graph_inputs(outputs):
         if variable not in inputs and not isinstance(variable, Constant):
-            kind = "shared variable" if isinstance(variable, SharedVariable) else "symbol"
             raise ModelError(
-                f"a function of the system uses the {kind} {variable} from outside; pass it as a "
-                f"parameter, or as a plain number or numpy array if it is a constant"
+                f"a function of the system uses the {_kind(variable, outputs)} from outside; pass "
+                f"it as a parameter, or as a plain number or numpy array if it is a constant"
             )
+    _check_indices(outputs)
     return FrozenFunctionGraph.from_io(inputs, outputs)
+
+
+def _kind(variable: Variable, outputs: Sequence[Variable]) -> str:
+    """What a variable from outside is, in words; a generator is there for what it draws."""
+    if not isinstance(variable, SharedVariable):
+        return f"symbol {variable}"
+    if not isinstance(variable.type, RandomType):
+        return f"shared variable {variable}"
+    drawn = [v for v in ancestors(outputs) if v.owner is not None and variable in v.owner.inputs]
+    return f"random variable {drawn[0].name or drawn[0]}"
+
+
+def _check_indices(outputs: Sequence[Variable]) -> None:
+    """Find an index beyond the end here, where the message still reaches the one who wrote it."""
+    for variable in ancestors(outputs):
+        if variable.owner is None or not isinstance(variable.owner.op, Subtensor):
+            continue
+        source, *indices = variable.owner.inputs
+        numbers = [i.data if isinstance(i, Constant) else None for i in indices]
+        where = unflatten_index_variables(numbers, variable.owner.op.idx_list)
+        for index, size in zip(where, source.type.shape, strict=False):
+            whole = isinstance(index, np.ndarray | np.integer | int)
+            if whole and size is not None and not -size <= index < size:
+                raise ModelError(
+                    f"a function of the system uses the index {int(index)} of {source}, which has "
+                    f"{size} entries, 0 to {size - 1}"
+                )
 
 
 def describe(graph: FrozenFunctionGraph | None) -> str:

@@ -9,7 +9,8 @@ import pytest
 from pymc.model.transform.optimization import freeze_dims_and_data
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.distribution import StateSpace, noise_seeds
+from pymc_statespace_filters.distribution import StateSpace
+from pymc_statespace_filters.inspection import noise_seeds
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from tests.small_systems import (
     FORCE,

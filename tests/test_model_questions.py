@@ -6,7 +6,7 @@ import pytensor
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.distribution import (
+from pymc_statespace_filters.inspection import (
     exactness,
     health_outputs,
     noise_seeds,

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pymc.model.transform_values import unconstrain_values
 from pymc.pytensorf import compile, join_nonshared_inputs
 
-from pymc_statespace_filters.distribution import noise_seeds
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.inspection import noise_seeds
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats

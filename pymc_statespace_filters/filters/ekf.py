@@ -270,9 +270,7 @@ def _reverse(system: StateSpaceModel) -> dict[str, VectorFunction]:
     )
     return {
         "zeros": function("c", ("theta",), [pt.zeros(n.type.shape) for n in (s, theta)]),
-        "start_vjp": function(
-            "c, s_bar, c_bar", ("theta", "s_bar", "c_bar"), [c_bar + start_bar]
-        ),
+        "start_vjp": function("c, s_bar, c_bar", ("theta", "s_bar", "c_bar"), [c_bar + start_bar]),
         "predict_vjp": function(
             "c, inputs, k, t, s, s_bar, c_bar",
             (*_PREDICT, "s_bar", "c_bar"),

@@ -24,25 +24,31 @@ from pymc_statespace_filters.filters._failures import (
 from pymc_statespace_filters.filters._gaussian import log_gaussian
 from pymc_statespace_filters.filters._loop import filter_loop
 from pymc_statespace_filters.filters._random import OBSERVATION, fill_normals, padded
-from pymc_statespace_filters.filters._weights import log_sum
+from pymc_statespace_filters.filters._weights import effective_number, normalise
 
 
 @compiled
-def _ensemble_mean(log_w, log_p, d, moments, residual):
-    """Mean over the members of p(d | x^f_i): the log of Eq. 4.26."""
-    return log_sum(log_w, log_p)
+def _ensemble_mean(n_alive, log_w, log_p, w, d, moments, residual):
+    """Mean over the members of p(d | x^f_i): the log of Eq. 4.26.
+
+    How many members carry the mean is the same question as in a particle filter (Eq. 4.43).
+    """
+    for i in range(log_w.size):
+        log_w[i] += log_p[i]
+    increment = normalise(log_w, w)
+    return increment, effective_number(w) if increment > -np.inf else 0.0
 
 
 @compiled
-def _gaussian_fit(log_w, log_p, d, moments, residual):
-    """log N(d; d_bar, P_dd), observed components only."""
+def _gaussian_fit(n_alive, log_w, log_p, w, d, moments, residual):
+    """log N(d; d_bar, P_dd), observed components only; every member alive carries it."""
     _, d_mean, _, P_dd_chol = moments
     n_present = 0
     for b in range(d.size):
         present = not np.isnan(d[b])
         residual[b] = d[b] - d_mean[b] if present else 0.0
         n_present += present
-    return log_gaussian(residual, P_dd_chol, n_present)
+    return log_gaussian(residual, P_dd_chol, n_present), float(n_alive)
 
 
 _LIKELIHOODS = {"ensemble": _ensemble_mean, "gaussian": _gaussian_fit}
@@ -127,12 +133,14 @@ class EnKF(EnsembleFilter):
             log_density(c, inputs, k, t, d, X, log_p)
             for i in range(N):
                 log_w[i] = -log_N if alive[i] else -np.inf
-            increment = likelihood(log_w, log_p, d, moments, residual)  # Eq. 4.26
+            increment, n_effective = likelihood(
+                n_alive, log_w, log_p, w, d, moments, residual
+            )  # Eq. 4.26
             if not np.isfinite(increment):
                 return -np.inf, 0.0, ZERO_WEIGHTS
 
             # Analysis
             nudge(d, D, alive, free, moments, X)  # Eqs. 4.20-4.21
-            return increment, float(n_alive), NONE
+            return increment, n_effective, NONE
 
         return filter_loop(machine, N, workspace, update)

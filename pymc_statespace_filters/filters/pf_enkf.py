@@ -69,8 +69,8 @@ class PFEnKF(EnsembleFilter):
     likelihood : {"predictive", "weights", "as_printed"}
         How p(d_j | d_1 .. d_{j-1}) is estimated. "predictive": previous weights on the forecast
         particles. "weights": log of the mean unnormalised weight. "as_printed": Eqs. 4.36 and 4.42
-        to the letter, which count the previous weights and the likelihood twice and come out about
-        one nat per observation too high.
+        to the letter, which count the previous weights and the likelihood twice and come out too
+        high, by 0.3 (coarse sensor) to 1.2 (precise sensor) nats per observation.
 
     Raises
     ------

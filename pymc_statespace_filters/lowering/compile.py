@@ -69,6 +69,7 @@ class Graph:
     outputs: Sequence[Variable]
 
     def unrolled(self) -> list[list[Value]]:
+        """The elements of every output as scalar expressions."""
         size = sum(np.prod(output.type.shape or (1,)) for output in self.outputs)
         if size > MAX_OUTPUT_ELEMENTS:
             raise NotUnrollableError(f"more than {MAX_OUTPUT_ELEMENTS} numbers")
@@ -112,9 +113,7 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
         written = {name: f.graph.unrolled() for name, f in functions.items()}
     except NotUnrollableError:
         return {name: _array_vector_function(name, f) for name, f in functions.items()}
-    return {
-        name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()
-    }
+    return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
 
 
 def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> Compiled:
@@ -141,11 +140,15 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     members = frozenset(key for key in _element_code(graph) if key[0] in _MEMBER_INPUTS)
     dependent = depends_on(values, members)
     shared = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
-    before = writer.statements([*sorted_by_number(shared), *(v for v in values if v not in dependent)])
+    before = writer.statements(
+        [*sorted_by_number(shared), *(v for v in values if v not in dependent)]
+    )
     inside = writer.statements(values)
     inside += [f"{target.format(i=i)} = {writer.as_float(v)}" for i, v in enumerate(values)]
     loop = [f"for member in range({arguments.split(', ')[-1]}.shape[-1]):"]
-    return _build(name, arguments, [*before, *loop, *("    " + s for s in inside)], writer.fallbacks)
+    return _build(
+        name, arguments, [*before, *loop, *("    " + s for s in inside)], writer.fallbacks
+    )
 
 
 def sorted_by_number(values: Sequence[Value]) -> list[Value]:
@@ -165,7 +168,9 @@ _GLOBALS = {
 }  # fmt: skip
 
 
-def _build(name: str, arguments: str, body: list[str], fallbacks: dict[str, ps.ScalarOp]) -> Compiled:
+def _build(
+    name: str, arguments: str, body: list[str], fallbacks: dict[str, ps.ScalarOp]
+) -> Compiled:
     source = f"def {name}({arguments}):\n" + "".join(f"    {line}\n" for line in body)
     namespace = dict(_GLOBALS)
     for called, op in fallbacks.items():
@@ -186,6 +191,7 @@ def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:
 
 
 def jit(function: Any) -> Any:
+    """Compile as all code of this room is compiled."""
     return numba.njit(function, nogil=True, error_model="numpy", fastmath=FAST_MATH)
 
 
@@ -204,7 +210,10 @@ def key_of(what: str, *keys: str | None) -> str | None:
 def _source_digest() -> str:
     """Machine code on disk must not outlive the code that it was made by."""
     package = Path(__file__).parent.parent
-    files = sorted([*package.glob("lowering/*.py"), *package.glob("filters/*.py")])
+    # All that machine code can be made by; samplers and evidence make none that is cached here.
+    files = sorted(
+        f for folder in (".", "lowering", "filters") for f in package.glob(folder + "/*.py")
+    )
     return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -238,7 +247,9 @@ def _array_member_function(name: str, arguments: str, graph: Graph, target: str)
     common = {n: v for n, v in graph.inputs.items() if n not in _MEMBER_INPUTS}
     shared = _frontier(list(graph.inputs.values()), members, graph.outputs)
     used_common = _used(common, shared)
-    used_members = _used({n: v for n, v in graph.inputs.items() if n in _MEMBER_INPUTS}, graph.outputs)
+    used_members = _used(
+        {n: v for n, v in graph.inputs.items() if n in _MEMBER_INPUTS}, graph.outputs
+    )
     before = array_code(list(used_common.values()), shared)
     inside = array_code([*used_members.values(), *shared], graph.outputs)
     whole, _, element = target.partition("[")
@@ -292,12 +303,15 @@ def _frontier(
             dependent.update(node.outputs)
     for node in nodes:
         if any(o in dependent for o in node.outputs):
-            frontier += [i for i in node.inputs if i not in dependent and not isinstance(i, Constant)]
+            frontier += [
+                i for i in node.inputs if i not in dependent and not isinstance(i, Constant)
+            ]
     frontier += [o for o in outputs if o not in dependent]
     return list(dict.fromkeys(frontier))
 
 
 def array_code(inputs: list, outputs: Sequence[Variable]) -> Compiled:
+    """A graph as PyTensor itself compiles it: arrays in, a tuple of arrays out."""
     # PyMC's checks of parameters become minus infinity: nothing may raise inside a filter.
     mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
     with warnings.catch_warnings():

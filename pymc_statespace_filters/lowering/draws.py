@@ -15,7 +15,7 @@ def observation_sampler(system: StateSpaceModel) -> Compiled:
     if (draw := system.equations.observation_draw) is not None:
         return _distribution_sampler(system, draw)
     machine = ensemble_machine(system)
-    observe_members, p, r = machine.observe, system.p, system.r
+    observe_members, p, r = machine.simulate, system.p, system.r
 
     def observe(rng, c, inputs, k, t, x, out):
         observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))

@@ -33,7 +33,9 @@ class Machine:
 
     * ``initialise(c, Z, X)`` draws the state at step 0.
     * ``propagate(c, inputs, k, t, Z, X)`` moves every member from step k to k + 1, in place.
-    * ``observe(c, inputs, k, t, Z, X, D)`` writes simulated observations (observables, members).
+    * ``observe(c, inputs, k, t, Z, X, D)`` writes simulated observations (observables, members),
+      for Kalman updates; None where the density of an observation is not this function's.
+    * ``simulate`` is the same wherever the user wrote an observation function.
     * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
     """
 
@@ -47,6 +49,7 @@ class Machine:
     initialise: Any
     propagate: Any
     observe: Any
+    simulate: Any
     log_density: Any
     key: str | None
 
@@ -65,7 +68,9 @@ class Constants:
 def symbols_of(system: StateSpaceModel) -> dict[str, TensorVariable]:
     """Fresh symbols with the names and sizes of the system's."""
     sizes = {"x": system.n, "u": system.n_inputs, "d": system.p}
-    symbols = {name: pt.tensor(name, shape=(size,), dtype="float64") for name, size in sizes.items()}
+    symbols = {
+        name: pt.tensor(name, shape=(size,), dtype="float64") for name, size in sizes.items()
+    }
     return symbols | {"t": pt.tensor("t", shape=(), dtype="float64")}
 
 
@@ -75,7 +80,12 @@ def call(
     values: Mapping[str, TensorVariable],
 ) -> TensorVariable:
     """The output of a traced function at given values; symbols not given are zero."""
-    sizes: dict[str, int | None] = {"theta": system.n_theta, "x": system.n, "q": system.m, "u": system.n_inputs}
+    sizes: dict[str, int | None] = {
+        "theta": system.n_theta,
+        "x": system.n,
+        "q": system.m,
+        "u": system.n_inputs,
+    }
     sizes |= {"t": None, "e": system.r, "d": system.p}
     arguments = [
         values[name] if name in values else pt.zeros(() if size is None else (size,))
@@ -91,7 +101,10 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
     blocks = _covariance_blocks(system)
     c, constants = _constants(system, blocks)
     symbols = symbols_of(system) | {"theta": constants.theta}
-    z = {size: pt.tensor("z", shape=(size,), dtype="float64") for size in (system.n, system.m, system.r)}
+    z = {
+        size: pt.tensor("z", shape=(size,), dtype="float64")
+        for size in (system.n, system.m, system.r)
+    }
 
     def members(
         name: str, arguments: str, output: TensorVariable, target: str, *inputs: str, n_z: int = 0
@@ -122,13 +135,14 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
             *"xutd",
         ),
     }
-    if system.gaussian_observation:
+    if system.equations.observation is not None:
         seen = call(system.equations.observation, system, symbols | {"e": e})
         parts["observe"] = members(
             "observe", "c, inputs, k, t, Z, X, D", seen, "D[{i}, member]", *"xut", n_z=system.r
         )
     prepare = _prepare(system, blocks)
     keys = [prepare.key, *(part.key for part in parts.values())]
+    simulate = parts["observe"].function if "observe" in parts else None
     carried = [system.states.index(name) for name in system.carried]
     return Machine(
         n=system.n,
@@ -138,8 +152,9 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
         dt=system.dt,
         free=np.setdiff1d(np.arange(system.n), carried),
         prepare=prepare.function,
-        **{name: part.function for name, part in parts.items()},
-        **({} if "observe" in parts else {"observe": None}),
+        **{name: parts[name].function for name in ("initialise", "propagate", "log_density")},
+        observe=simulate if system.gaussian_observation else None,
+        simulate=simulate,
         key=key_of(repr((system.dt, carried)), *keys),
     )
 
@@ -175,9 +190,7 @@ def _coloured(chol: TensorVariable | None, z: TensorVariable) -> TensorVariable:
     return z if chol is None else chol @ z
 
 
-def _log_density(
-    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
-) -> TensorVariable:
+def _log_density(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:
     """log p(d | x); Gaussian noise through D Gamma D^T at e = 0 (Eqs. 4.4, 4.12)."""
     if system.equations.observation_logp is not None:
         return call(system.equations.observation_logp, system, symbols)
@@ -269,5 +282,3 @@ def semidefinite_cholesky(a):
                 a[i, j] = 0.0
         for i in range(j):
             a[i, j] = 0.0
-
-

@@ -22,6 +22,7 @@ from pytensor.tensor.math import Dot
 
 @numba_njit
 def product(a, b):
+    """The matrix product."""
     out = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
@@ -46,6 +47,7 @@ def cholesky(a):
 
 @numba_njit
 def solve_lower(a, b):
+    """Forward substitution, all columns at once."""
     out = np.empty(b.shape)
     for i in range(b.shape[0]):
         for c in range(b.shape[1]):
@@ -60,6 +62,7 @@ def solve_lower(a, b):
 
 @numba_njit
 def solve_upper(a, b):
+    """Backward substitution, all columns at once."""
     out = np.empty(b.shape)
     for i in range(b.shape[0] - 1, -1, -1):
         for c in range(b.shape[1]):
@@ -83,11 +86,11 @@ class Loops(Op):
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def make_node(self, *matrices: Variable) -> Apply:
+    def make_node(self, *matrices: Variable) -> Apply:  # noqa: D102
         rows, columns = matrices[0].type.shape[0], matrices[-1].type.shape[1]
         return Apply(self, list(matrices), [pt.matrix(dtype="float64", shape=(rows, columns))])
 
-    def perform(self, node: Apply, inputs: list, output_storage: list) -> None:
+    def perform(self, node: Apply, inputs: list, output_storage: list) -> None:  # noqa: D102
         output_storage[0][0] = _LOOPS[self.name].py_func(*inputs)
 
 

@@ -37,10 +37,12 @@ _CASTS = {FLOAT: ps.Cast(ps.float64), INTEGER: ps.Cast(ps.int64), BOOLEAN: ps.Ca
 
 
 def is_constant(value: Value) -> bool:
+    """Whether a value is a Python number."""
     return not isinstance(value, Expression)
 
 
 def kind_of(value: Value) -> str:
+    """Float, integer or boolean."""
     if isinstance(value, Expression):
         return value.kind
     if isinstance(value, bool):
@@ -70,6 +72,7 @@ class Arena:
         return len(self._interned)
 
     def input(self, name: str) -> Expression:
+        """The scalar that stands for a named input."""
         return self._intern(None, (name,), FLOAT)
 
     def apply(self, op: ps.ScalarOp, *args: Value) -> Value:
@@ -163,9 +166,7 @@ class Arena:
         square = self.apply(ps.mul, half, half)
         return self.apply(ps.mul, square, base) if exponent % 2 else square
 
-    def _switch(
-        self, op: ps.ScalarOp, condition: Value, yes: Value, no: Value
-    ) -> Value | None:
+    def _switch(self, op: ps.ScalarOp, condition: Value, yes: Value, no: Value) -> Value | None:
         if is_constant(condition):
             return yes if condition else no
         return yes if yes is no or (is_constant(yes) and is_constant(no) and yes == no) else None

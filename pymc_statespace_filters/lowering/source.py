@@ -60,9 +60,11 @@ class Writer:
         return lines
 
     def name(self, value: Value) -> str:
+        """How a written expression, or a constant, is named in the source."""
         return self._names[value] if isinstance(value, Expression) else _literal(value)
 
     def as_float(self, value: Value) -> str:
+        """The same, as a double-precision number."""
         if not isinstance(value, Expression):
             return _literal(float(value))
         kind, name = value.kind, self.name(value)

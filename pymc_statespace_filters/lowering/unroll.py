@@ -176,9 +176,7 @@ def _cholesky(arena: Arena, node, arguments: list[np.ndarray]) -> list:
             entry = a[i, j] if node.op.lower else a[j, i]
             rest = arena.apply(ps.sub, entry, _inner(arena, chol[i, :j], chol[j, :j]))
             chol[i, j] = (
-                arena.apply(ps.sqrt, rest)
-                if i == j
-                else arena.apply(ps.true_div, rest, chol[j, j])
+                arena.apply(ps.sqrt, rest) if i == j else arena.apply(ps.true_div, rest, chol[j, j])
             )
     return [chol if node.op.lower else chol.T]
 
@@ -210,7 +208,9 @@ def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     core_node = node.op._create_dummy_core_node(node.inputs)
     results: list[np.ndarray] = []
     for index in np.ndindex(batch):
-        cores = [_objects(r) for r in _evaluate(arena, core_node, [_core(a, index) for a in spread])]
+        cores = [
+            _objects(r) for r in _evaluate(arena, core_node, [_core(a, index) for a in spread])
+        ]
         if not results:
             results = [np.empty(batch + c.shape, dtype=object) for c in cores]
         for result, core in zip(results, cores, strict=True):
@@ -266,7 +266,7 @@ def _alloc(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 
 
 def _check(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """A parameter check of a PyMC distribution: where it fails the log-density is minus infinity."""
+    """A parameter check of a PyMC distribution: minus infinity where it fails."""
     value, *conditions = arguments
     for condition in conditions:
         holds: Value = True

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from pymc.stats.convergence import SamplerWarning, WarningType
 
-from pymc_statespace_filters.distribution import FAILURES
+from pymc_statespace_filters.inspection import FAILURES
 from pymc_statespace_filters.sampling.log_density import NOT_A_NUMBER
 
 # Share of evaluations after warm-up that may fail in silence: a chain that brushes the edge of the
@@ -89,8 +89,9 @@ def closing_warning(record: Record) -> SamplerWarning | None:
         return _warning(
             f"In {record.collapsed} of {record.iterations} draws hardly more than one particle "
             "decided the estimated likelihood at some observation (sample_stats n_effective). The "
-            "chain is then slow to leave estimates that came out too high; see whether the "
-            "posterior stays the same with more particles, or with psf.EnKF."
+            "chain is then slow to leave estimates that came out too high. More particles "
+            "lessen this only slowly; psf.EKF() and psf.EnKF(n, likelihood='gaussian') do not "
+            "collapse, but have a bias of their own where the state is not Gaussian."
         )
     n_failed = sum(count for _, count in record.failures)
     if n_failed > TOLERATED_FAILURES * record.evaluations:

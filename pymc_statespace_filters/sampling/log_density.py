@@ -14,7 +14,7 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.distribution import health_outputs
+from pymc_statespace_filters.inspection import health_outputs
 
 # Reason of a failure that no filter reports.
 NOT_A_NUMBER = -1

@@ -13,7 +13,7 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.distribution import COLLAPSED, exactness, noise_seeds
+from pymc_statespace_filters.inspection import COLLAPSED, exactness, noise_seeds
 from pymc_statespace_filters.sampling import progress, statistics
 from pymc_statespace_filters.sampling.adaptation import AdaptationState, start_adaptation
 from pymc_statespace_filters.sampling.health import Record, closing_warning

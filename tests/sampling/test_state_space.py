@@ -6,8 +6,8 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.distribution import FAILURES
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.inspection import FAILURES
 from pymc_statespace_filters.ops import LogLikelihood
 from pymc_statespace_filters.sampling import DRAM
 from tests.sampling.test_dram import sample
