@@ -27,7 +27,10 @@ def drift(x, t, u, a, b=1.5):
     return pt.roll(x, 1) * a + pt.stack([pt.sin(x0), pt.erf(b * x1), u[0] * pt.softplus(x2)])
 
 def counts(x, c):
-    return [pm.Poisson.dist(mu=pt.exp(c + x[0])), pm.NegativeBinomial.dist(mu=pt.exp(x[1]), alpha=2)]
+    return [
+        pm.Poisson.dist(mu=pt.exp(c + x[0])),
+        pm.NegativeBinomial.dist(mu=pt.exp(x[1]), alpha=2),
+    ]
 
 common = dict(
     transition=psf.EulerMaruyama(drift, lambda s: [[s, 0], [0, 1], [0, s]], dt=0.1),

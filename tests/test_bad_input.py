@@ -1,0 +1,346 @@
+"""What users get wrong is an error that names the argument, its value and what is expected."""
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+
+
+def make(**changes):
+    """A small valid system with some of its arguments replaced."""
+    arguments = dict(
+        transition=lambda x, q, a: [a * x[0] + q[0], x[1]],
+        process_noise=[[0.1]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.5]],
+        initial_mean=[0.0, 1.0],
+        initial_cov=np.eye(2),
+    )
+    arguments = {k: v for k, v in (arguments | changes).items() if v is not ...}
+    return psf.StateSpaceModel(**arguments)
+
+
+def euler(drift=lambda x, a: [a * x[0], x[1]], diffusion=((0.1,), (0.0,)), dt=0.1, **settings):
+    step = psf.EulerMaruyama(drift, diffusion, dt, **settings)
+    return make(transition=step, process_noise=...)
+
+
+def branching(x):
+    return [x[0] if x[0] > 0 else -x[0], x[1]]
+
+
+def forgetful(x, q):
+    x[0] + q[0]
+
+
+OUTSIDE = pytensor.shared(np.array(2.0), name="gain")
+
+SYSTEMS = {
+    # shapes that disagree
+    "transition too short": (dict(transition=lambda x, q: [x[0]]), r"transition .*\(2,\).*\(1,\)"),
+    "transition a number": (dict(transition=lambda x, q: x[0]), "transition .*one expression per"),
+    "transition nested": (dict(transition=lambda x, q: [x]), "transition .*2 dimensions"),
+    "ragged list": (dict(transition=lambda x, q: [x[0], x]), "transition .*differ in shape"),
+    "observation empty": (dict(observation=lambda x: []), "observation .*at least one|must have"),
+    "noise of other size": (dict(observation_noise=np.eye(2)), r"observation_noise .*\(1, 1\)"),
+    "initial_cov of other size": (dict(initial_cov=[[1.0]]), r"initial_cov .*\(2, 2\).*\(1, 1\)"),
+    "initial_cov a vector": (dict(initial_cov=[1.0, 1.0]), r"initial_cov .*square.*\(2,\)"),
+    "initial_mean a number": (dict(initial_mean=0.0), "initial_mean .*vector"),
+    "initial_mean empty": (dict(initial_mean=[]), "initial_mean"),
+    "covariance function": (
+        dict(process_noise=lambda s: [[s, 0.0]]), r"process_noise .*(\(1, 1\)|square|\(2, 2\))",
+    ),
+    "initial_cov function": (dict(initial_cov=lambda s: [[s]]), r"initial_cov .*\(2, 2\)"),
+    "unpacked too many": (dict(observation=lambda x: [_third(x)]), "observation .*unpack"),
+    "index too large": (dict(observation=lambda x: [x[2]]), "index 2 of x, which has 2 entries"),
+    "observable names": (dict(observables=["a", "b"]), "observ"),
+    "state names": (dict(states=["a"]), r"states .*2.*\['a'\]"),
+    "state names a word": (dict(states="ab"), "states .*list of names"),
+    "names twice": (dict(states=["a", "a"]), "states .*differ"),
+    # covariances
+    "not symmetric": (dict(initial_cov=[[1.0, 0.5], [0.0, 1.0]]), "initial_cov .*symmetric"),
+    "negative": (dict(process_noise=[[-0.1]]), "process_noise .*negative.*-0.1"),
+    "indefinite": (dict(initial_cov=[[1.0, 2.0], [2.0, 1.0]]), "initial_cov .*eigenvalue"),
+    "noiseless": (dict(observation_noise=[[0.0]]), "observation_noise .*positive definite"),
+    "not finite": (dict(observation_noise=[[np.nan]]), "observation_noise .*finite"),
+    "words": (dict(observation_noise=[["a"]]), "observation_noise .*numbers"),
+    "a bare variance": (dict(observation_noise=0.5), r"observation_noise .*square matrix.*\(\)"),
+    "infinite mean": (dict(initial_mean=[0.0, np.inf]), "initial_mean .*finite"),
+    # reserved names and signatures
+    "e in the transition": (dict(transition=lambda x, e: x), "transition.*'e' is reserved"),
+    "q in the observation": (dict(observation=lambda x, q: [x[0]]), "observation.*'q' is reserved"),
+    "x in a covariance": (dict(initial_cov=lambda x: [[x]]), "initial_cov.*'x' is reserved"),
+    "default of x": (dict(transition=lambda q, x=1.0: x), "'x' takes no default"),
+    "star arguments": (dict(transition=lambda *args: args[0]), r"transition.*\*args"),
+    "star keywords": (dict(transition=lambda x, **kw: x), r"transition.*\*\*kw"),
+    "a word as default": (dict(transition=lambda x, q, a="b": x), "default of 'a' .*'b'"),
+    "None as default": (dict(transition=lambda x, q, a=None: x), "default of 'a' .*None"),
+    "two defaults": (
+        dict(transition=lambda x, q, a=1.0: a * x, observation=lambda x, a=2.0: [a * x[0]]),
+        "'a' has two defaults",
+    ),
+    "default of another shape": (
+        dict(transition=lambda x, q, a=(1.0, 2.0): a * x), r"default of 'a' .*\(2,\).*shapes",
+    ),
+    "u without inputs": (dict(observation=lambda x, u: [u[0]]), "observation asks for u.*inputs="),
+    "q without its covariance": (dict(process_noise=...), "process_noise.*missing"),
+    "process noise without q": (
+        dict(transition=lambda x: x), "process_noise .*transition .*does not ask for q",
+    ),
+    "inputs nobody asks for": (dict(inputs="force"), "inputs .*list of names"),
+    "unknown carried": (dict(carried=["branch"]), r"carried .*\['branch'\].*states are"),
+    "unknown shape": (dict(shapes={"k": (2,)}), r"shapes .*\['k'\].*\['a'\]"),
+    "bad shape": (dict(shapes={"a": 2}), r"shapes\['a'\] .*2"),
+    # what is returned, and how
+    "returns None": (dict(transition=forgetful), "transition returns None"),
+    "returns a word": (dict(observation=lambda x: ["x"]), "observation returns 'x'"),
+    "an array of symbols": (
+        dict(transition=lambda x, q: np.array([x[0], x[1]])), "transition .*numpy array of symbols",
+    ),
+    "numpy on symbols": (dict(transition=lambda x, q: np.roll(x, 1)), "transition .*numpy"),
+    "python branch": (dict(transition=branching, process_noise=...), r"transition .*pt\.switch"),
+    "python float": (dict(observation=lambda x: [float(x[0])]), "observation .*traced"),
+    "built-in max": (dict(observation=lambda x: [max(x[0], 0.0)]), r"observation .*pt\.switch"),
+    "complex": (dict(observation=lambda x: [pt.sqrt(x[0] + 0j)]), "observation .*complex"),
+    "shared variable": (dict(observation=lambda x: [OUTSIDE * x[0]]), "shared variable gain"),
+    "not a function": (dict(transition=3.0), "transition must be a function, got 3.0"),
+    "string matrix": (dict(process_noise="Q"), "process_noise .*'Q'"),
+    # observations
+    "nothing observed": (dict(observation=...), "observation"),
+    "noise of its own missing": (dict(observation_noise=...), "observation_noise"),
+    "dist beside observation": (
+        dict(observation_dist=lambda x: [pm.Poisson.dist(1.0)]), "observation_dist",
+    ),
+    "dist is no distribution": (
+        dict(observation_dist=lambda x: [x[0]], observation=..., observation_noise=...),
+        "observation_dist",
+    ),
+    "dist is a number": (
+        dict(observation_dist=lambda x: [1.0], observation=..., observation_noise=...),
+        "observation_dist .*scalar PyMC distribution",
+    ),
+    "dist is a vector": (
+        dict(
+            observation_dist=lambda x: [pm.Normal.dist(x, 1.0)], observation=...,
+            observation_noise=...,
+        ),
+        "observation_dist .*scalar PyMC distribution",
+    ),
+    "logp without d": (dict(observation_logp=lambda x: x[0]), "observation_logp must ask for d"),
+    "logp a vector": (dict(observation_logp=lambda d, x: x), "observation_logp .*one number"),
+    # numbers
+    "dt zero": (dict(dt=0.0), "dt .*positive.*0.0"),
+    "dt a word": (dict(dt="fast"), "dt .*'fast'"),
+    "dt true": (dict(dt=True), "dt .*True"),
+}  # fmt: skip
+
+
+def _third(x):
+    _a, _b, c = x
+    return c
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_wrong_system_is_refused_when_it_is_made(name):
+    changes, words = SYSTEMS[name]
+    with pytest.raises(psf.ModelError, match=words) as caught:
+        make(**changes)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_pymc_variables_are_not_constants():
+    with pm.Model():
+        gain = pm.Normal("gain")
+        with pytest.raises(psf.ModelError, match=r"random variable gain.*as a parameter"):
+            make(observation=lambda x: [gain * x[0]])
+
+
+INTEGRATORS = {
+    "dt negative": (lambda: euler(dt=-0.1), "dt .*positive.*-0.1"),
+    "dt infinite": (lambda: euler(dt=np.inf), "dt .*positive.*inf"),
+    "dt missing": (lambda: euler(dt=None), "dt .*None"),
+    "no substeps": (lambda: euler(substeps=0), "substeps .*at least 1.*0"),
+    "half a substep": (lambda: euler(substeps=1.5), "substeps .*whole.*1.5"),
+    "drift too long": (lambda: euler(drift=lambda x: [x[0]]), r"drift .*\(2,\).*\(1,\)"),
+    "drift with noise": (lambda: euler(drift=lambda x, q: x), "drift.*'q' is reserved"),
+    "diffusion a vector": (lambda: euler(diffusion=[0.1, 0.2]), "diffusion .*matrix"),
+    "diffusion of other size": (
+        lambda: euler(diffusion=[[0.1]]),
+        r"diffusion .*\(2, 1\).*\(1, 1\)",
+    ),
+    "diffusion not finite": (lambda: euler(diffusion=[[np.inf], [0.0]]), "diffusion .*finite"),
+    "process_noise too": (
+        lambda: make(transition=psf.EulerMaruyama(lambda x: x, np.eye(2), 0.1)),
+        "process_noise .*integrator",
+    ),
+    "dt twice": (
+        lambda: make(
+            transition=psf.EulerMaruyama(lambda x: x, np.eye(2), 0.1), process_noise=..., dt=0.1
+        ),
+        "dt=0.1 .*integrator",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_a_wrong_integrator_is_refused(name):
+    construct, words = INTEGRATORS[name]
+    with pytest.raises(psf.ModelError, match=words):
+        construct()
+
+
+SYSTEM = make()
+FORCED = make(transition=lambda x, q, u, a: [a * x[0] + u[0] + q[0], x[1]], inputs=["force"])
+SEEN_FORCE = make(
+    transition=lambda x, u: x, process_noise=..., observation=lambda x, u: [x[0] + u[0]],
+    inputs=["force"],
+)  # fmt: skip
+VECTOR = make(transition=lambda x, q, k: k * x + q[0], shapes={"k": (2,)})
+
+RECORDS = {
+    # steps and times
+    "neither": (dict(steps=None), "exactly one of steps and times"),
+    "both": (dict(times=[0.0, 1.0]), "exactly one of steps and times"),
+    "empty": (dict(steps=[], observed=[]), "steps is empty"),
+    "not increasing": (dict(steps=[1, 1]), r"steps\[0\] = 1 .*followed by 1"),
+    "decreasing": (dict(steps=[2, 1]), r"steps\[0\] = 2 .*followed by 1"),
+    "negative": (dict(steps=[-1, 1]), "steps must not be negative, got -1"),
+    "floats": (dict(steps=[0.0, 1.0]), "steps .*integers"),
+    "truths": (dict(steps=[False, True]), "steps .*integers"),
+    "a number": (dict(steps=3, observed=[0.0]), "steps .*vector"),
+    "off the grid": (dict(steps=None, times=[0.0, 1.5]), r"times\[1\] = .*1.5.*off the grid"),
+    "before the start": (dict(steps=None, times=[-1.0, 1.0]), "negative"),
+    "times not finite": (dict(steps=None, times=[0.0, np.nan]), "times .*finite"),
+    "times not numbers": (dict(steps=None, times=["now", "then"]), "times must be numbers"),
+    "t0 not a number": (dict(t0="0"), "t0 .*'0'"),
+    "t0 infinite": (dict(t0=np.inf), "t0 .*finite"),
+    # data
+    "data too short": (dict(observed=[0.0]), r"observed .*\(2, 1\).*\(1,\)"),
+    "data too wide": (dict(observed=np.zeros((2, 2))), r"observed .*\(2, 1\).*\(2, 2\)"),
+    "data infinite": (dict(observed=[0.0, np.inf]), r"observed .*NaN where missing.*inf"),
+    "data words": (dict(observed=["a", "b"]), "observed must be numbers"),
+    # parameters
+    "parameter missing": (dict(params={}), r"no value for the parameters \['a'\]"),
+    "parameter unknown": (dict(params={"a": 1.0, "b": 2.0}), r"parameters \['b'\].*\['a'\]"),
+    "parameter NaN": (dict(params={"a": np.nan}), "'a' must not be NaN"),
+    "parameter a word": (dict(params={"a": "big"}), "'a' must be numbers"),
+    "not a mapping": (dict(params=[1.0]), "params must be a mapping"),
+    "do not broadcast": (
+        dict(system=make(transition=lambda x, q, a, b: a * b * x),
+             params={"a": np.zeros(2), "b": np.zeros(3)}),
+        "do not broadcast",
+    ),
+    "declared shape": (dict(system=VECTOR, params={"k": 1.0}), r"'k' must have shape .*2"),
+    # inputs
+    "inputs missing": (dict(system=FORCED), r"inputs \['force'\]; give inputs="),
+    "inputs unasked": (dict(inputs=np.zeros(9)), "inputs are given, but"),
+    "inputs too few": (dict(system=FORCED, inputs=np.zeros(2)), "inputs has 2 rows.*needs 3"),
+    "inputs too few if observed": (
+        dict(system=SEEN_FORCE, params={}, inputs=np.zeros(3)), "needs 4.*asks for u",
+    ),
+    "inputs too wide": (dict(system=FORCED, inputs=np.zeros((9, 2))), r"\(steps, 1\).*\(9, 2\)"),
+    "inputs not finite": (dict(system=FORCED, inputs=np.full(9, np.nan)), "inputs .*finite"),
+    # seeds
+    "seed a float": (dict(seed=1.5), "seed must be an integer, got 1.5"),
+    "seed a truth": (dict(seed=True), "seed must be an integer, got True"),
+    "seeds of other shape": (
+        dict(params={"a": np.zeros(2)}, seed=np.arange(3)), "seed of shape .*broadcast",
+    ),
+    # the things themselves
+    "not a system": (dict(system=lambda x: x), "system must be a StateSpaceModel"),
+    "filter a class": (dict(filter=psf.EKF), r"filter must be .*EKF\(\)"),
+    "filter a word": (dict(filter="EKF"), "filter must be .*'EKF'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_wrong_record_is_refused(name):
+    changes, words = RECORDS[name]
+    given = dict(
+        system=SYSTEM, filter=psf.EKF(), params={"a": 0.5}, observed=[0.0, 1.0], steps=[0, 3]
+    )
+    given |= changes
+    positional = [given.pop(k) for k in ("system", "filter", "params", "observed")]
+    with pytest.raises(psf.ModelError, match=words):
+        psf.log_likelihood(*positional, **given)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (dict(steps=[1, 0]), "followed by 0"),
+        (dict(params={"a": [1.0, 2.0]}), "simulate takes one value per parameter"),
+        (dict(params={}), "no value for the parameters"),
+        (dict(random_seed="today"), "random_seed"),
+        (dict(system="system"), "system must be a StateSpaceModel"),
+    ],
+)
+def test_a_wrong_simulation_is_refused(changes, words):
+    given = dict(system=SYSTEM, params={"a": 0.5}, steps=[0, 3]) | changes
+    with pytest.raises(psf.ModelError, match=words):
+        psf.simulate(given.pop("system"), given.pop("params"), **given)
+
+
+def test_a_density_alone_cannot_be_simulated():
+    system = make(
+        observation=..., observation_noise=..., observation_logp=lambda d, x: -(d[0] ** 2)
+    )
+    with pytest.raises(psf.ModelError, match="simulating needs `observation`"):
+        psf.simulate(system, {"a": 1.0}, steps=[1])
+
+
+@pytest.mark.parametrize(
+    ("construct", "words"),
+    [
+        (lambda: psf.EnKF(1), "n_members .*at least 2.*1"),
+        (lambda: psf.EnKF(10.0), "n_members .*integer.*10.0"),
+        (lambda: psf.EnKF(True), "n_members .*True"),
+        (lambda: psf.EnKF(10, likelihood="exact"), "likelihood .*'ensemble', 'gaussian'.*'exact'"),
+        (lambda: psf.BootstrapPF(0), "n_particles .*at least 2.*0"),
+        (lambda: psf.BootstrapPF(10, resample_below=2), "resample_below .*0 to 1.*2"),
+        (lambda: psf.BootstrapPF(10, resampling="residual"), "resampling .*'residual'"),
+        (lambda: psf.PFEnKF(10, likelihood="gaussian"), "likelihood .*'predictive'.*'gaussian'"),
+    ],
+)
+def test_wrong_settings_of_a_filter_are_refused(construct, words):
+    with pytest.raises(psf.ModelError, match=words):
+        construct()
+
+
+def test_filters_refuse_systems_that_they_cannot_treat():
+    counts = make(
+        observation=..., observation_noise=..., observation_dist=lambda x: [pm.Poisson.dist(1.0)]
+    )
+    memory = make(states=["z", "branch"], carried=["branch"])
+    arguments = (
+        {"a": 1.0},
+        [1.0],
+    )
+    for filter in (psf.EKF(), psf.EnKF(10)):
+        with pytest.raises(psf.ModelError, match=r"BootstrapPF and PFEnKF|BootstrapPF or PFEnKF"):
+            psf.log_likelihood(counts, filter, *arguments, steps=[0])
+    with pytest.raises(psf.ModelError, match=r"EKF .*\['branch'\]"):
+        psf.log_likelihood(memory, psf.EKF(), *arguments, steps=[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([0.0, 0.1, 0.104], 0.1), "followed by 1"),
+        (([-0.2, 0.1], 0.1), "negative"),
+        (([0.0, np.nan], 0.1), "times .*finite"),
+        (([0.0, 0.1], 0.0), "dt must be a positive number, got 0.0"),
+        (([0.0, 0.1], "0.1"), "dt must be a positive number, got '0.1'"),
+    ],
+)
+def test_wrong_timestamps_are_refused(arguments, words):
+    with pytest.raises(psf.ModelError, match=words):
+        psf.nearest_steps(*arguments)
+
+
+def test_nothing_can_be_written_to_a_system():
+    with pytest.raises(AttributeError, match="immutable"):
+        SYSTEM.dt = 0.5
