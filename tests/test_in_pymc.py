@@ -10,8 +10,8 @@ from pymc.model.transform.optimization import freeze_dims_and_data
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.distribution import StateSpace
-from pymc_statespace_filters.inspection import noise_seeds
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
+from pymc_statespace_filters.inspection import noise_seeds
 from tests.small_systems import (
     FORCE,
     FORCED,

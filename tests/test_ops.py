@@ -124,7 +124,11 @@ def test_value_is_exact_where_the_filter_is():
     np.testing.assert_array_equal(health[1:], [0, -1])
 
 
-@pytest.mark.parametrize("mode", ["FAST_COMPILE", Mode(linker="vm"), Mode(linker="py")], ids=str)
+@pytest.mark.parametrize(
+    "mode",
+    ["FAST_COMPILE", Mode(linker="vm"), Mode(linker="py")],
+    ids=["FAST_COMPILE", "vm", "py"],
+)
 @pytest.mark.parametrize("filter", [psf.EKF(), PF], ids=lambda f: type(f).__name__)
 def test_other_modes_give_the_same_bits(filter, mode):
     theta = pt.dvector("theta")
