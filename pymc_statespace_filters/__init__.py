@@ -8,7 +8,6 @@ from pymc_statespace_filters.errors import (
     GradientUnavailableError,
     LoweringError,
     ModelError,
-    SamplingWarning,
     StateSpaceFiltersError,
 )
 from pymc_statespace_filters.evidence import (
@@ -41,7 +40,6 @@ __all__ = [
     "LoweringError",
     "ModelError",
     "PFEnKF",
-    "SamplingWarning",
     "StateSpace",
     "StateSpaceFiltersError",
     "StateSpaceModel",

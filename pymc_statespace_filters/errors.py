@@ -34,9 +34,5 @@ class FilterWarning(UserWarning):
     """A filter's numbers should not be trusted as they stand."""
 
 
-class SamplingWarning(UserWarning):
-    """A chain did not do what it should have done."""
-
-
 class EvidenceWarning(UserWarning):
     """An evidence estimate is less certain than its number looks."""
