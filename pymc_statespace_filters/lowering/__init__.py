@@ -1,13 +1,13 @@
 """From traced equations to machine code; the only room that knows how PyTensor works inside."""
 
-from pymc_statespace_filters.lowering.compile import (
+from pymc_statespace_filters.lowering.compile import vector_functions
+from pymc_statespace_filters.lowering.compiled import (
     Compiled,
     Graph,
     VectorFunction,
     digest,
     jit,
     key_of,
-    vector_functions,
 )
 from pymc_statespace_filters.lowering.draws import observation_sampler
 from pymc_statespace_filters.lowering.ensemble import (

@@ -5,7 +5,8 @@ import pytensor
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 
-from pymc_statespace_filters.lowering.compile import Compiled, array_code, jit, key_of
+from pymc_statespace_filters.lowering.arrays import array_code
+from pymc_statespace_filters.lowering.compiled import Compiled, jit, key_of
 from pymc_statespace_filters.lowering.ensemble import ensemble_machine, symbols_of
 from pymc_statespace_filters.model import StateSpaceModel
 

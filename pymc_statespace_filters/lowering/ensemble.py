@@ -11,15 +11,8 @@ from pytensor.gradient import jacobian
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.lowering.compile import (
-    Compiled,
-    Graph,
-    VectorFunction,
-    jit,
-    key_of,
-    member_function,
-    vector_functions,
-)
+from pymc_statespace_filters.lowering.compile import member_function, vector_functions
+from pymc_statespace_filters.lowering.compiled import Compiled, Graph, VectorFunction, jit, key_of
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.model import StateSpaceModel
 

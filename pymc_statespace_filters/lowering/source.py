@@ -48,7 +48,7 @@ class Writer:
     def __init__(self, input_code: dict[str, str]) -> None:
         self._input_code = input_code
         self._names: dict[Expression, str] = {}
-        self.fallbacks: dict[str, ps.ScalarOp] = {}
+        self.fallbacks: dict[str, tuple[ps.ScalarOp, int]] = {}
 
     def statements(self, values: Iterable[Value]) -> list[str]:
         """Statements for everything that ``values`` need and that is not written yet."""
@@ -90,8 +90,11 @@ class Writer:
 
     def _fallback(self, op: ps.ScalarOp, args: tuple) -> str:
         """A call of PyTensor's own compiled function, for the less common operations."""
-        name = f"{type(op).__name__.lower()}_{len(args)}"
-        self.fallbacks[name] = op
+        key = (op, len(args))
+        known = {kept: name for name, kept in self.fallbacks.items()}
+        # Operations of one type may differ in their properties.
+        name = known.get(key, f"{type(op).__name__.lower()}_{len(known)}")
+        self.fallbacks[name] = key
         return f"{name}({', '.join(self.as_float(a) for a in args)})"
 
 

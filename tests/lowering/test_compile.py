@@ -10,12 +10,9 @@ from scipy import stats
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.lowering import compile as lowering
 from pymc_statespace_filters.lowering import ensemble_machine
-from pymc_statespace_filters.lowering.compile import (
-    Graph,
-    VectorFunction,
-    member_function,
-    vector_functions,
-)
+from pymc_statespace_filters.lowering.arrays import _frontier
+from pymc_statespace_filters.lowering.compile import member_function, vector_functions
+from pymc_statespace_filters.lowering.compiled import Graph, VectorFunction
 
 
 def vector(name, size):
@@ -89,7 +86,7 @@ def test_what_no_member_enters_is_computed_before_the_loop(monkeypatch):
 def test_on_arrays_too_it_is_computed_before_the_loop():
     graph = member_graph()
     inputs = list(graph.inputs.values())
-    shared = lowering._frontier(inputs, inputs[1:], graph.outputs)
+    shared = _frontier(inputs, inputs[1:], graph.outputs)
     assert all(variable not in inputs[1:] for variable in shared)
     assert any(variable.type.ndim == 2 for variable in shared)  # the product of the two matrices
 

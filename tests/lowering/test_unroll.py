@@ -8,7 +8,8 @@ from pytensor.compile.mode import Mode
 
 from pymc_statespace_filters.equations import as_vector
 from pymc_statespace_filters.lowering import compile as lowering
-from pymc_statespace_filters.lowering.compile import Graph, VectorFunction, vector_functions
+from pymc_statespace_filters.lowering.compile import vector_functions
+from pymc_statespace_filters.lowering.compiled import Graph, VectorFunction
 from pymc_statespace_filters.lowering.scalars import Arena
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
 from tests.lowering import programs
@@ -44,7 +45,7 @@ def assert_same(group, points, rtol):
 def test_unrolled_code_equals_pytensor(group, monkeypatch):
     monkeypatch.setattr(lowering, "MAX_OUTPUT_ELEMENTS", 1000)
     x, outputs = traced(getattr(programs, group))
-    Graph({"theta": x}, outputs).unrolled()  # raises where array code would step in
+    lowering._unrolled(Graph({"theta": x}, outputs))  # raises where array code would step in
     assert_same(getattr(programs, group), POINTS, rtol=1e-13)
 
 
@@ -52,7 +53,7 @@ def test_what_does_not_unroll_runs_on_arrays():
     for name, program in programs.ARRAYS_ONLY.items():
         x, outputs = traced({name: program})
         with pytest.raises(NotUnrollableError):
-            Graph({"theta": x}, outputs).unrolled()
+            lowering._unrolled(Graph({"theta": x}, outputs))
     assert_same(programs.ARRAYS_ONLY, POINTS, rtol=1e-12)
 
 
