@@ -31,7 +31,7 @@ def simulator(system: StateSpaceModel) -> Compiled:
     machine = ensemble_machine(system)
     prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
     sampler = observation_sampler(system)
-    observe, dt, n, m, p = sampler.function, system.dt, system.n, system.m, system.p
+    observe, dt, n, m, p = sampler.function, system.dt, system.n, machine.m, system.p
 
     def simulate(rng, theta, steps, inputs, t0):
         c = prepare(theta)

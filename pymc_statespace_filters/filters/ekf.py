@@ -216,7 +216,6 @@ def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, T
 def _symbols(system: StateSpaceModel) -> dict[str, TensorVariable]:
     size = _state_size(system.n)
     return symbols_of(system) | {
-        "theta": pt.tensor("theta", shape=(system.n_theta,), dtype="float64"),
         "s": pt.tensor("s", shape=(size,), dtype="float64"),
         "s_bar": pt.tensor("s_bar", shape=(size,), dtype="float64"),
         "c_bar": pt.tensor("c_bar", shape=(system.n_theta,), dtype="float64"),

@@ -12,14 +12,16 @@ from pymc_statespace_filters.lowering.compiled import (
 from pymc_statespace_filters.lowering.draws import observation_sampler
 from pymc_statespace_filters.lowering.ensemble import (
     Machine,
-    call,
     ensemble_machine,
-    jacobian_of,
-    observation_moments,
     semidefinite_cholesky,
-    symbols_of,
 )
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
+from pymc_statespace_filters.lowering.graphs import (
+    call,
+    jacobian_of,
+    observation_moments,
+    symbols_of,
+)
 
 __all__ = [
     "Compiled",

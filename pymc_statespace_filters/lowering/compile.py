@@ -40,7 +40,7 @@ _ELEMENT = {
 }  # fmt: skip
 
 
-def _unrolled(graph: Graph) -> list[list[Value]]:
+def unrolled(graph: Graph) -> list[list[Value]]:
     """The elements of every output as scalar expressions."""
     size = sum(np.prod(output.type.shape or (1,)) for output in graph.outputs)
     if size > MAX_OUTPUT_ELEMENTS:
@@ -73,7 +73,7 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
     In scalars a vector is a tuple of numbers, otherwise an array; both are read by index.
     """
     try:
-        written = {name: _unrolled(f.graph) for name, f in functions.items()}
+        written = {name: unrolled(f.graph) for name, f in functions.items()}
     except NotUnrollableError:
         return {name: array_vector_function(name, f) for name, f in functions.items()}
     return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
@@ -96,7 +96,7 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     What does not depend on the member is computed once, before the loop.
     """
     try:
-        (values,) = _unrolled(graph)
+        (values,) = unrolled(graph)
     except NotUnrollableError:
         return array_member_function(name, arguments, graph, target)
     writer = Writer(_element_code(graph))

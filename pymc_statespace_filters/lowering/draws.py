@@ -7,7 +7,8 @@ from pytensor.graph.fg import FrozenFunctionGraph
 
 from pymc_statespace_filters.lowering.arrays import array_code
 from pymc_statespace_filters.lowering.compiled import Compiled, jit, key_of
-from pymc_statespace_filters.lowering.ensemble import ensemble_machine, symbols_of
+from pymc_statespace_filters.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.lowering.graphs import SYMBOLS, symbols_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 
@@ -26,12 +27,9 @@ def observation_sampler(system: StateSpaceModel) -> Compiled:
 
 def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> Compiled:
     """The user's distributions, drawn by PyTensor's own code."""
-    symbols = symbols_of(system) | {
-        "theta": pt.tensor("theta", shape=(system.n_theta,), dtype="float64"),
-        "q": pt.zeros((system.m,)),
-        "e": pt.zeros((system.r,)),
-    }
-    core = [symbols[name] for name in ("theta", "x", "q", "u", "t", "e", "d")]
+    no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}
+    symbols = symbols_of(system) | no_noise
+    core = [symbols[name] for name in SYMBOLS]
     generators = [variable.type() for variable in graph.inputs[len(core) :]]
     (draw,) = graph.bind([*core, *generators])
     # A mutable generator is advanced in place; a copy would give the same draw every time.

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.gradient import jacobian
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.lowering.compile import member_function, vector_functions
 from pymc_statespace_filters.lowering.compiled import Compiled, Graph, VectorFunction, jit, key_of
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
+from pymc_statespace_filters.lowering.graphs import call, observation_moments, symbols_of
+from pymc_statespace_filters.lowering.noise import merged_noise
 from pymc_statespace_filters.model import StateSpaceModel
 
 
@@ -23,6 +24,8 @@ class Machine:
 
     ``c`` are the constants of one evaluation, ``c = prepare(theta)``; ``Z`` holds standard normals
     and may have more columns than there are members; ``k`` is the step, ``t`` its time.
+
+    ``m`` is the number of normals that one step of a member takes: see `merged_noise`.
 
     * ``initialise(c, Z, X)`` draws the state at step 0.
     * ``propagate(c, inputs, k, t, Z, X)`` moves every member from step k to k + 1, in place.
@@ -58,45 +61,17 @@ class Constants:
     observation_chol: TensorVariable | None
 
 
-def symbols_of(system: StateSpaceModel) -> dict[str, TensorVariable]:
-    """Fresh symbols with the names and sizes of the system's."""
-    sizes = {"x": system.n, "u": system.n_inputs, "d": system.p}
-    symbols = {
-        name: pt.tensor(name, shape=(size,), dtype="float64") for name, size in sizes.items()
-    }
-    return symbols | {"t": pt.tensor("t", shape=(), dtype="float64")}
-
-
-def call(
-    graph: FrozenFunctionGraph,
-    system: StateSpaceModel,
-    values: Mapping[str, TensorVariable],
-) -> TensorVariable:
-    """The output of a traced function at given values; symbols not given are zero."""
-    sizes: dict[str, int | None] = {
-        "theta": system.n_theta,
-        "x": system.n,
-        "q": system.m,
-        "u": system.n_inputs,
-    }
-    sizes |= {"t": None, "e": system.r, "d": system.p}
-    arguments = [
-        values[name] if name in values else pt.zeros(() if size is None else (size,))
-        for name, size in sizes.items()
-    ]
-    (output,) = graph.bind(arguments)
-    return output
-
-
 @lru_cache(maxsize=256)
 def ensemble_machine(system: StateSpaceModel) -> Machine:
     """Compile what the ensemble and particle filters need of a system."""
-    blocks = _covariance_blocks(system)
+    merged = merged_noise(system)
+    blocks = _covariance_blocks(system, merged)
     c, constants = _constants(system, blocks)
-    symbols = symbols_of(system) | {"theta": constants.theta}
+    symbols = {name: symbols_of(system)[name] for name in "xutd"} | {"theta": constants.theta}
+    n_noises = system.m if merged is None else system.n
     z = {
         size: pt.tensor("z", shape=(size,), dtype="float64")
-        for size in (system.n, system.m, system.r)
+        for size in (system.n, n_noises, system.r)
     }
 
     def members(
@@ -108,17 +83,21 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 
     initial = constants.initial_mean + constants.initial_chol @ z[system.n]
-    q = _coloured(constants.process_chol, z[system.m])
+    noise = _coloured(constants.process_chol, z[n_noises])
+    if merged is None:
+        step = call(system.equations.transition, system, symbols | {"q": noise})
+    else:
+        step = call(system.equations.transition, system, symbols) + noise
     e = _coloured(constants.observation_chol, z[system.r])
     parts = {
         "initialise": members("initialise", "c, Z, X", initial, "X[{i}, member]", n_z=system.n),
         "propagate": members(
             "propagate",
             "c, inputs, k, t, Z, X",
-            call(system.equations.transition, system, symbols | {"q": q}),
+            step,
             "X[{i}, member]",
             *"xut",
-            n_z=system.m,
+            n_z=n_noises,
         ),
         "log_density": members(
             "log_density",
@@ -139,7 +118,7 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
     carried = [system.states.index(name) for name in system.carried]
     return Machine(
         n=system.n,
-        m=system.m,
+        m=n_noises,
         p=system.p,
         r=system.r,
         dt=system.dt,
@@ -152,9 +131,11 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
     )
 
 
-def _covariance_blocks(system: StateSpaceModel) -> dict[str, FrozenFunctionGraph]:
+def _covariance_blocks(
+    system: StateSpaceModel, merged: FrozenFunctionGraph | None
+) -> dict[str, FrozenFunctionGraph]:
     """Covariances whose square root noise is coloured with; an integrator's noise is white."""
-    graphs = vars(system.equations)
+    graphs = vars(system.equations) | ({} if merged is None else {"process_noise": merged})
     names = ("initial_cov", "process_noise", "observation_noise")
     return {name: graphs[name] for name in names if graphs[name] is not None}
 
@@ -189,31 +170,6 @@ def _log_density(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
         return call(system.equations.observation_logp, system, symbols)
     mean, cov = observation_moments(system, symbols)
     return log_normal(*without_missing(symbols["d"], mean, cov))
-
-
-def observation_moments(
-    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
-) -> tuple[TensorVariable, TensorVariable]:
-    """h(x, 0) and D Gamma D^T (Eq. 4.4); for additive noise D is the identity."""
-    cov = call(system.equations.observation_noise, system, symbols)
-    if system.additive_noise:
-        return call(system.equations.observation, system, symbols), cov
-    e = pt.tensor("e", shape=(system.r,), dtype="float64")
-    seen = call(system.equations.observation, system, {**symbols, "e": e})
-    noise_jac = jacobian_of(seen, e)
-    at_zero = FrozenFunctionGraph.from_io([e, *symbols.values()], [seen, noise_jac])
-    mean, noise_jac = at_zero.bind([pt.zeros((system.r,)), *symbols.values()])
-    return mean, noise_jac @ cov @ noise_jac.T
-
-
-def jacobian_of(output: TensorVariable, wrt: TensorVariable) -> TensorVariable:
-    """d output / d wrt, shape (len(output), len(wrt)); zeros where there is no connection."""
-    shape = (output.type.shape[0], wrt.type.shape[0])
-    if 0 in shape:
-        return pt.zeros(shape)
-    return pt.specify_shape(
-        jacobian(output, wrt, vectorize=True, disconnected_inputs="ignore"), shape
-    )
 
 
 def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]) -> Compiled:

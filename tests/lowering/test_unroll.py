@@ -45,7 +45,7 @@ def assert_same(group, points, rtol):
 def test_unrolled_code_equals_pytensor(group, monkeypatch):
     monkeypatch.setattr(lowering, "MAX_OUTPUT_ELEMENTS", 1000)
     x, outputs = traced(getattr(programs, group))
-    lowering._unrolled(Graph({"theta": x}, outputs))  # raises where array code would step in
+    lowering.unrolled(Graph({"theta": x}, outputs))  # raises where array code would step in
     assert_same(getattr(programs, group), POINTS, rtol=1e-13)
 
 
@@ -53,7 +53,7 @@ def test_what_does_not_unroll_runs_on_arrays():
     for name, program in programs.ARRAYS_ONLY.items():
         x, outputs = traced({name: program})
         with pytest.raises(NotUnrollableError):
-            lowering._unrolled(Graph({"theta": x}, outputs))
+            lowering.unrolled(Graph({"theta": x}, outputs))
     assert_same(programs.ARRAYS_ONLY, POINTS, rtol=1e-12)
 
 
