@@ -24,10 +24,10 @@ help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
 
 demo: $(VENV)/.installed  ## three rival models of a double well, in out/; CSV=yours for your own record
-	$(IN)/python examples/double_well.py $(if $(CSV),--csv $(CSV))
+	$(IN)/python examples/double_well.py $(if $(CSV),--csv "$(CSV)")
 
 demo-quick: $(VENV)/.installed  ## the same with short chains, to see that it runs
-	$(IN)/python examples/double_well.py --quick
+	$(IN)/python examples/double_well.py --quick --out out/quick $(if $(CSV),--csv "$(CSV)")
 
 test: $(VENV)/.installed  ## the tests, in two processes
 	$(IN)/python $(PYTEST)

@@ -176,6 +176,13 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     """
     draws = unconstrained_draws(idata, density.model)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
+    lacking = [f"{name}_seed" for name in density.seed_names if f"{name}_seed" not in stats]
+    if lacking and not any(name in stats for name in STORED_NAMES):
+        raise DataMismatchError(
+            f"sample_stats of idata holds neither the noise seeds of the draws ({lacking}) nor "
+            "their log-density: the estimates that the chain accepted cannot be found again. Keep "
+            "the group sample_stats that DRAM leaves"
+        )
     seeds = _stored_seeds(stats, density, draws.shape[:2])
     log_density = _stored_log_density(stats, density, draws, seeds)
 

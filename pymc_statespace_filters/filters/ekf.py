@@ -25,6 +25,7 @@ from pymc_statespace_filters.lowering import (
     Graph,
     VectorFunction,
     call,
+    covariance_check,
     jacobian_of,
     jit,
     key_of,
@@ -80,11 +81,15 @@ class EKF:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         parts = vector_functions(_forward(system))
         start, predict, update = (part.function for part in parts.values())
-        dt, n = system.dt, system.n
+        valid = covariance_check(system)
+        has_valid_covariances, dt, n = valid.function, system.dt, system.n
 
         def log_likelihood(theta, steps, observed, inputs, t0, seed):
-            terms = np.empty(steps.size)
+            terms = np.full(steps.size, -np.inf)
             health = np.array([np.inf, float(NONE), -1.0])
+            if not has_valid_covariances(theta):
+                health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
+                return terms, health
             s = start(theta)
             k = 0
             for j in range(steps.size):
@@ -105,7 +110,7 @@ class EKF:
                     break
             return terms, health
 
-        return _compiled(log_likelihood, parts, system)
+        return _compiled(log_likelihood, parts | {"valid": valid}, system)
 
     def compile_gradient(self, system: StateSpaceModel) -> Compiled:
         """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""

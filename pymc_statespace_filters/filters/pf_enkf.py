@@ -113,8 +113,8 @@ class PFEnKF(EnsembleFilter):
 
     def kernel(self, machine):
         """Compile the filter for one system; see ``_loop.filter_loop`` for what is returned."""
-        if machine.observe is None:
-            # A density alone gives nothing to nudge by: every update is the bootstrap filter's.
+        if machine.observe is None or machine.free.size == 0:
+            # Nothing to nudge by, or nothing to nudge: every update is the bootstrap filter's.
             return BootstrapPF(
                 self.n_particles, resample_below=self.resample_below, resampling=self.resampling
             ).kernel(machine)

@@ -12,6 +12,7 @@ from pymc_statespace_filters.lowering.compiled import (
 from pymc_statespace_filters.lowering.draws import observation_sampler
 from pymc_statespace_filters.lowering.ensemble import (
     Machine,
+    covariance_check,
     ensemble_machine,
     semidefinite_cholesky,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "Machine",
     "VectorFunction",
     "call",
+    "covariance_check",
     "digest",
     "ensemble_machine",
     "jacobian_of",

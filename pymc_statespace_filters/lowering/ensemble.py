@@ -198,25 +198,46 @@ def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph])
     return Compiled(jit(prepare), key_of(repr(sizes), flat.key))
 
 
+def covariance_check(system: StateSpaceModel) -> Compiled:
+    """``check(theta)``: whether every covariance is symmetric and non-negative at theta.
+
+    A filter of moments would go on with a negative variance and give it a likelihood.
+    """
+    blocks = {
+        name: graph
+        for name, graph in _covariance_blocks(system, None).items()
+        if any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
+    }
+    if not blocks:
+        return Compiled(jit(lambda theta: True), key_of("nothing to check"))
+    prepare = _prepare(system, blocks)
+    roots = prepare.function
+    first = system.n_theta + system.n
+
+    def check(theta):
+        return not np.isnan(roots(theta)[first:]).any()
+
+    return Compiled(jit(check), key_of("check", prepare.key))
+
+
 @jit
 def semidefinite_cholesky(a):
     """Lower square root in place; a zero pivot gives a zero column, a negative one NaN.
 
     Covariances without spread in some direction are ordinary here: a known initial state, noise
-    that acts on the velocity alone.
+    that acts on the velocity alone. Zero is judged against the component's own variance: one may be
+    in pascals, the next in metres.
     """
     n = a.shape[0]
-    scale = 0.0
-    for i in range(n):
-        scale = max(scale, abs(a[i, i]))
+    variance = np.diag(a).copy()
     for j in range(n):
         pivot = a[j, j]
         for k in range(j):
             pivot -= a[j, k] ** 2
-        if pivot < -1e-10 * scale or pivot != pivot:
+        if pivot < -1e-10 * abs(variance[j]) or pivot != pivot:
             a[:] = np.nan
             return
-        root = np.sqrt(pivot) if pivot > 1e-14 * scale else 0.0
+        root = np.sqrt(pivot) if pivot > 1e-14 * variance[j] else 0.0
         a[j, j] = root
         for i in range(j + 1, n):
             rest = a[i, j]
@@ -224,7 +245,7 @@ def semidefinite_cholesky(a):
                 rest -= a[i, k] * a[j, k]
             if root > 0.0:
                 a[i, j] = rest / root
-            elif abs(rest) > 1e-7 * scale:
+            elif abs(rest) > 1e-7 * np.sqrt(variance[i] * variance[j]):
                 a[:] = np.nan
                 return
             else:

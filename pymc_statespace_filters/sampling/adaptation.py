@@ -24,6 +24,8 @@ Differences from the sources
     * The scale shrinks in degrees: to a fifth where a block moves next to nowhere, to a half where
       the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted. Between
       the two lies the acceptance at which pseudo-marginal chains work best.
+    * After several stalls in a row the first covariance is back: with a noisy likelihood a chain
+      can sit on a lucky estimate, which no shrinking mends, and must still be able to leave.
     * Before the first block that moves, a quarter of a block without a single acceptance already
       shrinks the scale: a starting covariance is a guess.
 
@@ -49,6 +51,8 @@ LEAST_MOVED = 0.02
 LOW_ACCEPTANCE, FAIR_ACCEPTANCE = 0.05, 0.10
 # Factors of the proposals' standard deviation when next to nothing moved, and when little did.
 STALLED, SHRINK = 0.2, 0.5
+# Stalls in a row that shrink the proposals; the next one starts anew.
+MOST_STALLS = 6
 # Weight of the covariance in use before, in accepted moves for each dimension.
 PRIOR_MOVES = 0.2
 # The multiple of the identity, relative to the mean variance.
@@ -103,6 +107,10 @@ class AdaptationState(NamedTuple):
         below ``2.38 / sqrt(d)`` times those of the draws.
     n_blocks : int
         Complete blocks that taught a covariance.
+    n_stalls : int
+        Blocks in a row that moved next to nowhere.
+    first_cov : ndarray, shape (d, d)
+        The proposal covariance that the chain began with.
     block, recent, older : Moments
         The block now running; the complete blocks since their number was last a power of two; and
         those between the power of two before that and it.
@@ -113,6 +121,8 @@ class AdaptationState(NamedTuple):
     base: np.ndarray
     scale: float
     n_blocks: int
+    n_stalls: int
+    first_cov: np.ndarray
     block: Moments
     recent: Moments
     older: Moments
@@ -132,7 +142,7 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
     """
     cov = np.ascontiguousarray(cov, dtype=np.float64)
     none = _no_moments(cov.shape[0])
-    return AdaptationState(cov, np.linalg.cholesky(cov), cov, 1.0, 0, none, none, none)
+    return AdaptationState(cov, np.linalg.cholesky(cov), cov, 1.0, 0, 0, cov, none, none, none)
 
 
 @njit(cache=True, error_model="numpy")
@@ -223,25 +233,36 @@ def _has_stalled(settings: AdaptationSettings, n_blocks: int, block: Moments) ->
 
 @njit(cache=True, error_model="numpy")
 def _stalled(state: AdaptationState) -> AdaptationState:
-    """Forget the stalled block, propose closer by."""
+    """Forget the stalled block, propose closer by; after too many stalls forget everything."""
     none = _no_moments(state.cov.shape[0])
+    first = state.first_cov
+    if state.n_stalls == MOST_STALLS:
+        return AdaptationState(first, _cholesky(first), first, 1.0, 0, 0, first, none, none, none)
     cov = _scaled(state.cov, STALLED**2)
-    chol = _scaled(state.chol, STALLED)
     return AdaptationState(
-        cov, chol, cov, state.scale, state.n_blocks, none, state.recent, state.older
+        cov,
+        _scaled(state.chol, STALLED),
+        cov,
+        state.scale,
+        state.n_blocks,
+        state.n_stalls + 1,
+        first,
+        none,
+        state.recent,
+        state.older,
     )
 
 
 @njit(cache=True, error_model="numpy")
 def _with_block(state: AdaptationState, block: Moments) -> AdaptationState:
-    cov, chol, base, scale, n_blocks, _, recent, older = state
-    return AdaptationState(cov, chol, base, scale, n_blocks, block, recent, older)
+    cov, chol, base, scale, n_blocks, n_stalls, first, _, recent, older = state
+    return AdaptationState(cov, chol, base, scale, n_blocks, n_stalls, first, block, recent, older)
 
 
 @njit(cache=True, error_model="numpy")
 def _close_block(state: AdaptationState, block: Moments) -> AdaptationState:
     """File a complete block and let its acceptance move the scale."""
-    cov, chol, _, scale, n_blocks, _, recent, older = state
+    cov, chol, _, scale, n_blocks, _, first, _, recent, older = state
     if block.first < LOW_ACCEPTANCE * block.n:
         scale *= SHRINK
     elif block.first > FAIR_ACCEPTANCE * block.n:
@@ -251,13 +272,13 @@ def _close_block(state: AdaptationState, block: Moments) -> AdaptationState:
     recent = _merge(recent, block)
     if n_blocks & (n_blocks - 1) == 0:
         older, recent = recent, none
-    return AdaptationState(cov, chol, cov, scale, n_blocks, none, recent, older)
+    return AdaptationState(cov, chol, cov, scale, n_blocks, 0, first, none, recent, older)
 
 
 @njit(cache=True, error_model="numpy")
 def _learn(state: AdaptationState, moments: Moments) -> AdaptationState:
     """Proposal covariance, thesis Eqs. 3.28-3.29, blended with the one in use before."""
-    _, _, base, scale, n_blocks, block, recent, older = state
+    _, _, base, scale, n_blocks, n_stalls, first, block, recent, older = state
     dim = base.shape[0]
     weight = moments.moved / (moments.moved + PRIOR_MOVES * dim)
     learnt = weight * (2.38 * scale) ** 2 / (dim * moments.n)
@@ -272,7 +293,7 @@ def _learn(state: AdaptationState, moments: Moments) -> AdaptationState:
     chol = _cholesky(cov)
     if not 0.0 < chol[dim - 1, dim - 1] < np.inf:  # the draws have overflowed (or NaN)
         return state
-    return AdaptationState(cov, chol, base, scale, n_blocks, block, recent, older)
+    return AdaptationState(cov, chol, base, scale, n_blocks, n_stalls, first, block, recent, older)
 
 
 @njit(cache=True, error_model="numpy")

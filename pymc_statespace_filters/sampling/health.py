@@ -9,8 +9,11 @@ from pymc_statespace_filters.sampling.log_density import NOT_A_NUMBER
 
 # Share of evaluations after warm-up that may fail in silence: a chain that brushes the edge of the
 # region where its filter works is normal.
-TOLERATED_FAILURES = 0.01
+TOLERATED_FAILURES = 0.05
 
+
+# Share of accepted proposals below which a chain says nothing about its target.
+STANDING = 0.005
 
 # Share of the draws that may rest on collapsed particles: a rare surprise costs only mixing.
 TOLERATED_COLLAPSES = 0.5
@@ -79,19 +82,18 @@ def closing_warning(record: Record) -> SamplerWarning | None:
     pymc.stats.convergence.SamplerWarning or None
         PyMC logs it in the main process, in whichever process the chain ran.
     """
-    if record.moved == 0:
+    if record.moved <= STANDING * record.iterations:
         return _warning(
-            f"DRAM accepted none of {record.iterations} proposals after warm-up: the chain stands "
-            "still. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
-            "likelihood is noisy, give its filter more particles."
+            f"DRAM accepted {record.moved} of {record.iterations} proposals after warm-up: the "
+            "chain hardly moves. Tune longer, start elsewhere (initvals), give proposal_cov, or, "
+            "if the likelihood is noisy, give its filter more particles."
         )
     if record.collapsed > TOLERATED_COLLAPSES * record.iterations:
         return _warning(
             f"In {record.collapsed} of {record.iterations} draws hardly more than one particle "
-            "decided the estimated likelihood at some observation (sample_stats n_effective). The "
-            "chain is then slow to leave estimates that came out too high. More particles "
-            "lessen this only slowly; psf.EKF() and psf.EnKF(n, likelihood='gaussian') do not "
-            "collapse, but have a bias of their own where the state is not Gaussian."
+            "decided the estimated likelihood at some observation (sample_stats n_effective). Such "
+            "estimates scatter by many nats, and a chain is slow to leave one that came out high. "
+            "More particles lessen this only slowly."
         )
     n_failed = sum(count for _, count in record.failures)
     if n_failed > TOLERATED_FAILURES * record.evaluations:

@@ -17,6 +17,8 @@ from pymc_statespace_filters.sampling.held_variables import HeldVariables
 from pymc_statespace_filters.sampling.transition import EvaluatedPoint
 
 N_DRAWS = 200
+# Possible prior draws of which a chain starts at the best.
+N_COMPARED = 10
 
 
 class Starts:
@@ -84,10 +86,13 @@ def _prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
     return table[np.isfinite(table).all(axis=1)]
 
 
-def first_possible(
+def best_start(
     candidates: Sequence[np.ndarray], evaluate: Callable[[np.ndarray], EvaluatedPoint]
 ) -> tuple[EvaluatedPoint, tuple[int, ...]]:
-    """Take the first candidate of positive density.
+    """Take the best of the first few candidates of positive density.
+
+    Far out in the prior an estimated likelihood is a matter of luck, and a chain that begins at a
+    lucky estimate stays there; a few more draws lie better and are still dispersed.
 
     Parameters
     ----------
@@ -107,11 +112,16 @@ def first_possible(
         If all are impossible.
     """
     codes: tuple[int, ...] = ()
+    possible: list[EvaluatedPoint] = []
     for position in candidates:
         start = evaluate(position)
         codes = (*codes, start.failure)
         if start.log_density > -np.inf:
-            return start, codes
+            possible.append(start)
+        if len(possible) == N_COMPARED:
+            break
+    if possible:
+        return max(possible, key=lambda start: start.log_density), codes
     tried = f", nor at {len(codes) - 1} draws from the prior" if len(codes) > 1 else ""
     because = f" ({reason(codes[-1])})" if codes[-1] else ""
     raise ModelError(

@@ -25,7 +25,7 @@ from pymc_statespace_filters.sampling.held_variables import (
 from pymc_statespace_filters.sampling.log_density import LogDensity
 from pymc_statespace_filters.sampling.randomness import Batch, draw_seeds, take
 from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov, stage_pair
-from pymc_statespace_filters.sampling.starts import Starts, first_possible
+from pymc_statespace_filters.sampling.starts import Starts, best_start
 from pymc_statespace_filters.sampling.transition import EvaluatedPoint, Move, delayed_rejection_move
 
 
@@ -269,7 +269,7 @@ class DRAM(BlockedStep):
             seeds = draw_seeds(self.rng, (len(self._seed_names),))
             return self._evaluate(candidate, others, self._noise(seeds))
 
-        return first_possible(candidates, evaluate_afresh)
+        return best_start(candidates, evaluate_afresh)
 
     def _noise(self, fresh: np.ndarray) -> tuple[np.ndarray, ...]:
         """Turn drawn seeds into arguments, or put the held ones in their place."""
