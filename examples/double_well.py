@@ -69,9 +69,14 @@ def simulated_record(path: Path) -> None:
 
 def read_record(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps and values of a CSV with the columns time and value; an empty value is missing."""
-    table = pd.read_csv(path)
-    times, values = table.iloc[:, 0].to_numpy(float), table.iloc[:, 1].to_numpy(float)
-    return psf.nearest_steps(times, DT, t0=times[0]), values
+    try:
+        table = pd.read_csv(path).iloc[:, :2]
+        times, values = table.to_numpy(float).T
+        return psf.nearest_steps(times, DT, t0=times[0]), values
+    except (OSError, ValueError) as error:
+        raise SystemExit(
+            f"{path}: a header and two columns of numbers are needed: {error}"
+        ) from None
 
 
 def rival(coefficients: tuple[str, ...], filter, steps, values) -> pm.Model:

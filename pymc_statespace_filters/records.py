@@ -85,9 +85,17 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     >>> psf.nearest_steps([0.0, 0.101, 0.199], dt=0.01)
     array([ 0, 10, 20])
     """
+    if np.asarray(times).dtype.kind in "mM":
+        raise ModelError(
+            "times must be numbers in the units of dt (seconds from a start), not dates"
+        )
     array = _floats("times", times, 1)
     dt, t0 = positive("dt", dt), check_t0(t0)
-    return check_steps(np.round((array - t0) / dt).astype("int64"))
+    steps = np.round((array - t0) / dt)
+    if (clashes := np.flatnonzero(np.diff(steps) == 0)).size:
+        first, second = array[clashes[0]], array[clashes[0] + 1]
+        raise ModelError(f"times {first:g} and {second:g} fall on one step of dt = {dt:g}")
+    return check_steps(steps.astype("int64"))
 
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:

@@ -82,7 +82,7 @@ def simulate(
     -------
     xarray.Dataset
         ``states`` (step, state) at every step from 0 to the last, ``observations``
-        (obs, observable), with the coordinate ``time`` on both.
+        (obs, observable), with the coordinates ``time`` and ``obs_time``.
 
     Examples
     --------

@@ -11,6 +11,6 @@ ZERO_WEIGHTS = 3
 FAILURES: dict[int, str] = {
     NONE: "no failure",
     NO_FINITE_MEMBER: "every member or particle became infinite or NaN",
-    COVARIANCE_NOT_POSITIVE: "a covariance (predicted observation or system) is not positive definite",
+    COVARIANCE_NOT_POSITIVE: "a covariance of the system or the forecast is not positive definite",
     ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
 }

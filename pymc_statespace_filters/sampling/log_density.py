@@ -28,7 +28,7 @@ class Evaluation(NamedTuple):
     log_density : float
         Never NaN nor plus infinity; a failed evaluation is minus infinity.
     failure : int
-        0, or the code of the reason: a key of ``distribution.FAILURES``, or ``NOT_A_NUMBER``.
+        0, or the code of the reason: a key of ``inspection.FAILURES``, or ``NOT_A_NUMBER``.
     n_effective : float
         Smallest effective number of particles in any filter, infinity without noisy filters.
     """

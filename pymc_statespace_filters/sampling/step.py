@@ -110,7 +110,7 @@ class DRAM(BlockedStep):
         standard deviations
     ``n_evaluations``, ``n_failed``, ``failure``
         evaluations of the model; how many failed, so that the point counts as impossible; and the
-        last one's reason, a key of ``distribution.FAILURES`` or -1: NaN or plus infinity
+        last one's reason, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity
 
     A chain that stood still after warm-up, or whose evaluations often failed, says so when it ends,
     through PyMC's logger.

@@ -133,3 +133,20 @@ def test_another_variables_move_keeps_the_noise(toy):
     mean, sd = exact_posterior()
     assert abs(draws.mean() - mean) < 4.0 * az.mcse(draws, method="mean")
     assert abs(draws.std() - np.hypot(sd, 1.0)) < 4.0 * az.mcse(draws, method="sd")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_proposal_of_every_stage_has_noise_of_its_own(toy):
+    with toy(1.3):
+        step = DRAM(stages=3)
+        seen: list[int] = []
+        evaluate = step._evaluate
+        step._evaluate = lambda position, others, seeds: (
+            seen.append(int(seeds[0])) or evaluate(position, others, seeds)
+        )
+        pm.sample(
+            50, tune=50, chains=1, step=step, random_seed=1, progressbar=False, quiet=True,
+            compute_convergence_checks=False,
+        )  # fmt: skip
+    assert len(seen) > 150
+    assert len(set(seen)) == len(seen)
