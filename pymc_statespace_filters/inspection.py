@@ -20,7 +20,6 @@ __all__ = [
     "exactness",
     "health_outputs",
     "noise_seeds",
-    "noisy_parents",
 ]
 
 
@@ -48,16 +47,6 @@ def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
     return seeds
 
 
-def noisy_parents(model: pm.Model) -> dict[str, list[Variable]]:
-    """For every noisily estimated variable, the free variables that its likelihood reads."""
-    free = set(model.free_RVs)
-    return {
-        name: [v for v in ancestors(node.inputs[2:], blockers=free) if v in free]
-        for name, node in _state_space_nodes(model).items()
-        if node.op.filter.noisy
-    }
-
-
 def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
     nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
@@ -65,6 +54,6 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
 
 
 def exactness(model: pm.Model) -> bool:
-    """Whether sampling the model targets its posterior without a bias of a filter's noise."""
-    filters = [node.op.filter for node in _state_space_nodes(model).values()]
-    return all(not f.noisy or f.unbiased for f in filters)
+    """Whether sampling the model targets its posterior itself, without the bias of a filter."""
+    ops = [node.op for node in _state_space_nodes(model).values()]
+    return all(op.filter.is_exact_for(op.system) for op in ops)

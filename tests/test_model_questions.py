@@ -10,9 +10,8 @@ from pymc_statespace_filters.inspection import (
     exactness,
     health_outputs,
     noise_seeds,
-    noisy_parents,
 )
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 ENKF = psf.EnKF(20)
 
@@ -48,19 +47,24 @@ def test_exactness(filter, exact):
     assert not exactness(model)
 
 
-def test_noisy_parents_are_the_variables_that_the_estimate_reads():
-    with pm.Model() as model:
-        centre = pm.Normal("centre")
-        pm.Normal("a", centre, 1)  # the estimate reads a alone
-        strength = pm.Normal("strength")
-        pair_variable("exact")
-        psf.StateSpace(
-            "d", FORCED, ENKF, steps=STEPS, observed=FORCED_DATA, inputs=strength * FORCE,
-            dims=("d_time", "place"),
-        )  # fmt: skip
-    assert {k: {v.name for v in p} for k, p in noisy_parents(model).items()} == {
-        "d": {"a", "strength"}
-    }
+@pytest.mark.parametrize("exact", [psf.EKF(), psf.BootstrapPF(20)], ids=["EKF", "PF"])
+def test_a_filter_that_approximates_the_system_is_not_exact(exact):
+    """The EKF is exact for linear systems, the bootstrap filter where the density is."""
+
+    def system(power, observation):
+        return psf.StateSpaceModel(
+            lambda x, q: [x[0] ** power + q[0]],
+            observation,
+            process_noise=[[1.0]],
+            observation_noise=[[1.0]],
+            initial_mean=[0.0],
+            initial_cov=[[1.0]],
+        )
+
+    additive, general = (lambda x: [x[0]]), (lambda x, e: [x[0] + x[0] * e[0]])
+    assert exact.is_exact_for(system(1, additive))
+    assert exact.is_exact_for(system(3, additive)) is isinstance(exact, psf.BootstrapPF)
+    assert not exact.is_exact_for(system(1, general))
 
 
 def test_health_comes_out_of_the_same_evaluation():

@@ -1,9 +1,10 @@
 """The filters: frozen settings, one file each.
 
-A filter has the attributes ``noisy`` (its likelihood is an estimate that depends on a seed),
-``unbiased`` (the estimate has the right mean) and ``has_gradient``, and two methods:
-``check(system)`` raises if it cannot treat the system, ``compile(system)`` gives the machine code
-``(theta, steps, observed, inputs, t0, seed) -> (terms, health)``.
+A filter has the attributes ``noisy`` (its likelihood is an estimate that depends on a seed) and
+``has_gradient``, and three methods: ``check(system)`` raises if it cannot treat the system,
+``is_exact_for(system)`` says whether its likelihood, or the mean of its estimates, is the system's,
+and ``compile(system)`` gives the machine code ``(theta, steps, observed, inputs, t0, seed) ->
+(terms, health)``.
 """
 
 from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES

@@ -28,6 +28,11 @@ class EnsembleFilter:
                 f"observation_logp use the particle filters BootstrapPF or PFEnKF"
             )
 
+    def is_exact_for(self, system: StateSpaceModel) -> bool:
+        """Whether the expected likelihood is that of the system, for any number of members."""
+        # Noise that is not additive enters the density through its linearisation.
+        return self.unbiased and (system.additive_noise or not system.gaussian_observation)
+
     def compile(self, system: StateSpaceModel) -> Compiled:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         machine = ensemble_machine(system)

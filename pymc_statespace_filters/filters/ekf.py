@@ -26,6 +26,7 @@ from pymc_statespace_filters.lowering import (
     VectorFunction,
     call,
     covariance_check,
+    is_linear,
     jacobian_of,
     jit,
     key_of,
@@ -61,7 +62,6 @@ class EKF:
     """
 
     noisy = False
-    unbiased = False
     has_gradient = True
 
     def check(self, system: StateSpaceModel) -> None:
@@ -76,6 +76,10 @@ class EKF:
                 f"EKF cannot treat the carried states {list(system.carried)}, which no Kalman "
                 f"update may touch; use EnKF, BootstrapPF or PFEnKF"
             )
+
+    def is_exact_for(self, system: StateSpaceModel) -> bool:
+        """Whether the system is linear; False too where that cannot be seen."""
+        return is_linear(system)
 
     def compile(self, system: StateSpaceModel) -> Compiled:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""

@@ -23,6 +23,7 @@ from pymc_statespace_filters.lowering.graphs import (
     observation_moments,
     symbols_of,
 )
+from pymc_statespace_filters.lowering.noise import is_linear
 
 __all__ = [
     "Compiled",
@@ -33,6 +34,7 @@ __all__ = [
     "covariance_check",
     "digest",
     "ensemble_machine",
+    "is_linear",
     "jacobian_of",
     "jit",
     "key_of",

@@ -1,8 +1,11 @@
-"""Process noise drawn with no more normals than there are states, where the law allows it."""
+"""What the Jacobians of a system tell: noises that can be drawn as one, and linearity."""
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.lowering.compile import unrolled
 from pymc_statespace_filters.lowering.compiled import Graph
@@ -22,15 +25,7 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
         return None
     symbols = symbols_of(system)
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
-    inputs = {name: symbols[name] for name in ("theta", "x", "q", "u", "t")}
-    try:
-        (values,) = unrolled(Graph(inputs, [gain.ravel()]))
-    except NotUnrollableError:
-        return None
-    elsewhere = {
-        f"{name}.{i}" for name in ("x", "q", "u", "t") for i in range(max(1, _size(symbols[name])))
-    }
-    if depends_on(values, frozenset(elsewhere)):
+    if not _is_free_of(("x", "q", "u", "t"), gain, symbols):
         return None
     cov = pt.as_tensor(np.eye(system.m))
     if system.equations.process_noise is not None:
@@ -38,5 +33,31 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
     return FrozenFunctionGraph.from_io([symbols[s] for s in SYMBOLS], [gain @ cov @ gain.T])
 
 
-def _size(symbol) -> int:
+def is_linear(system: StateSpaceModel) -> bool:
+    """Whether state and noise enter the transition and the observation linearly."""
+    symbols = symbols_of(system)
+    equations, variables = system.equations, ("x", "q", "e")
+    if equations.observation is None:
+        return False
+    jacobians = [
+        jacobian_of(call(graph, system, symbols), symbols[name])
+        for graph, names in ((equations.transition, "xq"), (equations.observation, "xe"))
+        for name in names
+    ]
+    return all(_is_free_of(variables, jac, symbols) for jac in jacobians)
+
+
+def _is_free_of(
+    names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
+) -> bool:
+    """Whether no element depends on the named symbols; False where that cannot be seen."""
+    try:
+        (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
+    except NotUnrollableError:
+        return False
+    inputs = {f"{name}.{i}" for name in names for i in range(_size(symbols[name]))}
+    return not depends_on(values, frozenset(inputs))
+
+
+def _size(symbol: TensorVariable) -> int:
     return symbol.type.shape[0] if symbol.type.ndim else 1
