@@ -16,7 +16,11 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import Filter
 from pymc_statespace_filters.likelihood import check_kinds
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.parameters import check_names, missing_parameters
+from pymc_statespace_filters.parameters import (
+    check_names,
+    missing_parameters,
+    parameter_numbers,
+)
 from pymc_statespace_filters.random_variable import StateSpaceRV
 from pymc_statespace_filters.records import (
     check_inputs,
@@ -164,7 +168,9 @@ def _theta(system: StateSpaceModel, params: Mapping[str, Any], model: pm.Model) 
     parts = []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
         value = found[name]
-        symbol = value if isinstance(value, Variable) else pt.as_tensor(_array(name, value))
+        symbol = (
+            value if isinstance(value, Variable) else pt.as_tensor(parameter_numbers(name, value))
+        )
         same = symbol.type.ndim == len(shape) and all(
             s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
         )
@@ -185,16 +191,6 @@ def _model_variables(system: StateSpaceModel, model: pm.Model) -> dict[str, Vari
     return enclosing | {
         name: model.named_vars[full] for name, full in names.items() if full in model.named_vars
     }
-
-
-def _array(name: str, value: Any) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype="float64")
-    except (TypeError, ValueError):
-        raise ModelError(f"parameter {name!r} must be numbers or a symbol, got {value!r}") from None
-    if np.isnan(array).any():
-        raise ModelError(f"parameter {name!r} must not be NaN, got {value!r}")
-    return array
 
 
 def _steps(steps: Any, times: Any, dt: float, t0: float) -> tuple[Any, np.ndarray]:

@@ -37,7 +37,7 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
         raise missing_parameters(system, values)
     parts, batches = [], []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        part = _numbers(name, values[name])
+        part = parameter_numbers(name, values[name])
         core = part.ndim - len(shape)
         if core < 0 or part.shape[core:] != shape:
             raise ModelError(
@@ -55,7 +55,8 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     return np.concatenate([np.broadcast_to(p, (*batch, p.shape[-1])) for p in parts], axis=-1)
 
 
-def _numbers(name: str, value: Any) -> np.ndarray:
+def parameter_numbers(name: str, value: Any) -> np.ndarray:
+    """A parameter's value as an array; never NaN."""
     try:
         array = np.asarray(value, dtype="float64")
     except (TypeError, ValueError):

@@ -114,7 +114,7 @@ def test_declared_shapes():
         ({"a": 1.0, "c": 2.0}, r"unknown parameters \['c'\]; parameters are \['a', 'b'\]"),
         ({"a": [0.1, 0.2]}, r"'a' must have shape \(\), got \(2,\)"),
         ({"a": pt.dvector("v")}, r"'a' must have shape \(\)"),
-        ({"a": "fast"}, "'a' must be numbers or a symbol, got 'fast'"),
+        ({"a": "fast"}, "'a' must be numbers, got 'fast'"),
         ({"a": None}, "'a' must not be NaN, got None"),
         ([0.1], r"params must be a mapping.*got \[0.1\]"),
     ],
