@@ -21,6 +21,7 @@ from pymc_statespace_filters.lowering.compiled import (
     key_of,
 )
 from pymc_statespace_filters.lowering.loops import use_loops
+from pymc_statespace_filters.lowering.vocabulary import FOR_ONE
 
 # How the code reads a whole input.
 _WHOLE = {
@@ -87,7 +88,7 @@ def array_member_function(name: str, arguments: str, graph: Graph, target: str) 
 
 
 def _build(name: str, arguments: str, body: list[str], **parts: Compiled) -> Compiled:
-    namespace = {part: compiled.function for part, compiled in parts.items()}
+    namespace = FOR_ONE | {part: compiled.function for part, compiled in parts.items()}
     function, source = function_of(name, arguments, body, namespace)
     return Compiled(function, key_of(source, *(part.key for part in parts.values())))
 

@@ -27,6 +27,7 @@ from pymc_statespace_filters.lowering.compiled import (
 from pymc_statespace_filters.lowering.scalars import Arena, Value
 from pymc_statespace_filters.lowering.source import Writer, depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
+from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
 
 # Beyond this many scalar operations machine code takes longer to make than it saves.
 MAX_EXPRESSIONS = 1500
@@ -87,7 +88,7 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
         for group, is_scalar in zip(values, function.scalar, strict=True)
     ]
     body = [*lines, f"return {', '.join(results)}"]
-    return _build(name, function.arguments, body, writer.fallbacks)
+    return _build(name, function.arguments, body, writer)
 
 
 def member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
@@ -99,7 +100,7 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
         (values,) = unrolled(graph)
     except NotUnrollableError:
         return array_member_function(name, arguments, graph, target)
-    writer = Writer(_element_code(graph))
+    writer = Writer(_element_code(graph), FOR_MEMBERS)
     members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
     dependent = depends_on(values, members)
     shared = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
@@ -109,9 +110,8 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     inside = writer.statements(values)
     inside += [f"{target.format(i=i)} = {writer.as_float(v)}" for i, v in enumerate(values)]
     loop = [f"for member in range({arguments.split(', ')[-1]}.shape[-1]):"]
-    return _build(
-        name, arguments, [*before, *loop, *("    " + s for s in inside)], writer.fallbacks
-    )
+    body = [*before, *loop, *("    " + s for s in inside)]
+    return _build(name, arguments, body, writer)
 
 
 def sorted_by_number(values: Sequence[Value]) -> list[Value]:
@@ -123,12 +123,10 @@ def _tuple(names: Sequence[str]) -> str:
     return "(" + "".join(f"{name}, " for name in names) + ")"
 
 
-def _build(
-    name: str, arguments: str, body: list[str], fallbacks: dict[str, tuple[ps.ScalarOp, int]]
-) -> Compiled:
-    namespace = {called: _scalar_function(*op) for called, op in fallbacks.items()}
-    function, source = function_of(name, arguments, body, namespace)
-    return Compiled(function, digest(source, *(repr(op) for op, _ in fallbacks.values())))
+def _build(name: str, arguments: str, body: list[str], writer: Writer) -> Compiled:
+    others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
+    function, source = function_of(name, arguments, body, {**writer.vocabulary, **others})
+    return Compiled(function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values())))
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
 from pytensor.graph.basic import Variable
 
 # NaN and infinity keep their meaning: failures are found by them. With reassociation allowed beside
@@ -17,14 +16,6 @@ FAST_MATH = {"contract", "nsz", "arcp"}
 
 # Inputs of which every member of an ensemble has its own.
 MEMBER_INPUTS = frozenset({"x", "z"})
-
-# What generated source may name.
-GLOBALS = {
-    "np": np, "inf": np.inf, "nan": np.nan,
-    **{f: getattr(np, f) for f in ("exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan",
-       "arctan", "arcsin", "arccos", "tanh", "sinh", "cosh", "floor", "ceil", "exp2", "log2",
-       "log10")},
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,9 +46,9 @@ class VectorFunction:
 def function_of(
     name: str, arguments: str, body: Sequence[str], namespace: Mapping[str, Any]
 ) -> tuple[Any, str]:
-    """Compile a function from the lines of its body; also its source."""
+    """Compile a function from the lines of its body, which may name what is in ``namespace``."""
     source = f"def {name}({arguments}):\n" + "".join(f"    {line}\n" for line in body)
-    names = GLOBALS | dict(namespace)
+    names = dict(namespace)
     exec(compile(source, f"<{name} of a state-space system>", "exec"), names)
     return jit(names[name]), source
 

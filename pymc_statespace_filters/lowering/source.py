@@ -4,9 +4,11 @@ The source text is canonical: equal expressions give equal text, in every proces
 also the identity of a lowered function, and part of the key under which machine code is cached.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import pytensor.scalar as ps
+from pytensor.scalar.math import Log1mexp, Sigmoid, Softplus
 
 from pymc_statespace_filters.lowering.scalars import (
     BOOLEAN,
@@ -14,12 +16,14 @@ from pymc_statespace_filters.lowering.scalars import (
     INTEGER,
     Expression,
     Value,
+    is_constant,
     kind_of,
 )
+from pymc_statespace_filters.lowering.vocabulary import FOR_ONE
 
 _INFIX: dict[type, str] = {
     ps.Add: "+", ps.Sub: "-", ps.Mul: "*", ps.TrueDiv: "/", ps.LT: "<", ps.GT: ">", ps.LE: "<=",
-    ps.GE: ">=", ps.EQ: "==", ps.NEQ: "!=", ps.IntDiv: "//", ps.Mod: "%", ps.Pow: "**",
+    ps.GE: ">=", ps.EQ: "==", ps.NEQ: "!=", ps.IntDiv: "//", ps.Mod: "%",
 }  # fmt: skip
 
 _CALLS: dict[type, str] = {
@@ -27,6 +31,8 @@ _CALLS: dict[type, str] = {
     ps.Sin: "sin", ps.Cos: "cos", ps.Tan: "tan", ps.ArcTan: "arctan", ps.Tanh: "tanh",
     ps.Sinh: "sinh", ps.Cosh: "cosh", ps.Abs: "abs", ps.Floor: "floor", ps.Ceil: "ceil",
     ps.Exp2: "exp2", ps.Log2: "log2", ps.Log10: "log10", ps.ArcSin: "arcsin", ps.ArcCos: "arccos",
+    ps.Trunc: "trunc", ps.RoundHalfToEven: "rint",
+    ps.Pow: "power", ps.ArcTan2: "arctan2", ps.IntDiv: "floor_divide", ps.Mod: "modulo",
 }  # fmt: skip
 
 # Branch-free forms that LLVM turns into selects; a NaN argument stays NaN.
@@ -39,13 +45,20 @@ _TEMPLATES: dict[type, str] = {
     ps.Sign: "(1.0 if {0} > 0.0 else (-1.0 if {0} < 0.0 else {0}))",
     ps.IsNan: "({0} != {0})",
     ps.IsInf: "(abs({0}) == inf)",
+    Sigmoid: "1.0 / (1.0 + exp(-{0}))",
+    Softplus: "({0} if {0} > 0.0 else 0.0) + log1p(exp(-abs({0})))",
+    Log1mexp: "(log1p(-exp({0})) if {0} < -0.6931471805599453 else log(-expm1({0})))",
 }
 
 
 class Writer:
-    """Writes the statements that compute some expressions, each at most once."""
+    """Writes the statements that compute some expressions, each at most once.
 
-    def __init__(self, input_code: dict[str, str]) -> None:
+    The names of functions have the meaning that the ``vocabulary`` gives them.
+    """
+
+    def __init__(self, input_code: dict[str, str], vocabulary: Mapping[str, Any] = FOR_ONE) -> None:
+        self.vocabulary = vocabulary
         self._input_code = input_code
         self._names: dict[Expression, str] = {}
         self.fallbacks: dict[str, tuple[ps.ScalarOp, int]] = {}
@@ -74,12 +87,14 @@ class Writer:
         op, args = expression.op, expression.args
         if op is None:
             return self._input_code[args[0]]
-        names = [self.name(a) for a in args]
-        kind = type(op)
-        if kind in _INFIX:
+        kind, names = type(op), [self.name(a) for a in args]
+        if isinstance(op, ps.Pow) and is_constant(args[1]) and args[1] == int(args[1]):
+            return f"{names[0]} ** {_literal(int(args[1]))}"
+        if kind in _INFIX and not (kind in _CALLS and expression.kind == FLOAT):
             return f" {_INFIX[kind]} ".join(names)
         if kind in _CALLS:
-            return f"{_CALLS[kind]}({names[0]})"
+            floats = names if expression.kind != FLOAT else [self.as_float(a) for a in args]
+            return f"{_CALLS[kind]}({', '.join(floats)})"
         if kind in _TEMPLATES:
             return _TEMPLATES[kind].format(*names)
         if isinstance(op, ps.Cast):

@@ -1,0 +1,100 @@
+"""Machine instructions that numba does not offer by name, and how functions made of them compile.
+
+What is built from these has neither branches nor calls, so a loop around it becomes vector code.
+Nothing here takes part in fast mathematics: a caller's flags (`compiled.FAST_MATH`) end where an
+inlined function begins, so the error-free steps stay what they are written as, and a number does
+not depend on whether the loop around it was vectorised.
+"""
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+inlined = njit(
+    error_model="numpy",
+    nogil=True,
+    forceinline=True,
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+)
+"""For the functions inside vector loops: machine code is pasted into every caller."""
+
+ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it rounds to an integer, held in the lowest bits
+_ROUND_BIASED = ROUND + 1023.0
+_EXPONENT_BITS = np.uint64(52)
+_SIGN = np.uint64(0x8000000000000000)
+
+
+@intrinsic
+def fma(typing_context, a, b, c):
+    """``a * b + c``, rounded once; where no such instruction exists, a slow call."""
+
+    def code(context, builder, signature, arguments):
+        return builder.fma(*arguments)
+
+    return types.float64(types.float64, types.float64, types.float64), code
+
+
+@intrinsic
+def sqrt(typing_context, x):
+    """The square root, correctly rounded; NaN for negative numbers."""
+
+    def code(context, builder, signature, arguments):
+        function = builder.module.declare_intrinsic("llvm.sqrt", [ir.DoubleType()])
+        return builder.call(function, arguments)
+
+    return types.float64(types.float64), code
+
+
+@intrinsic
+def polynomial(typing_context, x, coefficients):
+    """A polynomial in x by Horner's rule; the coefficients are a tuple, highest power first."""
+
+    def code(context, builder, signature, arguments):
+        argument, packed = arguments
+        total, *rest = cgutils.unpack_tuple(builder, packed)
+        for coefficient in rest:
+            total = builder.fma(total, argument, coefficient)
+        return total
+
+    return types.float64(types.float64, coefficients), code
+
+
+@intrinsic
+def bits_of(typing_context, x):
+    """The 64 bits of a float64, as uint64."""
+
+    def code(context, builder, signature, arguments):
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.uint64(types.float64), code
+
+
+@intrinsic
+def float_of(typing_context, bits):
+    """The float64 with these 64 bits."""
+
+    def code(context, builder, signature, arguments):
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.uint64), code
+
+
+@inlined
+def power_of_two(k):
+    """2**k for a whole number k between -1022 and 1023."""
+    return float_of(bits_of(k + _ROUND_BIASED) << _EXPONENT_BITS)
+
+
+@inlined
+def sign_bit(x):
+    """The bits of +0.0 or -0.0, whichever has the sign of x."""
+    return bits_of(x) & _SIGN
+
+
+@inlined
+def with_sign(magnitude, sign):
+    """``magnitude``, not negative, with the sign that `sign_bit` found."""
+    return float_of(bits_of(magnitude) | sign)
