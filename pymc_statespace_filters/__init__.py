@@ -16,7 +16,7 @@ from pymc_statespace_filters.evidence import (
     chib_jeliazkov,
     compare_evidence,
 )
-from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, PFEnKF
+from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
 from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
@@ -37,6 +37,7 @@ __all__ = [
     "EvidenceWarning",
     "FilterWarning",
     "GradientUnavailableError",
+    "GridFilter",
     "LoweringError",
     "ModelError",
     "PFEnKF",

@@ -11,8 +11,18 @@ from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.enkf import EnKF
+from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 
-type Filter = EKF | EnKF | BootstrapPF | PFEnKF
+type Filter = EKF | EnKF | BootstrapPF | PFEnKF | GridFilter
 
-__all__ = ["COLLAPSED", "EKF", "FAILURES", "BootstrapPF", "EnKF", "Filter", "PFEnKF"]
+__all__ = [
+    "COLLAPSED",
+    "EKF",
+    "FAILURES",
+    "BootstrapPF",
+    "EnKF",
+    "Filter",
+    "GridFilter",
+    "PFEnKF",
+]

@@ -7,10 +7,15 @@ NONE = 0
 NO_FINITE_MEMBER = 1
 COVARIANCE_NOT_POSITIVE = 2
 ZERO_WEIGHTS = 3
+NO_PROCESS_NOISE = 4
+GRID_TOO_LARGE = 5
 
 FAILURES: dict[int, str] = {
     NONE: "no failure",
     NO_FINITE_MEMBER: "every member or particle became infinite or NaN",
     COVARIANCE_NOT_POSITIVE: "a covariance of the system or the forecast is not positive definite",
     ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
+    NO_PROCESS_NOISE: "the process noise vanished where the state may be",
+    GRID_TOO_LARGE: "the grid would need more than 8192 points, for the noise or the sensor is so "
+    "fine beside the spread of the state, or the equations are so far from smooth",
 }

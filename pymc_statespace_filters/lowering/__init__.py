@@ -24,16 +24,25 @@ from pymc_statespace_filters.lowering.graphs import (
     symbols_of,
 )
 from pymc_statespace_filters.lowering.noise import is_linear
+from pymc_statespace_filters.lowering.one_state import (
+    OneState,
+    has_additive_process_noise,
+    has_smooth_transition,
+    one_state,
+)
 
 __all__ = [
     "Compiled",
     "Graph",
     "Machine",
+    "OneState",
     "VectorFunction",
     "call",
     "covariance_check",
     "digest",
     "ensemble_machine",
+    "has_additive_process_noise",
+    "has_smooth_transition",
     "is_linear",
     "jacobian_of",
     "jit",
@@ -41,6 +50,7 @@ __all__ = [
     "log_normal",
     "observation_moments",
     "observation_sampler",
+    "one_state",
     "semidefinite_cholesky",
     "symbols_of",
     "vector_functions",

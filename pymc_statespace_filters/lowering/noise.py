@@ -25,7 +25,7 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
         return None
     symbols = symbols_of(system)
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
-    if not _is_free_of(("x", "q", "u", "t"), gain, symbols):
+    if not is_free_of(("x", "q", "u", "t"), gain, symbols):
         return None
     cov = pt.as_tensor(np.eye(system.m))
     if system.equations.process_noise is not None:
@@ -44,10 +44,10 @@ def is_linear(system: StateSpaceModel) -> bool:
         for graph, names in ((equations.transition, "xq"), (equations.observation, "xe"))
         for name in names
     ]
-    return all(_is_free_of(variables, jac, symbols) for jac in jacobians)
+    return all(is_free_of(variables, jac, symbols) for jac in jacobians)
 
 
-def _is_free_of(
+def is_free_of(
     names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
 ) -> bool:
     """Whether no element depends on the named symbols; False where that cannot be seen."""
