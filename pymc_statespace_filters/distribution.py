@@ -44,7 +44,7 @@ class StateSpace(Continuous):
         Name of the variable.
     system : StateSpaceModel
         The equations.
-    filter : EKF, EnKF, BootstrapPF or PFEnKF
+    filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter
         How the likelihood is computed.
     params : mapping, optional
         Parameters by name, numbers or expressions. A parameter not named here is the variable of

@@ -57,7 +57,7 @@ def reached(mean, sd, mass, spacing, reach):
 
 @pasted
 def _add_gaussian(first, spacing, mean, sd, mass, out):
-    """Add what N(mean, sd^2) of this mass puts on the points of ``out``, numbered from ``first``."""
+    """Add what N(mean, sd^2) of this mass puts on the points of ``out``, from ``first`` on."""
     scale = spacing / sd
     height = mass * scale * _ONE_OVER_ROOT_TWO_PI
     start = (first * spacing - mean) / sd
@@ -160,10 +160,10 @@ def aliasing(mean, sd, source_spacing, spacing):
 
 @reducing
 def total(mass, shares):
-    """Sum of mass * share."""
+    """Sum of mass * share, in which a share without mass, infinite too, does not count."""
     result = 0.0
     for i in range(mass.size):
-        result += mass[i] * shares[i]
+        result += mass[i] * shares[i] if mass[i] > 0.0 else 0.0
     return result
 
 

@@ -20,25 +20,17 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._failures import (
     COVARIANCE_NOT_POSITIVE,
-    GRID_TOO_LARGE,
-    NO_FINITE_MEMBER,
-    NO_PROCESS_NOISE,
     NONE,
     ZERO_WEIGHTS,
 )
-from pymc_statespace_filters.filters._lattice import (
-    MAX_POINTS,
-    aliasing,
-    coarseness,
-    kernel,
-    lattice,
-    move,
-    normalise,
-    reached,
-    significant,
-    spread,
-    total,
-    weigh,
+from pymc_statespace_filters.filters._point_mass import (
+    REFINEMENT,
+    TOO_COARSE,
+    TOO_SHORT,
+    begin_of,
+    forecast_of,
+    no_table,
+    see_of,
 )
 from pymc_statespace_filters.lowering import (
     Compiled,
@@ -50,10 +42,6 @@ from pymc_statespace_filters.lowering import (
 )
 from pymc_statespace_filters.model import StateSpaceModel
 
-# Reasons to begin again, beside the failures.
-_TOO_COARSE, _TOO_SHORT = -1, -2
-
-_REFINEMENT = 0.7
 _LENGTHENING = 1.6
 _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
 _PER_STEP = 1e-3  # of the tolerance, what one step's error is planned for
@@ -160,9 +148,9 @@ def _evaluation(system: OneState, tolerance: float) -> Any:
             spacing = first_spacing(theta, inputs, t0, steps[-1])
         while is_valid:
             code, j = attempt(theta, steps, observed, inputs, t0, spacing, reach, terms)
-            if code == _TOO_COARSE:
-                spacing *= _REFINEMENT
-            elif code == _TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
+            if code == TOO_COARSE:
+                spacing *= REFINEMENT
+            elif code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
                 reach *= _LENGTHENING
             else:
                 break
@@ -200,9 +188,23 @@ def _first_spacing(system: OneState, tolerance: float) -> Any:
     return first_spacing
 
 
+@pasted
+def nothing_seen(d):
+    """Whether every component is missing."""
+    for value in d:
+        if not np.isnan(value):
+            return False
+    return True
+
+
 def _attempt(system: OneState, tolerance: float) -> Any:
     """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
-    begin, forecast, see, dt = _begin(system), _forecast(system), _see(system, tolerance), system.dt
+    begin, forecast, see, dt = (
+        begin_of(system),
+        forecast_of(system),
+        see_of(system, tolerance),
+        system.dt,
+    )
 
     @pasted
     def attempt(theta, steps, observed, inputs, t0, spacing, reach, terms):
@@ -218,7 +220,7 @@ def _attempt(system: OneState, tolerance: float) -> Any:
                 error += lost
                 k += 1
             if code == NONE and error > tolerance:
-                code = _TOO_COARSE if error < np.inf else NO_PROCESS_NOISE
+                code = TOO_COARSE
             if code != NONE:
                 return code, j
             if nothing_seen(observed[j]):
@@ -233,152 +235,3 @@ def _attempt(system: OneState, tolerance: float) -> Any:
         return code, steps.size
 
     return attempt
-
-
-@compiled
-def no_table():
-    """A table of no points."""
-    nothing = np.empty(0)
-    return np.int64(0), nothing, nothing, nothing, kernel(1.0, nothing, nothing, 1.0)
-
-
-@pasted
-def nothing_seen(d):
-    """Whether every component is missing."""
-    for value in d:
-        if not np.isnan(value):
-            return False
-    return True
-
-
-@pasted
-def cut_of(reach):
-    """The share of the largest mass below which masses are dropped."""
-    return math.exp(-0.5 * reach * reach)
-
-
-def _begin(system: OneState) -> Any:
-    start = system.start
-
-    @pasted
-    def begin(theta, spacing, reach):
-        """The grid at step 0, and the mixture (of one) that its masses are taken from."""
-        mean, variance = start(theta)
-        sd = math.sqrt(variance)
-        source = np.array([mean]), np.array([sd]), np.ones(1)
-        if not (np.isfinite(mean) and np.isfinite(sd)):
-            return NO_FINITE_MEMBER, (np.int64(0), 1.0, np.ones(1)), source
-        if sd == 0.0:
-            return NONE, (np.int64(1), mean, np.ones(1)), source  # point 1 of this spacing
-        spacing = min(spacing, 0.6 * sd)
-        low, n = reached(*source, spacing, reach)
-        if n > MAX_POINTS:
-            return GRID_TOO_LARGE, (low, spacing, np.ones(1)), source
-        return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
-
-    return begin
-
-
-def _forecast(system: OneState) -> Any:
-    moments, same_every_step = _moments(system.move), system.same_every_step
-    drop_escaping = _drop_escaping(system.move)
-
-    @pasted
-    def forecast(theta, inputs, k, t, spacing, reach, grid, table):
-        """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
-        low, here, mass = grid
-        tabled = same_every_step and here == spacing and mass.size > 1
-        if tabled:
-            first = table[0]
-            if low < first or low + mass.size > first + table[1].size:
-                first, n = low - mass.size // 4, mass.size + mass.size // 2
-                mean, sd, shares = moments(theta, inputs, k, t, lattice(first, n, here), here, here)
-                table = first, mean, sd, shares, kernel(spacing, mean, sd, reach)
-            first = low - table[0]
-            last = first + mass.size
-            mean, sd, shares = table[1][first:last], table[2][first:last], table[3][first:last]
-        else:
-            X = lattice(low, mass.size, here)
-            mean, sd, shares = moments(theta, inputs, k, t, X, here, spacing)
-        target, n = reached(mean, sd, mass, spacing, reach)
-        if n > MAX_POINTS:
-            drop_escaping(theta, inputs, k, t, mean, mass)
-            target, n = reached(mean, sd, mass, spacing, reach)
-        source = mean, sd, mass
-        if n == 0 or n > MAX_POINTS:
-            code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
-            return code, grid, source, table, 0.0
-        if tabled:
-            starts, ends, masses = table[4]
-            first = low - table[0]
-            out = move(starts[first:], ends[first:], masses, mass, target, n)
-        else:
-            out = spread(target, n, spacing, *source, reach)
-        i, j = significant(out, cut_of(reach))
-        return NONE, (target + i, spacing, out[i:j]), source, table, total(mass, shares)
-
-    return forecast
-
-
-def _moments(step: Any) -> Any:
-    @pasted
-    def moments(theta, inputs, k, t, X, source_spacing, spacing):
-        """Mean and deviation of the next state from every point, and what a step may misplace."""
-        M = np.empty((2, X.shape[1]))
-        step(theta, inputs, k, t, X, M)
-        mean, sd = M[0], M[1]
-        for i in range(sd.size):
-            sd[i] = math.sqrt(sd[i])
-        return mean, sd, aliasing(mean, sd, source_spacing, spacing)
-
-    return moments
-
-
-def _drop_escaping(step: Any) -> Any:
-    @pasted
-    def drop_escaping(theta, inputs, k, t, mean, mass):
-        """Take the mass off points whose path, without noise, is infinite some steps later."""
-        X, M = np.empty((1, mean.size)), np.empty((2, mean.size))
-        for i in range(mean.size):
-            M[0, i] = mean[i]
-        for _ in range(20):
-            for i in range(mean.size):
-                X[0, i] = M[0, i]
-            step(theta, inputs, k, t, X, M)
-        for i in range(mass.size):
-            if not np.isfinite(M[0, i]):
-                mass[i] = 0.0
-
-    return drop_escaping
-
-
-def _see(system: OneState, tolerance: float) -> Any:
-    log_density = system.log_density
-
-    @pasted
-    def see(theta, inputs, k, t, d, reach, grid, source):
-        """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed."""
-        low, spacing, mass = grid
-        cut = cut_of(reach)
-        while True:
-            log_likelihood = np.empty(mass.size)
-            log_density(theta, inputs, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
-            term, posterior = weigh(mass, log_likelihood)
-            if term == -np.inf:
-                return ZERO_WEIGHTS, grid, term
-            first, last = significant(posterior, cut)
-            normalise(posterior)
-            known = mass.size == 1
-            if not known and posterior[0] + posterior[-1] > tolerance:
-                return _TOO_SHORT, grid, term
-            if known or coarseness(posterior) <= tolerance:
-                return NONE, (low + first, spacing, posterior[first:last]), term
-            lowest, highest = (low + first - 2) * spacing, (low + last + 1) * spacing
-            spacing *= _REFINEMENT
-            low = np.int64(math.floor(lowest / spacing))
-            n = np.int64(math.ceil(highest / spacing)) - low + 1
-            if n > MAX_POINTS:
-                return GRID_TOO_LARGE, grid, term
-            mass = spread(low, n, spacing, *source, reach)
-
-    return see

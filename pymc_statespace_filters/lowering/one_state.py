@@ -23,7 +23,6 @@ from pymc_statespace_filters.lowering.source import depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError
 from pymc_statespace_filters.model import StateSpaceModel
 
-
 _KINKED = (
     ps.Switch, ps.Abs, ps.ScalarMaximum, ps.ScalarMinimum, ps.Clip, ps.Sign, ps.Floor, ps.Ceil,
     ps.Mod, ps.IntDiv, ps.Cast,
@@ -78,10 +77,12 @@ def one_state(system: StateSpaceModel) -> OneState:
     """Compile what a filter of densities needs of a system with one state and additive noise."""
     symbols = {name: symbols_of(system)[name] for name in ("theta", *"xutd")}
     theta = {"theta": symbols["theta"]}
-    start = pt.concatenate([
-        call(system.equations.initial_mean, system, theta),
-        call(system.equations.initial_cov, system, theta).ravel(),
-    ])
+    start = pt.concatenate(
+        [
+            call(system.equations.initial_mean, system, theta),
+            call(system.equations.initial_cov, system, theta).ravel(),
+        ]
+    )
     step = {name: symbols[name] for name in ("theta", *"xut")}
     moments = _step_moments(system, step)
     density = pt.atleast_1d(_log_density(system, symbols))

@@ -1,0 +1,193 @@
+"""The verbs of the point-mass filter: begin, forecast, see.
+
+A *grid* is (low, spacing, masses), see `_lattice`; its *source* is the mixture of Gaussians
+(means, deviations, masses) that the masses were taken from, which has a density at any point: where
+an observation asks for a finer grid, it is made of the source. A known state is the grid whose
+point number 1, of spacing x_0, is x_0. A *table* keeps the kernel of a step that is the same at
+every time, for the points from its first on.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._failures import (
+    GRID_TOO_LARGE,
+    NO_FINITE_MEMBER,
+    NO_PROCESS_NOISE,
+    NONE,
+    ZERO_WEIGHTS,
+)
+from pymc_statespace_filters.filters._lattice import (
+    MAX_POINTS,
+    aliasing,
+    coarseness,
+    kernel,
+    lattice,
+    move,
+    normalise,
+    reached,
+    significant,
+    spread,
+    total,
+    weigh,
+)
+from pymc_statespace_filters.lowering import OneState
+
+# Reasons to begin again, beside the failures.
+TOO_COARSE, TOO_SHORT = -1, -2
+
+REFINEMENT = 0.7
+"""Factor of the spacing where it is too coarse."""
+
+
+@compiled
+def no_table():
+    """A table of no points."""
+    nothing = np.empty(0)
+    return np.int64(0), nothing, nothing, nothing, kernel(1.0, nothing, nothing, 1.0)
+
+
+@pasted
+def cut_of(reach):
+    """The share of the largest mass below which masses are dropped."""
+    return math.exp(-0.5 * reach * reach)
+
+
+def begin_of(system: OneState) -> Any:
+    start = system.start
+
+    @pasted
+    def begin(theta, spacing, reach):
+        """The grid at step 0, and the mixture (of one) that its masses are taken from."""
+        mean, variance = start(theta)
+        sd = math.sqrt(variance)
+        source = np.array([mean]), np.array([sd]), np.ones(1)
+        if not (np.isfinite(mean) and np.isfinite(sd)):
+            return NO_FINITE_MEMBER, (np.int64(0), 1.0, np.ones(1)), source
+        if sd == 0.0:
+            return NONE, (np.int64(1), mean, np.ones(1)), source  # point 1 of this spacing
+        spacing = min(spacing, 0.6 * sd)
+        low, n = reached(*source, spacing, reach)
+        if n > MAX_POINTS:
+            return GRID_TOO_LARGE, (low, spacing, np.ones(1)), source
+        return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
+
+    return begin
+
+
+def forecast_of(system: OneState) -> Any:
+    moments, same_every_step = _moments(system.move), system.same_every_step
+    drop_escaping = _drop_escaping(system.move)
+
+    @pasted
+    def forecast(theta, inputs, k, t, spacing, reach, grid, table):
+        """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
+        low, here, mass = grid
+        tabled = same_every_step and here == spacing and mass.size > 1
+        if tabled:
+            first = table[0]
+            if low < first or low + mass.size > first + table[1].size:
+                first, n = low - mass.size // 4, mass.size + mass.size // 2
+                mean, sd, shares = moments(theta, inputs, k, t, lattice(first, n, here), here, here)
+                table = first, mean, sd, shares, kernel(spacing, mean, sd, reach)
+            first = low - table[0]
+            last = first + mass.size
+            mean, sd, shares = table[1][first:last], table[2][first:last], table[3][first:last]
+        else:
+            X = lattice(low, mass.size, here)
+            mean, sd, shares = moments(theta, inputs, k, t, X, here, spacing)
+        lost = total(mass, shares)
+        if lost == np.inf:
+            return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
+        target, n = reached(mean, sd, mass, spacing, reach)
+        if n > MAX_POINTS:
+            target, n = drop_escaping(theta, inputs, k, t, mean, sd, mass, spacing, reach)
+        source = mean, sd, mass
+        if n == 0 or n > MAX_POINTS:
+            code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
+            return code, grid, source, table, lost
+        if tabled:
+            starts, ends, masses = table[4]
+            first = low - table[0]
+            out = move(starts[first:], ends[first:], masses, mass, target, n)
+        else:
+            out = spread(target, n, spacing, *source, reach)
+        i, j = significant(out, cut_of(reach))
+        return NONE, (target + i, spacing, out[i:j]), source, table, lost
+
+    return forecast
+
+
+def _moments(step: Any) -> Any:
+    @pasted
+    def moments(theta, inputs, k, t, X, source_spacing, spacing):
+        """Mean and deviation of the next state from every point, and what a step may misplace."""
+        M = np.empty((2, X.shape[1]))
+        step(theta, inputs, k, t, X, M)
+        mean, sd = M[0], M[1]
+        for i in range(sd.size):
+            sd[i] = math.sqrt(sd[i])
+        return mean, sd, aliasing(mean, sd, source_spacing, spacing)
+
+    return moments
+
+
+def _drop_escaping(step: Any) -> Any:
+    @pasted
+    def drop_escaping(theta, inputs, k, t, mean, sd, mass, spacing, reach):
+        """Take the mass off exploding points, the fastest first, until a lattice holds the rest.
+
+        Those are points whose path without noise is infinite some steps later.
+        """
+        X, M = np.empty((1, mean.size)), np.empty((2, mean.size))
+        for i in range(mean.size):
+            M[0, i] = mean[i]
+        low, n = np.int64(0), np.int64(MAX_POINTS + 1)
+        for _ in range(20):
+            for i in range(mean.size):
+                X[0, i] = M[0, i]
+            step(theta, inputs, k, t, X, M)
+            for i in range(mass.size):
+                if not np.isfinite(M[0, i]):
+                    mass[i] = 0.0
+            low, n = reached(mean, sd, mass, spacing, reach)
+            if n <= MAX_POINTS:
+                break
+        return low, n
+
+    return drop_escaping
+
+
+def see_of(system: OneState, tolerance: float) -> Any:
+    log_density = system.log_density
+
+    @pasted
+    def see(theta, inputs, k, t, d, reach, grid, source):
+        """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed."""
+        low, spacing, mass = grid
+        cut = cut_of(reach)
+        while True:
+            log_likelihood = np.empty(mass.size)
+            log_density(theta, inputs, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
+            term, posterior = weigh(mass, log_likelihood)
+            if term == -np.inf:
+                return ZERO_WEIGHTS, grid, term
+            first, last = significant(posterior, cut)
+            normalise(posterior)
+            known = mass.size == 1
+            if not known and posterior[0] + posterior[-1] > tolerance:
+                return TOO_SHORT, grid, term
+            if known or coarseness(posterior) <= tolerance:
+                return NONE, (low + first, spacing, posterior[first:last]), term
+            lowest, highest = (low + first - 2) * spacing, (low + last + 1) * spacing
+            spacing *= REFINEMENT
+            low = np.int64(math.floor(lowest / spacing))
+            n = np.int64(math.ceil(highest / spacing)) - low + 1
+            if n > MAX_POINTS:
+                return GRID_TOO_LARGE, grid, term
+            mass = spread(low, n, spacing, *source, reach)
+
+    return see
