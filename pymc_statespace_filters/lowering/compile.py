@@ -33,6 +33,11 @@ from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
 MAX_EXPRESSIONS = 1500
 MAX_OUTPUT_ELEMENTS = 200
 
+# LLVM makes no vector code of a loop before which more than 128 pairs of rows would have to be
+# found apart; 8 rows that are written and as many that are only read make 92.
+MAX_ROWS_COMPARED = 8
+BLOCK = 64
+
 # How generated code reads element i of an input; members are columns.
 _ELEMENT = {
     "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]", "x": "X[{i}, member]",
@@ -107,11 +112,47 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     before = writer.statements(
         [*sorted_by_number(shared), *(v for v in values if v not in dependent)]
     )
-    inside = writer.statements(values)
-    inside += [f"{target.format(i=i)} = {writer.as_float(v)}" for i, v in enumerate(values)]
-    loop = [f"for member in range({arguments.split(', ')[-1]}.shape[-1]):"]
-    body = [*before, *loop, *("    " + s for s in inside)]
-    return _build(name, arguments, body, writer)
+    inside, results = writer.statements(values), [writer.as_float(v) for v in values]
+    loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
+    return _build(name, arguments, [*before, *loop(inside, results, target)], writer)
+
+
+def _loop(inside: list[str], results: list[str], target: str) -> list[str]:
+    """Lines that run ``inside`` for every member and keep its results."""
+    stores = [f"{target.format(i=i)} = {result}" for i, result in enumerate(results)]
+    head = f"for member in range({target.partition('[')[0]}.shape[-1]):"
+    return [head, *_indented([*inside, *stores])]
+
+
+def _staged_loop(inside: list[str], results: list[str], target: str) -> list[str]:
+    """The same by blocks of members, whose results are kept aside and copied.
+
+    What is written is then apart from all that is read, which LLVM need not find out row by row.
+    """
+    whole = target.partition("[")[0]
+    stores = [f"aside[{i}, j] = {result}" for i, result in enumerate(results)]
+    # An unsigned index is never counted from the end, and so leaves the loop vector code.
+    compute = ["member = np.uint64(first + j)", *inside, *stores]
+    copy = [
+        f"for i in range({len(results)}):",
+        "    for j in range(size):",
+        f"        {whole}[i, np.uint64(first + j)] = aside[i, j]",
+    ]
+    block = [
+        f"size = min({BLOCK}, {whole}.shape[-1] - first)",
+        "for j in range(size):",
+        *_indented(compute),
+        *copy,
+    ]
+    return [
+        f"aside = np.empty(({len(results)}, {BLOCK}))",
+        f"for first in range(0, {whole}.shape[-1], {BLOCK}):",
+        *_indented(block),
+    ]
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return ["    " + line for line in lines]
 
 
 def sorted_by_number(values: Sequence[Value]) -> list[Value]:

@@ -82,6 +82,18 @@ def test_members_move_in_vectors_and_as_pytensor_says(name):
     np.testing.assert_allclose(X[0], expected, rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.parametrize("n", [8, 9, 20])
+def test_any_number_of_states_moves_in_vectors(n):
+    x, z = pt.tensor("x", shape=(n,)), pt.tensor("z", shape=(n,))
+    graph = Graph({"x": x, "z": z}, [x * pt.roll(x, 1) + pt.sin(x) + z])
+    propagate = member_function("propagate", "Z, X", graph, "X[{i}, member]").function
+    X, Z = np.random.default_rng(n).normal(size=(2, n, 2 * 64 + N))
+    expected = X * np.roll(X, 1, axis=0) + np.sin(X) + Z
+    propagate(Z, X)
+    assert vector_arithmetic(propagate)
+    np.testing.assert_allclose(X, expected, rtol=1e-13, atol=1e-15)
+
+
 def test_a_call_of_the_library_would_be_noticed():
     x = pt.tensor("x", shape=(1,))
     graph = Graph({"x": x}, [pt.erf(x)])
