@@ -8,7 +8,7 @@ import operator
 
 import numpy as np
 
-from pymc_statespace_filters.lowering import exponentials, instructions, trigonometry
+from pymc_statespace_filters.lowering import exponentials, hyperbolic, instructions, trigonometry
 
 _NUMPY = (
     "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sqrt", "sin", "cos", "tan", "arcsin",
@@ -23,8 +23,8 @@ FOR_ONE = {
 
 _FOR_VECTORS = (
     exponentials.exp, exponentials.exp2, exponentials.expm1, exponentials.log, exponentials.log2,
-    exponentials.log10, exponentials.log1p, exponentials.power, exponentials.sinh,
-    exponentials.cosh, exponentials.tanh, trigonometry.sin, trigonometry.cos, trigonometry.tan,
+    exponentials.log10, exponentials.log1p, exponentials.power, hyperbolic.sinh,
+    hyperbolic.cosh, hyperbolic.tanh, trigonometry.sin, trigonometry.cos, trigonometry.tan,
     trigonometry.arctan, trigonometry.arctan2, trigonometry.floor_divide, trigonometry.modulo,
 )  # fmt: skip
 
