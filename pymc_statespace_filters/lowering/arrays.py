@@ -28,6 +28,7 @@ _WHOLE = {
     "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "d": "d", "x": "X[:, member].copy()",
     "z": "Z[:{n}, member].copy()", "s": "s", "s_bar": "s_bar", "c_bar": "c_bar",
     "term_bar": "np.asarray(term_bar)",
+    "tape": "tape[row]",
 }  # fmt: skip
 
 

@@ -43,6 +43,7 @@ _ELEMENT = {
     "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]", "x": "X[{i}, member]",
     "z": "Z[{i}, member]", "s": "s[{i}]", "s_bar": "s_bar[{i}]", "c_bar": "c_bar[{i}]",
     "term_bar": "term_bar",
+    "tape": "tape[row, {i}]",
 }  # fmt: skip
 
 

@@ -75,6 +75,6 @@ def _source_digest() -> str:
     package = Path(__file__).parent.parent
     # All that machine code can be made by; samplers and evidence make none that is cached here.
     files = sorted(
-        f for folder in (".", "lowering", "filters") for f in package.glob(folder + "/*.py")
+        f for folder in (".", "lowering", "filters", "ops") for f in package.glob(folder + "/*.py")
     )
     return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()

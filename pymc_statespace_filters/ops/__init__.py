@@ -1,0 +1,24 @@
+"""The log-likelihood of a record as PyTensor operations: its value, and its derivative."""
+
+from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.record import (
+    HEALTH_SIZE,
+    RecordOp,
+    cache_key,
+    check_record,
+    evaluator,
+)
+from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapeReversal
+
+__all__ = [
+    "HEALTH_SIZE",
+    "LogLikelihood",
+    "LogLikelihoodGradient",
+    "RecordOp",
+    "TapeReversal",
+    "TapedLogLikelihood",
+    "cache_key",
+    "check_record",
+    "evaluator",
+]

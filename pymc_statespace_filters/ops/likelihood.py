@@ -1,0 +1,94 @@
+"""The log-likelihood of a record as a PyTensor operation."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytensor.tensor as pt
+from pytensor.gradient import DisconnectedType, grad_not_implemented
+from pytensor.graph.basic import Apply, Variable
+from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
+
+from pymc_statespace_filters.errors import GradientUnavailableError
+from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.ops.record import (
+    HEALTH_SIZE,
+    RecordOp,
+    cache_key,
+    check_observed,
+    check_record,
+    kernel,
+)
+
+
+class LogLikelihood(RecordOp):
+    """log p(d_j | d_1 .. d_{j-1}) of every observation, and a record of the filter's health.
+
+    Inputs: ``theta`` (k,), ``steps`` (J,), ``observed`` (J, p), ``inputs`` (steps, n_inputs),
+    ``t0``, ``seed``. Outputs: terms (J,), and health (3,): smallest effective number of
+    particles, code of the failure, index of the failing observation.
+    """
+
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
+
+    def compile(self) -> Compiled:
+        """The filter's machine code."""
+        return self.filter.compile(self.system)
+
+    def results(self) -> list[Variable]:
+        """Terms and health."""
+        return [pt.dvector(), pt.dvector()]
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """As many terms as steps."""
+        return [(input_shapes[1][0],), (HEALTH_SIZE,)]
+
+    def pullback(
+        self,
+        inputs: Sequence[Variable],
+        outputs: Sequence[Variable],
+        cotangents: Sequence[Variable],
+    ) -> list[Variable]:
+        """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
+        if not self.filter.has_gradient:
+            raise GradientUnavailableError(
+                f"The likelihood by {self.filter} is a random estimate without a gradient, so "
+                f"NUTS, HMC, nutpie and find_MAP cannot use it. Sample with "
+                f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
+            )
+        terms_bar = cotangents[0]
+        if isinstance(terms_bar.type, DisconnectedType):
+            theta_bar = pt.zeros_like(inputs[0])
+        else:
+            theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
+        data_bars = [
+            grad_not_implemented(self, i, variable, "only parameters have a gradient")
+            for i, variable in enumerate(inputs[1:], start=1)
+        ]
+        return [theta_bar, *data_bars]
+
+
+# Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
+# combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
+
+
+@register_funcify_and_cache_key(LogLikelihood)
+def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
+    compiled = kernel(op)
+    run = compiled.function
+    check, check_rows = check_record(op.system), check_observed(op.system)
+
+    @numba_njit
+    def log_likelihood(theta, steps, observed, inputs, t0, seed):
+        check(steps, inputs)
+        check_rows(steps, observed)
+        return run(
+            theta.copy(),
+            steps.copy(),
+            observed.copy(),
+            inputs.copy(),
+            t0.item(),
+            seed.item(),
+        )
+
+    return log_likelihood, cache_key(op.system, compiled)

@@ -1,0 +1,129 @@
+"""What every operation on a record has in common: its inputs, their checks, and its machine code.
+
+All are pure: parameters, data and the noise seed are inputs, and equal inputs give equal outputs.
+Nothing that matters is closed over, so that neither merging of equal nodes nor the cache of
+machine code on disk can mix two data sets up.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, ClassVar
+
+import pytensor
+import pytensor.tensor as pt
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.op import Op
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.lowering import Compiled, jit, key_of
+from pymc_statespace_filters.model import StateSpaceModel
+
+HEALTH_SIZE = 3
+
+RECORD_INPUTS = (
+    ("theta", "float64", 1),
+    ("steps", "int64", 1),
+    ("observed", "float64", 2),
+    ("inputs", "float64", 2),
+    ("t0", "float64", 0),
+    ("seed", "int64", 0),
+)
+
+
+class RecordOp(Op):
+    """An operation on parameters and a record, made of a system and a filter."""
+
+    __props__ = ("system", "filter")
+    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
+
+    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
+        self.system = system
+        self.filter = filter
+
+    def __str__(self) -> str:
+        # The default would print every equation of the system.
+        return f"{type(self).__name__}{{{self.filter}}}"
+
+    def compile(self) -> Compiled:
+        """The machine code, a function of the inputs."""
+        raise NotImplementedError
+
+    def results(self) -> list[Variable]:
+        """Fresh variables for the outputs."""
+        raise NotImplementedError
+
+    def make_node(self, *inputs: Any) -> Apply:
+        """Apply to symbols or numbers; the names and types are in `input_types`."""
+        return Apply(self, _typed(inputs, self.input_types), self.results())
+
+    def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        """Evaluate in PyTensor's modes without numba: by the same machine code."""
+        values = evaluator(self)(*inputs)
+        for cell, value in zip(output_storage, values, strict=True):
+            cell[0] = value
+
+
+def _typed(inputs: Sequence[Any], types: Sequence[tuple[str, str, int]]) -> list[Variable]:
+    return [
+        pt.as_tensor(value, dtype=dtype, ndim=ndim)
+        if not isinstance(value, Variable)
+        else _checked(value, name, dtype, ndim)
+        for value, (name, dtype, ndim) in zip(inputs, types, strict=True)
+    ]
+
+
+def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
+    if value.type.ndim != ndim:
+        raise TypeError(f"{name} must have {ndim} dimensions, got {value.type}")
+    return value if value.type.dtype == dtype else pt.cast(value, dtype)
+
+
+@cache
+def evaluator(op: RecordOp) -> Any:
+    """A compiled Python function of the operation's inputs; its machine code is cached on disk."""
+    inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in op.input_types]
+    return pytensor.function(
+        inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
+    )
+
+
+def check_record(system: StateSpaceModel) -> Any:
+    """Compile a check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
+    n_inputs, last_row = system.n_inputs, int(system.observation_uses_inputs)
+
+    @jit
+    def check(steps, inputs):
+        for j in range(steps.size):
+            if steps[j] < 0 or (j > 0 and steps[j] <= steps[j - 1]):
+                raise ModelError("steps must not be negative and must increase strictly")
+        if n_inputs and inputs.shape[1] != n_inputs:
+            raise ModelError("inputs must have one column for each input of the system")
+        if n_inputs and steps.size and inputs.shape[0] < steps[-1] + last_row:
+            raise ModelError("inputs has too few rows: row k holds during step k")
+
+    return check
+
+
+def check_observed(system: StateSpaceModel) -> Any:
+    """Compile a check that a record has the shape that the kernels read."""
+    p = system.p
+
+    @jit
+    def check(steps, observed):
+        if observed.shape[0] != steps.size or observed.shape[1] != p:
+            raise ModelError("observed must have a row for each step, a column for each observable")
+
+    return check
+
+
+def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
+    """What the machine code of this file is made of, on top of a compiled function."""
+    checked = (system.p, system.n_inputs, system.observation_uses_inputs)
+    return key_of(f"checked for {checked}", compiled.key)
+
+
+@cache
+def kernel(op: RecordOp) -> Compiled:
+    """The machine code of an operation, compiled once."""
+    return op.compile()
