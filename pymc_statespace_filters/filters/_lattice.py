@@ -186,6 +186,16 @@ def weigh(mass, log_density):
 
 
 @compiled
+def highest(log_density):
+    """The largest value that is not infinite or NaN."""
+    largest = -np.inf
+    for value in log_density:
+        if value > largest and value < np.inf:
+            largest = value
+    return largest
+
+
+@compiled
 def normalise(mass):
     """Make the sum one, in place."""
     whole = 0.0

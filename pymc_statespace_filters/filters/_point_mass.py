@@ -24,6 +24,7 @@ from pymc_statespace_filters.filters._lattice import (
     MAX_POINTS,
     aliasing,
     coarseness,
+    highest,
     kernel,
     lattice,
     move,
@@ -165,8 +166,12 @@ def see_of(system: OneState, tolerance: float) -> Any:
     log_density = system.log_density
 
     @pasted
-    def see(theta, inputs, k, t, d, reach, grid, source):
-        """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed."""
+    def see(theta, inputs, k, t, d, reach, grid, source, error):
+        """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
+
+        ``error`` is the mass that the steps since the last update may have misplaced: it may lie
+        where the observation looks.
+        """
         low, spacing, mass = grid
         cut = cut_of(reach)
         while True:
@@ -181,11 +186,13 @@ def see_of(system: OneState, tolerance: float) -> Any:
             if not known and posterior[0] + posterior[-1] > tolerance:
                 return TOO_SHORT, grid, term
             if known or coarseness(posterior) <= tolerance:
+                if math.log(error) + highest(log_likelihood) - term > math.log(tolerance):
+                    return TOO_COARSE, grid, term
                 return NONE, (low + first, spacing, posterior[first:last]), term
-            lowest, highest = (low + first - 2) * spacing, (low + last + 1) * spacing
+            start, end = (low + first - 2) * spacing, (low + last + 1) * spacing
             spacing *= REFINEMENT
-            low = np.int64(math.floor(lowest / spacing))
-            n = np.int64(math.ceil(highest / spacing)) - low + 1
+            low = np.int64(math.floor(start / spacing))
+            n = np.int64(math.ceil(end / spacing)) - low + 1
             if n > MAX_POINTS:
                 return GRID_TOO_LARGE, grid, term
             mass = spread(low, n, spacing, *source, reach)

@@ -44,7 +44,7 @@ from pymc_statespace_filters.model import StateSpaceModel
 
 _LENGTHENING = 1.6
 _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
-_PER_STEP = 1e-3  # of the tolerance, what one step's error is planned for
+_PER_STEP = 1e-5  # of the tolerance, what one step's error is planned for
 
 
 @dataclass(frozen=True)
@@ -199,12 +199,8 @@ def nothing_seen(d):
 
 def _attempt(system: OneState, tolerance: float) -> Any:
     """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
-    begin, forecast, see, dt = (
-        begin_of(system),
-        forecast_of(system),
-        see_of(system, tolerance),
-        system.dt,
-    )
+    begin, forecast, dt = begin_of(system), forecast_of(system), system.dt
+    see = see_of(system, tolerance)
 
     @pasted
     def attempt(theta, steps, observed, inputs, t0, spacing, reach, terms):
@@ -219,15 +215,13 @@ def _attempt(system: OneState, tolerance: float) -> Any:
                 )
                 error += lost
                 k += 1
-            if code == NONE and error > tolerance:
-                code = TOO_COARSE
             if code != NONE:
                 return code, j
             if nothing_seen(observed[j]):
                 terms[j] = 0.0
                 continue
             code, grid, terms[j] = see(
-                theta, inputs, k, t0 + k * dt, observed[j], reach, grid, source
+                theta, inputs, k, t0 + k * dt, observed[j], reach, grid, source, error
             )
             if code != NONE:
                 return code, j

@@ -142,7 +142,7 @@ def test_it_is_the_independent_point_mass_filter(reference, record):
     np.testing.assert_allclose(terms, exact, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+@pytest.mark.parametrize("tolerance", [1e-8, pytest.param(1e-4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sensor", [0.3, 0.03, 0.003])
 def test_tolerance_is_kept_against_a_much_finer_lattice(sensor, tolerance):
     reference = DoubleWell(noise_var=sensor**2, initial_var=0.02)
