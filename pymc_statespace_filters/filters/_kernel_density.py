@@ -1,10 +1,10 @@
-"""Gaussian kernel density of weighted particles, exact, O(N^2), in logs (thesis, Eqs. 4.36-4.39).
+"""Gaussian kernel density of weighted particles, in logs (thesis, Eqs. 4.36-4.39).
 
 The density at a target v is sum_l w_l |H|^-1 K(H^-1 (x_l - v)), where H is the lower Cholesky
 factor of the weighted covariance times N_eff^{-1/(n+4)}. Members and targets are whitened by H
-first, so that the double loop sees plain distances. It makes two passes over blocks of 64 targets:
-the largest exponent of each target, then the sum of exponentials relative to it. So a target many
-bandwidths away from every member still has its finite log-density.
+first, so that the sums see plain distances. In one and two directions they go over a lattice
+(`_lattice_sum`), O(N); in more, for few members, and for targets in the far tails they are exact
+(`_kernel_sum`), O(N) a target.
 
 A direction in which the members do not spread at all (a state known exactly, or a copy of another)
 is left out: all members and all targets lie in the same subspace, and the density is the one on it,
@@ -16,20 +16,38 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.filters._compile import compiled, pasted
-from pymc_statespace_filters.filters._elementary import exp
+from pymc_statespace_filters.filters._elementary import log
 from pymc_statespace_filters.filters._ensemble import count_true, covariance, mean
 from pymc_statespace_filters.filters._gaussian import LOG_TWO_PI, semidefinite_cholesky
-from pymc_statespace_filters.filters._random import BLOCK
+from pymc_statespace_filters.filters._kernel_sum import (
+    compact,
+    kernel_sum_workspace,
+    log_kernel_sum,
+)
+from pymc_statespace_filters.filters._lattice_sum import FLOOR, lattice_sums, lattice_workspace
 
 _SQRT_HALF = math.sqrt(0.5)
 _KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a value known exactly
+_LINE_FROM, _PLANE_FROM = 64, 256  # members from which a lattice is at least twice as fast
+
+
+@pasted
+def _by_lattice(n_active, n_members):
+    least = _LINE_FROM if n_active == 1 else _PLANE_FROM
+    return 1 <= n_active <= 2 and n_members >= least
+
+
+def density_method(n_active, n_members):
+    """How the densities of n_members particles that spread in n_active directions are summed."""
+    return "lattice" if _by_lattice.py_func(n_active, n_members) else "exact"
 
 
 @compiled
 def density_workspace(n, width):
     """Scratch of ``log_kernel_density`` for n directions and a padded number of members."""
-    sources, targets = np.empty((n, width)), np.zeros((n, width))
-    return sources, targets, np.empty(width), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    whitened = np.empty((n, width)), np.empty((n, width))
+    missed = np.empty(width, np.int64)
+    return whitened, missed, kernel_sum_workspace(width), lattice_workspace(width)
 
 
 @compiled
@@ -55,48 +73,25 @@ def scott_bandwidth(w, n_effective, X, free, x_mean, P, H, active):
     return True
 
 
-@pasted
-def _whiten(H, active, free, X, i, out, column):
-    """Write H^-1 x_i / sqrt(2) into a column; zero in the directions that are left out."""
+@compiled
+def _whiten(H, active, free, X, out):
+    """Leave H^-1 X / sqrt(2) of the active directions in the first rows of ``out``; how many."""
+    row = 0
     for a in range(active.size):
-        out[a, column] = 0.0
-        if active[a]:
-            value = _SQRT_HALF * X[free[a], i]
-            for b in range(a):
-                value -= H[a, b] * out[b, column]
-            out[a, column] = value / H[a, a]
-
-
-@pasted
-def _half_squares(sources, targets, member, first, q):
-    """q_i = |y - v_i|^2 / 2 for one member and the 64 targets from ``first``."""
-    for a in range(sources.shape[0]):
-        y, v = sources[a, member], targets[a, first : first + BLOCK]
-        if a == 0:
-            for i in range(BLOCK):
-                q[i] = (y - v[i]) * (y - v[i])
-        else:
-            for i in range(BLOCK):
-                q[i] += (y - v[i]) * (y - v[i])
-
-
-@pasted
-def _density_block(sources, targets, log_w, n_sources, first, q, largest, total):
-    """Log of sum_l w_l exp(-|y_l - v_i|^2 / 2) for 64 targets, left in ``total``."""
-    for i in range(BLOCK):
-        largest[i] = -np.inf
-        total[i] = 0.0
-    for member in range(n_sources):
-        _half_squares(sources, targets, member, first, q)
-        for i in range(BLOCK):
-            exponent = log_w[member] - q[i]
-            largest[i] = exponent if exponent > largest[i] else largest[i]
-    for member in range(n_sources):
-        _half_squares(sources, targets, member, first, q)
-        for i in range(BLOCK):
-            total[i] += exp((log_w[member] - q[i]) - largest[i])
-    for i in range(BLOCK):
-        total[i] = largest[i] + math.log(total[i])
+        if not active[a]:
+            continue
+        x, y = X[free[a]], out[row]
+        scale, before = 1.0 / H[a, a], 0
+        for i in range(x.size):
+            y[i] = (_SQRT_HALF * scale) * x[i]
+        for b in range(a):
+            if active[b]:
+                share, z = scale * H[a, b], out[before]
+                for i in range(x.size):
+                    y[i] -= share * z[i]
+                before += 1
+        row += 1
+    return row
 
 
 @compiled
@@ -105,20 +100,26 @@ def log_kernel_density(w, X, V, free, H, active, work, out):
 
     Members of zero weight are left out, and may be NaN. A target that is not finite gets -inf.
     """
-    sources, targets, log_w, q, largest, total = work
-    n_sources = np.int64(0)  # typed, so that `_whiten` is compiled once
-    for i in range(w.size):
-        if w[i] > 0.0:
-            _whiten(H, active, free, X, i, sources, n_sources)
-            log_w[n_sources] = math.log(w[i])
-            n_sources += 1
-        _whiten(H, active, free, V, i, targets, i)
+    (sources, targets), missed, sum_work, lattice_work = work
+    n_active = _whiten(H, active, free, X, sources)
+    _whiten(H, active, free, V, targets)
     log_kernel = 0.0
     for a in range(active.size):
         if active[a]:
             log_kernel -= math.log(H[a, a]) + 0.5 * LOG_TWO_PI
-    for block in range(-(-out.size // BLOCK)):
-        first = block * BLOCK
-        _density_block(sources, targets, log_w, n_sources, first, q, largest, total)
-        for i in range(min(BLOCK, out.size - first)):
-            out[first + i] = total[i] + log_kernel if np.isfinite(total[i]) else -np.inf
+
+    known = _by_lattice(n_active, out.size)
+    known = known and lattice_sums(w, sources, targets, n_active, lattice_work, out)
+    n_missed = 0
+    for i in range(out.size):
+        if not (known and out[i] > FLOOR):
+            missed[n_missed] = i
+            n_missed += 1
+    if known:
+        for i in range(out.size):
+            out[i] = log(out[i]) + log_kernel
+    if n_missed > 0:
+        n_blocks = compact(w, sources, n_active, sum_work)
+        for k in range(n_missed):
+            i = missed[k]
+            out[i] = log_kernel + log_kernel_sum(sources, n_active, n_blocks, targets, i, sum_work)
