@@ -2,22 +2,50 @@
 
 from typing import Any, ClassVar
 
+import numpy as np
+
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.lowering import Compiled, Machine, ensemble_machine, key_of
+from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._failures import OUT_OF_MEMORY
+from pymc_statespace_filters.filters._noise import STORE_NORMALS, NoiseSizes, n_stored
+from pymc_statespace_filters.filters._random import padded
+from pymc_statespace_filters.filters._system import N_TABLE
+from pymc_statespace_filters.lowering import (
+    Compiled,
+    Entry,
+    Machine,
+    address_of,
+    ensemble_machine,
+    key_of,
+    machine_entries,
+)
 from pymc_statespace_filters.model import StateSpaceModel
 
 
 class EnsembleFilter:
-    """A filter whose likelihood is an estimate made with noise."""
+    """A filter whose likelihood is an estimate made with noise.
+
+    A filter gives its ``entry``, see `_loop.filter_entry`, and what `settings` reads.
+    """
 
     noisy: ClassVar[bool] = True
     unbiased: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = False
     needs_simulated_observations: ClassVar[bool] = False
+    simulates: ClassVar[bool] = False
+    entry: ClassVar[Entry]
 
-    def kernel(self, machine: Machine) -> Any:
-        """Compile the filter for the functions of one system."""
+    def size(self) -> int:
+        """Return the number of members."""
         raise NotImplementedError
+
+    def settings(self) -> tuple[float, ...]:
+        """Return the settings that the entry reads besides the size, choices by their number."""
+        raise NotImplementedError
+
+    def resampling_normals(self) -> int:
+        """Return how many normals a resampling takes."""
+        return 0
 
     def check(self, system: StateSpaceModel) -> None:
         """Raise if the system is not one that this filter can treat."""
@@ -33,7 +61,83 @@ class EnsembleFilter:
         # Noise that is not additive enters the density through its linearisation.
         return self.unbiased and (system.additive_noise or not system.gaussian_observation)
 
+    def algorithm(self, machine: Machine) -> "EnsembleFilter":
+        """Return the filter that treats this system: itself, unless nothing is to be nudged."""
+        return self
+
+    def noise_sizes(self, machine: Machine) -> NoiseSizes:
+        """Return how many normals the filter takes where."""
+        simulated = machine.r if self.simulates else 0
+        resampling = self.resampling_normals()
+        return NoiseSizes(padded(self.size()), machine.n, machine.m, simulated, resampling)
+
     def compile(self, system: StateSpaceModel) -> Compiled:
-        """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
+        """The function (theta, steps, observed, inputs, t0, noise) -> (terms, health).
+
+        ``noise`` is a seed and a vector of stored normals; the seed counts where the vector is
+        empty.
+        """
         machine = ensemble_machine(system)
         return Compiled(self.kernel(machine), key_of(repr(self), machine.key))
+
+    def kernel(self, machine: Machine) -> Any:
+        """Bind the filter's entry to the functions of one system."""
+        filter = self.algorithm(machine)
+        functions = machine_entries(machine)
+        for entry in (filter.entry, *(f for f in functions if f is not None)):
+            entry.compile()
+        evaluate = filter.entry.external
+        prepare, initialise, propagate, log_density = (f.symbol for f in functions[:4])
+        observe = functions.observe.symbol if functions.observe is not None else ""
+        free, dt = machine.free, machine.dt
+        sizes = (machine.n, machine.p, machine.n_inputs, machine.n_constants, free.size)
+        constants = np.array([*sizes, *[0] * (N_TABLE - len(sizes)), *free], dtype=np.int64)
+        leading = (filter.size(), *filter.noise_sizes(machine))
+        settings = np.array([*leading, *filter.settings()], dtype=np.float64)
+
+        @compiled
+        def run(theta, steps, observed, inputs, t0, noise):
+            seed, normals = noise
+            terms, health = np.full(steps.size, -np.inf), np.empty(3)
+            health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
+            table = constants.copy()
+            table[5], table[6] = address_of(prepare), address_of(initialise)
+            table[7], table[8] = address_of(propagate), address_of(log_density)
+            table[9] = address_of(observe)
+            evaluate(
+                table.ctypes.data, dt, settings.ctypes.data, theta.ctypes.data, theta.size,
+                steps.ctypes.data, steps.size, observed.ctypes.data,
+                inputs.ctypes.data, inputs.shape[0], t0,
+                seed, normals.ctypes.data, normals.size, terms.ctypes.data, health.ctypes.data,
+            )  # fmt: skip
+            _keep(table, normals)
+            return terms, health
+
+        return run
+
+    def stored_noise(self, system: StateSpaceModel) -> Compiled:
+        """The function (steps, seed) -> the normals that an evaluation with this seed uses."""
+        machine = ensemble_machine(system)
+        width, initial, process, observation, resampling = self.algorithm(machine).noise_sizes(
+            machine
+        )
+        sizes = NoiseSizes(width, initial, process, observation, resampling)
+        STORE_NORMALS.compile()
+        store = STORE_NORMALS.external
+
+        @compiled
+        def stored(steps, seed):
+            n_steps = steps[-1] if steps.size else np.int64(0)
+            out = np.empty(n_stored(sizes, n_steps, steps.size))
+            store(
+                seed, steps.ctypes.data, steps.size, width, initial, process, observation,
+                resampling, out.ctypes.data,
+            )  # fmt: skip
+            return out
+
+        return Compiled(stored, key_of(f"stored noise {sizes}", STORE_NORMALS.key))
+
+
+@compiled
+def _keep(table, normals):
+    """Be the last reader of arrays whose addresses were handed on; else they were freed before."""

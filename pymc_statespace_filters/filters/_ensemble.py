@@ -99,9 +99,10 @@ def forecast_moments(w, X, D, d, moments):
     covariance(w, D, d_mean, D, d_mean, P_dd)
     for b in range(d.size):
         if np.isnan(d[b]):
-            P_xd[:, b] = 0.0
-            P_dd[:, b] = 0.0
-            P_dd[b, :] = 0.0
+            for a in range(P_xd.shape[0]):
+                P_xd[a, b] = 0.0
+            for a in range(d.size):
+                P_dd[a, b] = P_dd[b, a] = 0.0
             P_dd[b, b] = 1.0
     return cholesky(P_dd)
 

@@ -9,6 +9,7 @@ COVARIANCE_NOT_POSITIVE = 2
 ZERO_WEIGHTS = 3
 NO_PROCESS_NOISE = 4
 GRID_TOO_LARGE = 5
+OUT_OF_MEMORY = 6
 
 FAILURES: dict[int, str] = {
     NONE: "no failure",
@@ -18,4 +19,5 @@ FAILURES: dict[int, str] = {
     NO_PROCESS_NOISE: "the process noise vanished where the state may be",
     GRID_TOO_LARGE: "the grid would need more than 8192 points, for the noise or the sensor is so "
     "fine beside the spread of the state, or the equations are so far from smooth",
+    OUT_OF_MEMORY: "there was not enough memory for the members",
 }

@@ -1,81 +1,102 @@
 """The loop of every ensemble filter: predict up to an observation, update, note the increment."""
 
+from collections.abc import Callable
+
 import numpy as np
+from numba import carray, types
 
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._failures import NONE
-from pymc_statespace_filters.filters._random import INITIAL, PROCESS, fill_normals, padded
+from pymc_statespace_filters.filters._noise import (
+    NoiseSizes,
+    initial_normals,
+    noise_of,
+    process_normals,
+)
+from pymc_statespace_filters.filters._random import FILL_NORMALS
+from pymc_statespace_filters.filters._system import initialise, propagate, read_system
+from pymc_statespace_filters.lowering import COUNTS, NUMBERS, Entry, digest
+
+_ARGUMENTS = (
+    COUNTS, types.float64,  # table of the system and its time step
+    NUMBERS,  # number of members, sizes of their noise, then the filter's settings
+    NUMBERS, types.intp,  # theta
+    COUNTS, types.intp, NUMBERS,  # steps and record
+    NUMBERS, types.intp,  # rows of inputs
+    types.float64,  # t0
+    types.int64, NUMBERS, types.intp,  # seed, stored normals
+    NUMBERS, NUMBERS,  # terms, health
+)  # fmt: skip
+
+_N_LEADING = 6  # number of members and five of `NoiseSizes`
 
 
-def filter_loop(machine, n_members, workspace, update):
-    """Compile the evaluation of one filter on one system.
+@pasted
+def _nothing_seen(d):
+    for value in d:
+        if not np.isnan(value):
+            return False
+    return True
+
+
+def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: int) -> Entry:
+    """A filter as one function for all systems and numbers of members.
 
     Parameters
     ----------
-    machine : lowered system
-        The compiled functions ``prepare``, ``initialise`` and ``propagate`` and the sizes of the
-        system.
-    n_members : int
-        Number of members (particles), N.
-    workspace : njit function ``() -> tuple of arrays``
-        Allocates what ``update`` needs and keeps from one observation to the next (weights), once
-        an evaluation.
+    name : str
+    workspace : njit function ``(system, n_members, width, settings) -> tuple``
+        ``width`` is the number of members padded to whole blocks.
+        Allocates what ``update`` needs and keeps what lasts from one observation to the next
+        (weights), once an evaluation; the filter's settings go with it.
     update : njit function
-        ``(c, inputs, k, t, d, seed, X, work) -> (increment, n_effective, failure)``.
-        Replaces the forecast members X (n, N) by the analysis at step k and returns log p(d_j | d_1
-        .. d_{j-1}).
+        ``(system, j, k, t, d, noise, X, work) -> (increment, n_effective, failure)``. Replaces the
+        forecast members X (n, N) by the analysis of observation j at step k and returns
+        log p(d_j | d_1 .. d_{j-1}).
+    n_settings : int
+        How many settings, as numbers, the filter has besides the number of members.
 
     Returns
     -------
-    njit function ``(theta, steps, observed, inputs, t0, seed) -> (terms, health)``
-        ``terms`` (J,): the increments, 0 for a row that is wholly missing, -inf from a failing
-        observation on. ``health`` (3,): smallest effective number of particles, failure code, index
-        of the failing observation or -1.
+    Entry
+        Writes ``terms`` (J,): the increments, 0 for a row that is wholly missing, -inf from a
+        failing observation on; and ``health`` (3,): smallest effective number of particles,
+        failure code, index of the failing observation or -1.
     """
-    n, m, dt = machine.n, machine.m, machine.dt
-    width = padded(n_members)
-    prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
 
-    @pasted
-    def predict(c, inputs, k, t, seed, Z, X):
-        """One step of every member with its own noise (Eqs. 4.22 and 4.40)."""
-        fill_normals(seed, PROCESS, k, Z)
-        propagate(c, inputs, k, t, Z, X)
-
-    @pasted
-    def nothing_seen(d):
-        for value in d:
-            if not np.isnan(value):
-                return False
-        return True
-
-    @compiled
-    def run(theta, steps, observed, inputs, t0, seed):
-        terms, health = np.empty(steps.size), np.empty(3)
-        terms[:] = -np.inf
-        health[0], health[1], health[2] = n_members, NONE, -1
-        c = prepare(theta)
-        work = workspace()
-        X = np.empty((n, n_members))
-        Z = np.empty((n, width))
-        k = np.int64(0)  # typed, so that nothing is compiled twice
-        fill_normals(seed, INITIAL, k, Z)
-        initialise(c, Z, X)
-        Z = np.empty((m, width))
-        for j in range(steps.size):
-            while k < steps[j]:
-                predict(c, inputs, k, t0 + k * dt, seed, Z, X)
+    def run(
+        table, dt, settings, theta, n_theta, steps, n_observations, observed, inputs,
+        n_rows, t0, seed, normals, n_normals, terms, health,
+    ):  # fmt: skip
+        given = carray(settings, (_N_LEADING + n_settings,))
+        n_members, width, initial = np.int64(given[0]), np.int64(given[1]), np.int64(given[2])
+        sizes = NoiseSizes(
+            width, initial, np.int64(given[3]), np.int64(given[4]), np.int64(given[5])
+        )
+        system = read_system(table, dt, theta, n_theta, inputs, n_rows)
+        at = carray(steps, (n_observations,))
+        record = carray(observed, (n_observations, system.p))
+        out, state = carray(terms, (n_observations,)), carray(health, (3,))
+        n_steps = at[n_observations - 1] if n_observations else np.int64(0)
+        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps)
+        work = workspace(system, n_members, width, given[_N_LEADING:])
+        X = np.empty((system.n, n_members))
+        state[0], state[1], state[2] = n_members, NONE, -1
+        initialise(system, initial_normals(noise), sizes.width, X)
+        k = np.int64(0)
+        for j in range(n_observations):
+            while k < at[j]:
+                propagate(system, k, t0 + k * dt, process_normals(noise, k), sizes.width, X)
                 k += 1
-            d = observed[j]
-            if nothing_seen(d):
-                terms[j] = 0.0
+            d = record[j]
+            if _nothing_seen(d):
+                out[j] = 0.0
                 continue
-            increment, n_effective, failure = update(c, inputs, k, t0 + k * dt, d, seed, X, work)
-            health[0] = min(health[0], n_effective)
+            increment, n_effective, failure = update(system, j, k, t0 + k * dt, d, noise, X, work)
+            state[0] = min(state[0], n_effective)
             if failure != NONE:
-                health[1], health[2] = failure, j
+                state[1], state[2] = failure, j
                 break
-            terms[j] = increment
-        return terms, health
+            out[j] = increment
 
-    return run
+    return Entry(run, _ARGUMENTS, name, digest(name), needs=(FILL_NORMALS,))

@@ -8,9 +8,11 @@ vector code. Normals are Box and Muller's.
 """
 
 import numpy as np
+from numba import carray, types
 
 from pymc_statespace_filters.filters._compile import compiled, pasted
-from pymc_statespace_filters.filters._elementary import float_of, log, sin_cos_quarter
+from pymc_statespace_filters.filters._elementary import exp, float_of, log, sin_cos_quarter
+from pymc_statespace_filters.lowering import NUMBERS, Entry, digest
 
 INITIAL, PROCESS, OBSERVATION, RESAMPLING = (np.uint64(purpose) for purpose in range(4))
 """Purposes: which stream of a step a number belongs to."""
@@ -103,21 +105,26 @@ def fill_normals(seed, purpose, step, Z):
                 lower[pair], upper[pair] = box_muller(w0, w1, w2, w3)
 
 
-@compiled
-def uniform(seed, purpose, step):
-    """One uniform number in (0, 1)."""
-    k0, k1 = key_words(seed)
-    zero = np.uint64(0)
-    w0, w1, _, _ = philox(zero, zero, np.uint64(step), purpose, k0, k1)
-    return open_unit(w0, w1)
+@pasted
+def exponential(z0, z1):
+    """A standard exponential from two independent standard normals."""
+    return 0.5 * (z0 * z0 + z1 * z1)
 
 
-@compiled
-def fill_exponentials(seed, purpose, step, out):
-    """Fill the vector ``out`` with standard exponentials."""
-    k0, k1 = key_words(seed)
-    c2, c3 = np.uint64(step), purpose
-    zero = np.uint64(0)
-    for i in range(out.size):
-        w0, w1, _, _ = philox(np.uint64(i), zero, c2, c3, k0, k1)
-        out[i] = -log(open_unit(w0, w1))
+@pasted
+def uniform(z0, z1):
+    """A uniform number in (0, 1] from two independent standard normals."""
+    return exp(-exponential(z0, z1))
+
+
+def _fill(seed, purpose, step, z, n_rows, width):
+    fill_normals(seed, np.uint64(purpose), step, carray(z, (n_rows, width)))
+
+
+FILL_NORMALS = Entry(
+    _fill,
+    (types.int64, types.int64, types.int64, NUMBERS, types.intp, types.intp),
+    "fill_normals",
+    digest("fill_normals"),
+)
+"""`fill_normals` of rows at an address: compiled once for all filters."""

@@ -8,24 +8,31 @@ belongs to particle n + 1; here it is v_{n-1} <= u < v_n with v_0 = 0. It also d
 here N.
 """
 
-from pymc_statespace_filters.filters._compile import compiled
-from pymc_statespace_filters.filters._random import RESAMPLING, fill_exponentials, uniform
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._random import exponential, padded, uniform
 
 
 @compiled
-def systematic(seed, step, points):
-    """Points (i + u) / N with one uniform u; the last of the N + 1 places is not used."""
+def systematic(z, points):
+    """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is not used."""
     n = points.size - 1
-    u = uniform(seed, RESAMPLING, step)
+    u = uniform(z[0], z[1])
     for i in range(n):
         points[i] = (i + u) / n
 
 
 @compiled
-def multinomial(seed, step, points):
+def multinomial(z, points):
     """N sorted uniforms: partial sums of N + 1 exponentials over their total."""
     n = points.size - 1
-    fill_exponentials(seed, RESAMPLING, step, points)
+    half = z.size // 2
+    for i in range(n + 1):
+        points[i] = exponential(z[i], z[half + i])
     for i in range(1, n + 1):
         points[i] += points[i - 1]
     for i in range(n):
@@ -33,6 +40,51 @@ def multinomial(seed, step, points):
 
 
 POINTS = {"systematic": systematic, "multinomial": multinomial}
+SCHEMES = tuple(POINTS)
+_SYSTEMATIC = SCHEMES.index("systematic")
+
+
+class Resampling(NamedTuple):
+    """When and how to resample, and scratch for it."""
+
+    threshold: float
+    systematic: bool
+    always: bool
+    points: np.ndarray
+    ancestors: np.ndarray
+
+
+@pasted
+def resampler(fraction, scheme, n_particles):
+    """Resample below this fraction of the particles, by the scheme of this number."""
+    points, ancestors = np.empty(n_particles + 1), np.empty(n_particles, np.int64)
+    return Resampling(
+        fraction * n_particles, scheme == _SYSTEMATIC, fraction == 1.0, points, ancestors
+    )
+
+
+@pasted
+def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
+    """Draw new particles of equal weight if the effective number is below the threshold.
+
+    ``z`` are the normals that a resampling takes; ``buffer`` is of the size of X.
+    """
+    if not (resampling.always or n_effective < resampling.threshold):
+        return
+    points, ancestors, N = resampling.points, resampling.ancestors, w.size
+    if resampling.systematic:
+        systematic(z, points)
+    else:
+        multinomial(z, points)
+    choose_ancestors(w, points, ancestors)
+    copy_ancestors(ancestors, X, buffer)
+    for i in range(N):
+        log_w[i] = -math.log(N)
+
+
+def n_normals(scheme: str, n_particles: int) -> int:
+    """Normals that a scheme takes, a whole number of blocks."""
+    return 2 * padded(n_particles + 1) if scheme == "multinomial" else padded(2)
 
 
 @compiled

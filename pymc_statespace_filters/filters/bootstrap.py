@@ -11,9 +11,49 @@ from pymc_statespace_filters.filters._checks import check_choice, check_count, c
 from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._ensemble import mark_finite
 from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters._loop import filter_loop
-from pymc_statespace_filters.filters._resampling import POINTS, choose_ancestors, copy_ancestors
+from pymc_statespace_filters.filters._loop import filter_entry
+from pymc_statespace_filters.filters._noise import resampling_normals
+from pymc_statespace_filters.filters._resampling import (
+    SCHEMES,
+    n_normals,
+    resample_if_few,
+    resampler,
+)
+from pymc_statespace_filters.filters._system import log_density
 from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.lowering import Entry
+
+
+@pasted
+def _workspace(system, n_members, width, settings):
+    N = n_members
+    w, log_w, log_p = np.empty(N), np.empty(N), np.empty(N)
+    for i in range(N):
+        log_w[i] = -math.log(N)
+    alive = np.empty(N, np.bool_)
+    return (
+        (w, log_w, log_p, alive),
+        resampler(settings[0], np.int64(settings[1]), N),
+        np.empty((system.n, N)),
+    )
+
+
+@pasted
+def _update(system, j, k, t, d, noise, X, work):
+    (w, log_w, log_p, alive), resampling, buffer = work
+
+    # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
+    if mark_finite(X, X, alive) == 0:
+        return -np.inf, 0.0, NO_FINITE_MEMBER
+    log_density(system, k, t, d, X, log_p)
+    for i in range(alive.size):
+        log_w[i] = log_w[i] + log_p[i] if alive[i] else -np.inf
+    increment = normalise(log_w, w)
+    if increment == -np.inf:
+        return -np.inf, 0.0, ZERO_WEIGHTS
+    n_effective = effective_number(w)  # Eq. 4.43
+    resample_if_few(resampling, n_effective, resampling_normals(noise, j, k), log_w, w, X, buffer)
+    return increment, n_effective, NONE
 
 
 @dataclass(frozen=True)
@@ -55,49 +95,22 @@ class BootstrapPF(EnsembleFilter):
     resampling: str = "systematic"
 
     unbiased: ClassVar[bool] = True
+    entry: ClassVar[Entry] = filter_entry("bootstrap_pf", _workspace, _update, n_settings=2)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_particles", check_count("n_particles", self.n_particles))
         fraction = check_fraction("resample_below", self.resample_below)
         object.__setattr__(self, "resample_below", fraction)
-        check_choice("resampling", self.resampling, POINTS)
+        check_choice("resampling", self.resampling, SCHEMES)
 
-    def kernel(self, machine):
-        """Compile the filter for one system; see ``_loop.filter_loop`` for what is returned."""
-        N, n = self.n_particles, machine.n
-        log_density = machine.log_density
-        draw_points = POINTS[self.resampling]
-        always, threshold = self.resample_below == 1.0, self.resample_below * N
-        log_N = math.log(N)
+    def size(self) -> int:
+        """Return the number of particles."""
+        return self.n_particles
 
-        @pasted
-        def workspace():
-            w, log_w, log_p = np.empty(N), np.empty(N), np.empty(N)
-            log_w[:] = -log_N
-            alive, points, ancestors = np.empty(N, np.bool_), np.empty(N + 1), np.empty(N, np.int64)
-            return w, log_w, log_p, alive, points, ancestors, np.empty((n, N))
+    def settings(self) -> tuple[float, ...]:
+        """Return the threshold of resampling and the number of its scheme."""
+        return self.resample_below, SCHEMES.index(self.resampling)
 
-        @pasted
-        def update(c, inputs, k, t, d, seed, X, work):
-            w, log_w, log_p, alive, points, ancestors, buffer = work
-
-            # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
-            if mark_finite(X, X, alive) == 0:
-                return -np.inf, 0.0, NO_FINITE_MEMBER
-            log_density(c, inputs, k, t, d, X, log_p)
-            for i in range(N):
-                log_w[i] = log_w[i] + log_p[i] if alive[i] else -np.inf
-            increment = normalise(log_w, w)
-            if increment == -np.inf:
-                return -np.inf, 0.0, ZERO_WEIGHTS
-            n_effective = effective_number(w)  # Eq. 4.43
-
-            # Resampling
-            if always or n_effective < threshold:
-                draw_points(seed, k, points)
-                choose_ancestors(w, points, ancestors)
-                copy_ancestors(ancestors, X, buffer)
-                log_w[:] = -log_N
-            return increment, n_effective, NONE
-
-        return filter_loop(machine, N, workspace, update)
+    def resampling_normals(self) -> int:
+        """Return how many normals a resampling takes."""
+        return n_normals(self.resampling, self.n_particles)

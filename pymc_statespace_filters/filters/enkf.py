@@ -8,7 +8,7 @@ import numpy as np
 
 from pymc_statespace_filters.filters._base import EnsembleFilter
 from pymc_statespace_filters.filters._checks import check_choice, check_count
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._ensemble import (
     equal_weights,
     forecast_moments,
@@ -22,13 +22,18 @@ from pymc_statespace_filters.filters._failures import (
     ZERO_WEIGHTS,
 )
 from pymc_statespace_filters.filters._gaussian import log_gaussian
-from pymc_statespace_filters.filters._loop import filter_loop
-from pymc_statespace_filters.filters._random import OBSERVATION, fill_normals, padded
+from pymc_statespace_filters.filters._loop import filter_entry
+from pymc_statespace_filters.filters._noise import observation_normals
+from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.lowering import Entry
+
+_LIKELIHOODS = ("ensemble", "gaussian")
+_ENSEMBLE = 0
 
 
-@compiled
-def _ensemble_mean(n_alive, log_w, log_p, w, d, moments, residual):
+@pasted
+def _ensemble_mean(log_w, log_p, w):
     """Mean over the members of p(d | x^f_i): the log of Eq. 4.26.
 
     How many members carry the mean is the same question as in a particle filter (Eq. 4.43).
@@ -39,8 +44,8 @@ def _ensemble_mean(n_alive, log_w, log_p, w, d, moments, residual):
     return increment, effective_number(w) if increment > -np.inf else 0.0
 
 
-@compiled
-def _gaussian_fit(n_alive, log_w, log_p, w, d, moments, residual):
+@pasted
+def _gaussian_fit(d, moments, residual, n_alive):
     """log N(d; d_bar, P_dd), observed components only; every member alive carries it."""
     _, d_mean, _, P_dd_chol = moments
     n_present = 0
@@ -51,7 +56,45 @@ def _gaussian_fit(n_alive, log_w, log_p, w, d, moments, residual):
     return log_gaussian(residual, P_dd_chol, n_present), float(n_alive)
 
 
-_LIKELIHOODS = {"ensemble": _ensemble_mean, "gaussian": _gaussian_fit}
+@pasted
+def _workspace(system, n_members, width, settings):
+    n, p, N = system.n, system.p, n_members
+    D, alive = np.empty((p, N)), np.empty(N, np.bool_)
+    weights = (np.empty(N), np.empty(N), np.empty(N))
+    moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
+    return settings[0] == _ENSEMBLE, D, alive, weights, moments, np.empty(p)
+
+
+@pasted
+def _update(system, j, k, t, d, noise, X, work):
+    of_ensemble, D, alive, (w, log_w, log_p), moments, residual = work
+
+    # Simulated observations
+    observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.15
+    n_alive = mark_finite(X, D, alive)
+    if n_alive == 0:
+        return -np.inf, 0.0, NO_FINITE_MEMBER
+
+    # Moments of the forecast
+    equal_weights(alive, n_alive, w)
+    if not forecast_moments(w, X, D, d, moments):  # Eqs. 4.16-4.19
+        return -np.inf, float(n_alive), COVARIANCE_NOT_POSITIVE
+
+    # Increment of the log-likelihood
+    if of_ensemble:
+        log_density(system, k, t, d, X, log_p)
+        log_N = math.log(alive.size)
+        for i in range(alive.size):
+            log_w[i] = -log_N if alive[i] else -np.inf
+        increment, n_effective = _ensemble_mean(log_w, log_p, w)  # Eq. 4.26
+    else:
+        increment, n_effective = _gaussian_fit(d, moments, residual, n_alive)
+    if not np.isfinite(increment):
+        return -np.inf, 0.0, ZERO_WEIGHTS
+
+    # Analysis
+    nudge(d, D, alive, system.free, moments, X)  # Eqs. 4.20-4.21
+    return increment, n_effective, NONE
 
 
 @dataclass(frozen=True)
@@ -92,55 +135,17 @@ class EnKF(EnsembleFilter):
     likelihood: str = "ensemble"
 
     needs_simulated_observations: ClassVar[bool] = True
+    simulates: ClassVar[bool] = True
+    entry: ClassVar[Entry] = filter_entry("enkf", _workspace, _update, n_settings=1)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_members", check_count("n_members", self.n_members))
         check_choice("likelihood", self.likelihood, _LIKELIHOODS)
 
-    def kernel(self, machine):
-        """Compile the filter for one system; see ``_loop.filter_loop`` for what is returned."""
-        N, n, p, r = self.n_members, machine.n, machine.p, machine.r
-        free = machine.free
-        observe, log_density = machine.observe, machine.log_density
-        likelihood = _LIKELIHOODS[self.likelihood]
-        width = padded(N)
-        log_N = math.log(N)
+    def size(self) -> int:
+        """Return the number of members."""
+        return self.n_members
 
-        @pasted
-        def workspace():
-            noise, simulated = np.empty((r, width)), np.empty((p, N))
-            alive, w, log_w, log_p = np.empty(N, np.bool_), np.empty(N), np.empty(N), np.empty(N)
-            moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-            return noise, simulated, alive, w, log_w, log_p, moments, np.empty(p)
-
-        @pasted
-        def update(c, inputs, k, t, d, seed, X, work):
-            Z, D, alive, w, log_w, log_p, moments, residual = work
-
-            # Simulated observations
-            fill_normals(seed, OBSERVATION, k, Z)
-            observe(c, inputs, k, t, Z, X, D)  # Eq. 4.15
-            n_alive = mark_finite(X, D, alive)
-            if n_alive == 0:
-                return -np.inf, 0.0, NO_FINITE_MEMBER
-
-            # Moments of the forecast
-            equal_weights(alive, n_alive, w)
-            if not forecast_moments(w, X, D, d, moments):  # Eqs. 4.16-4.19
-                return -np.inf, float(n_alive), COVARIANCE_NOT_POSITIVE
-
-            # Increment of the log-likelihood
-            log_density(c, inputs, k, t, d, X, log_p)
-            for i in range(N):
-                log_w[i] = -log_N if alive[i] else -np.inf
-            increment, n_effective = likelihood(
-                n_alive, log_w, log_p, w, d, moments, residual
-            )  # Eq. 4.26
-            if not np.isfinite(increment):
-                return -np.inf, 0.0, ZERO_WEIGHTS
-
-            # Analysis
-            nudge(d, D, alive, free, moments, X)  # Eqs. 4.20-4.21
-            return increment, n_effective, NONE
-
-        return filter_loop(machine, N, workspace, update)
+    def settings(self) -> tuple[float, ...]:
+        """Return the number of the likelihood."""
+        return (_LIKELIHOODS.index(self.likelihood),)

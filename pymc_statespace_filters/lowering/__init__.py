@@ -16,6 +16,13 @@ from pymc_statespace_filters.lowering.ensemble import (
     ensemble_machine,
     semidefinite_cholesky,
 )
+from pymc_statespace_filters.lowering.entries import (
+    COUNTS,
+    NUMBERS,
+    Entry,
+    address_of,
+    call_address,
+)
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.lowering.graphs import (
     call,
@@ -23,6 +30,7 @@ from pymc_statespace_filters.lowering.graphs import (
     observation_moments,
     symbols_of,
 )
+from pymc_statespace_filters.lowering.members import MachineEntries, machine_entries
 from pymc_statespace_filters.lowering.noise import is_linear
 from pymc_statespace_filters.lowering.one_state import (
     OneState,
@@ -32,12 +40,18 @@ from pymc_statespace_filters.lowering.one_state import (
 )
 
 __all__ = [
+    "COUNTS",
+    "NUMBERS",
     "Compiled",
+    "Entry",
     "Graph",
     "Machine",
     "OneState",
+    "MachineEntries",
     "VectorFunction",
+    "address_of",
     "call",
+    "call_address",
     "covariance_check",
     "digest",
     "ensemble_machine",
@@ -48,6 +62,7 @@ __all__ = [
     "jit",
     "key_of",
     "log_normal",
+    "machine_entries",
     "observation_moments",
     "observation_sampler",
     "one_state",

@@ -39,6 +39,8 @@ class Machine:
     m: int
     p: int
     r: int
+    n_inputs: int
+    n_constants: int
     dt: float
     free: np.ndarray
     prepare: Any
@@ -121,6 +123,8 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
         m=n_noises,
         p=system.p,
         r=system.r,
+        n_inputs=system.n_inputs,
+        n_constants=c.type.shape[0],
         dt=system.dt,
         free=np.setdiff1d(np.arange(system.n), carried),
         prepare=prepare.function,

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType, grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
@@ -78,6 +79,8 @@ def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs
     run = compiled.function
     check, check_rows = check_record(op.system), check_observed(op.system)
 
+    no_normals = np.empty(0)
+
     @numba_njit
     def log_likelihood(theta, steps, observed, inputs, t0, seed):
         check(steps, inputs)
@@ -88,7 +91,7 @@ def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs
             observed.copy(),
             inputs.copy(),
             t0.item(),
-            seed.item(),
+            (seed.item(), no_normals.copy()),
         )
 
     return log_likelihood, cache_key(op.system, compiled)

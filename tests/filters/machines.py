@@ -70,7 +70,7 @@ def linear_machine(F, G, H, R, m0, L0, free=None):
                 X[a, i] = new[a]
 
     return SimpleNamespace(
-        n=n, m=m, p=H.shape[0], r=H.shape[0], dt=0.1,
+        n=n, m=m, p=H.shape[0], r=H.shape[0], n_inputs=0, n_constants=1, dt=0.1, key=None,
         free=np.arange(n) if free is None else np.array(free, dtype=np.int64),
         prepare=prepare, initialise=initialise, propagate=propagate,
         observe=observe, log_density=log_density,
@@ -168,7 +168,7 @@ def double_well_machine():
             x[i] = linear * x[i] + cubic * x[i] * x[i] * x[i] + sd * z[i]
 
     return SimpleNamespace(
-        n=1, m=1, p=1, r=1, dt=dt, free=np.arange(1),
+        n=1, m=1, p=1, r=1, n_inputs=0, n_constants=4, dt=dt, key=None, free=np.arange(1),
         prepare=prepare, initialise=initialise, propagate=propagate,
         observe=observe, log_density=log_density,
     )  # fmt: skip
@@ -178,7 +178,7 @@ DOUBLE_WELL = np.array([4.0, -4.0, 1.0, 0.7])
 """Parameters of the double well: drift, mean and standard deviation of the start."""
 
 
-def evaluate(run, machine, steps, observed, seed=0, theta=(1.0,)):
+def evaluate(run, machine, steps, observed, seed=0, theta=(1.0,), normals=()):
     """Call a compiled filter with the types that the lowering hands over."""
     return run(
         np.asarray(theta, dtype=float),
@@ -186,5 +186,5 @@ def evaluate(run, machine, steps, observed, seed=0, theta=(1.0,)):
         np.asarray(observed, dtype=float),
         np.zeros((0, 0)),
         0.0,
-        seed,
+        (seed, np.array(normals, dtype=float)),
     )

@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._random import RESAMPLING, uniform
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, run
+from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, normals, run
 from tests.filters.machines import kalman, linear_machine, scalar_record
 
 
@@ -39,7 +39,9 @@ def numpy_bootstrap(machine, steps, observed, n_particles, seed, resample_below)
         n_effective = 1 / np.sum(w**2)
         smallest = min(smallest, n_effective)
         if n_effective < resample_below * n_particles:
-            points = (np.arange(n_particles) + uniform(seed, RESAMPLING, step)) / n_particles
+            points = (
+                np.arange(n_particles) + uniform(*normals(seed, RESAMPLING, step, (1, 2))[0])
+            ) / n_particles
             X = X[:, np.searchsorted(np.cumsum(w), points, side="right")]
             w = np.full(n_particles, 1 / n_particles)
     return np.array(terms), smallest

@@ -8,7 +8,14 @@ from scipy.stats import multivariate_normal
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._random import RESAMPLING, uniform
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
-from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, run
+from tests.filters.laws import (
+    OSCILLATOR,
+    EnsembleFilterLaws,
+    forecasts,
+    log_gaussian,
+    normals,
+    run,
+)
 from tests.filters.machines import kalman, linear_machine, scalar_record
 
 SCALAR = scalar_record()
@@ -65,7 +72,7 @@ def numpy_pf_enkf(machine, steps, observed, N, seed, likelihood, resample_below)
         )
         X, w = X_a, new
         if 1 / np.sum(w**2) < resample_below * N:
-            points = (np.arange(N) + uniform(seed, RESAMPLING, step)) / N
+            points = (np.arange(N) + uniform(*normals(seed, RESAMPLING, step, (1, 2))[0])) / N
             X = X[:, np.searchsorted(np.cumsum(w), points, side="right")]
             w = equal
     return np.array(terms)

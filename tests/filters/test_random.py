@@ -12,7 +12,7 @@ from pymc_statespace_filters.filters._random import (
     OBSERVATION,
     PROCESS,
     RESAMPLING,
-    fill_exponentials,
+    exponential,
     fill_normals,
     padded,
     uniform,
@@ -179,14 +179,21 @@ def test_streams_are_uncorrelated():
 
 
 def test_uniforms_are_uniform_and_differ_by_step_and_seed():
-    u = np.array([uniform(seed, RESAMPLING, step) for seed in range(40) for step in range(50)])
+    Z = np.empty((1, 64))
+    u = []
+    for seed in range(40):
+        for step in range(50):
+            fill_normals(seed, RESAMPLING, step, Z)
+            u.append(uniform(Z[0, 0], Z[0, 1]))
+    u = np.array(u)
     assert np.all((u > 0) & (u < 1))
     assert stats.kstest(u, "uniform").pvalue > 1e-3
 
 
 def test_exponentials_are_exponential():
-    e = np.empty(20_000)
-    fill_exponentials(11, RESAMPLING, 4, e)
+    Z = np.empty((2, 20_032))
+    fill_normals(11, RESAMPLING, 4, Z)
+    e = np.array([exponential(z0, z1) for z0, z1 in Z.T])
     assert np.all(e > 0)
     assert stats.kstest(e, "expon").pvalue > 1e-3
 

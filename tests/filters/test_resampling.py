@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pymc_statespace_filters.filters._random import RESAMPLING, fill_normals
 from pymc_statespace_filters.filters._resampling import (
     POINTS,
     choose_ancestors,
     copy_ancestors,
     multinomial,
+    n_normals,
     systematic,
 )
 
@@ -19,10 +21,16 @@ def ancestors_at(weights, points):
     return out.tolist()
 
 
+def normals_of(scheme, n_particles, seed, step):
+    Z = np.empty((1, n_normals(scheme, n_particles)))
+    fill_normals(seed, RESAMPLING, step, Z)
+    return Z[0]
+
+
 def draw(scheme, weights, seed, step=0):
     w = np.array(weights, dtype=float)
     points, out = np.empty(w.size + 1), np.empty(w.size, dtype=np.int64)
-    POINTS[scheme](seed, step, points)
+    POINTS[scheme](normals_of(scheme, w.size, seed, step), points)
     choose_ancestors(w, points, out)
     return out
 
@@ -90,7 +98,7 @@ def test_multinomial_counts_have_the_multinomial_variance():
 
 def test_multinomial_points_are_sorted_uniforms():
     points = np.empty(5001)
-    multinomial(3, 0, points)
+    multinomial(normals_of("multinomial", 5000, 3, 0), points)
     assert np.all(np.diff(points[:5000]) >= 0)
     assert stats.kstest(points[:5000], "uniform").pvalue > 1e-3
     spacings = np.diff(points[:5000]) * 5001  # the gaps of sorted uniforms are exponential
@@ -101,7 +109,7 @@ def test_systematic_points_share_one_offset_which_is_uniform_over_seeds_and_step
     points, offsets = np.empty(9), []
     for seed in range(30):
         for step in range(30):
-            systematic(seed, step, points)
+            systematic(normals_of("systematic", 8, seed, step), points)
             offsets.append(points[0] * 8)
             assert np.allclose(np.diff(points[:8]), 1 / 8)
     assert stats.kstest(offsets, "uniform").pvalue > 1e-3

@@ -1,0 +1,66 @@
+"""The functions of a machine as entries, all of one form, so that a filter is the same for all."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from numba import carray, types
+
+from pymc_statespace_filters.lowering.compiled import key_of
+from pymc_statespace_filters.lowering.ensemble import Machine
+from pymc_statespace_filters.lowering.entries import NUMBERS, Entry
+
+# c, inputs, k, t, what comes to all members (Z and its columns, or d), X, out, number of members
+_MEMBERS = (
+    NUMBERS, NUMBERS, types.intp, types.float64, NUMBERS, types.intp, NUMBERS, NUMBERS, types.intp,
+)  # fmt: skip
+
+
+class MachineEntries(NamedTuple):
+    """One for each function of a `Machine`; ``observe`` is None where the machine has none."""
+
+    prepare: Entry
+    initialise: Entry
+    propagate: Entry
+    log_density: Entry
+    observe: Entry | None
+
+
+def machine_entries(machine: Machine) -> MachineEntries:
+    """Entries around the functions of a machine, not compiled yet."""
+    sizes = (machine.n, machine.m, machine.p, machine.r, machine.n_inputs, machine.n_constants)
+    n, m, p, r, n_inputs, n_constants = sizes
+    prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
+    observe, log_density = machine.observe, machine.log_density
+
+    def prepare_constants(theta, n_theta, c):
+        values, out = prepare(carray(theta, (n_theta,))), carray(c, (n_constants,))
+        for i in range(n_constants):
+            out[i] = values[i]
+
+    def initialise_members(c, inputs, k, t, z, width, x, out, n_members):
+        X, Z = carray(x, (n, n_members)), carray(z, (n, width))
+        initialise(carray(c, (n_constants,)), Z, X)
+
+    def propagate_members(c, inputs, k, t, z, width, x, out, n_members):
+        X, Z = carray(x, (n, n_members)), carray(z, (m, width))
+        propagate(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, Z, X)
+
+    def observe_members(c, inputs, k, t, z, width, x, out, n_members):
+        X, Z, D = carray(x, (n, n_members)), carray(z, (r, width)), carray(out, (p, n_members))
+        observe(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, Z, X, D)
+
+    def log_density_members(c, inputs, k, t, z, width, x, out, n_members):
+        X, d, log_p = carray(x, (n, n_members)), carray(z, (p,)), carray(out, (n_members,))
+        log_density(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, d, X, log_p)
+
+    def entry(function: Callable, arguments: tuple) -> Entry:
+        name = function.__name__
+        return Entry(function, arguments, name, key_of(f"{name} {sizes}", machine.key))
+
+    return MachineEntries(
+        prepare=entry(prepare_constants, (NUMBERS, types.intp, NUMBERS)),
+        initialise=entry(initialise_members, _MEMBERS),
+        propagate=entry(propagate_members, _MEMBERS),
+        log_density=entry(log_density_members, _MEMBERS),
+        observe=entry(observe_members, _MEMBERS) if machine.observe is not None else None,
+    )
