@@ -69,10 +69,8 @@ def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: i
         n_rows, t0, seed, normals, n_normals, terms, health,
     ):  # fmt: skip
         given = carray(settings, (_N_LEADING + n_settings,))
-        n_members, width, initial = np.int64(given[0]), np.int64(given[1]), np.int64(given[2])
-        sizes = NoiseSizes(
-            width, initial, np.int64(given[3]), np.int64(given[4]), np.int64(given[5])
-        )
+        n_members, width = int(given[0]), int(given[1])
+        sizes = NoiseSizes(width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
         at = carray(steps, (n_observations,))
         record = carray(observed, (n_observations, system.p))

@@ -81,7 +81,7 @@ class Entry:
         for needed in self._needs:
             needed.compile()
         options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
-        compiled = CFunc(self._function, (self._arguments, types.void), {}, options)
+        compiled: Any = CFunc(self._function, (self._arguments, types.void), {}, options)
         if self.key is not None and config.numba__cache:
             CACHED_SRC_FUNCTIONS[self._function] = self.key
             compiled._cache = _CacheByKey(self._function)
