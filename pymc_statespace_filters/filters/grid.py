@@ -214,6 +214,8 @@ def _attempt(system: OneState, tolerance: float) -> Any:
                     theta, inputs, k, t0 + k * dt, spacing, reach, grid, table
                 )
                 error += lost
+                if code == NONE and error > tolerance:
+                    code = TOO_COARSE
                 k += 1
             if code != NONE:
                 return code, j

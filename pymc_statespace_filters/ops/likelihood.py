@@ -52,8 +52,9 @@ class LogLikelihood(RecordOp):
     ) -> list[Variable]:
         """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
         if not self.filter.has_gradient:
+            what = "is a random estimate without a" if self.filter.noisy else "does not come with a"
             raise GradientUnavailableError(
-                f"The likelihood by {self.filter} is a random estimate without a gradient, so "
+                f"The likelihood by {self.filter} {what} gradient, so "
                 f"NUTS, HMC, nutpie and find_MAP cannot use it. Sample with "
                 f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
             )

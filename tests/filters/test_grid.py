@@ -17,6 +17,7 @@ from pymc_statespace_filters.filters._failures import (
     NO_PROCESS_NOISE,
     ZERO_WEIGHTS,
 )
+from pymc_statespace_filters.inspection import exactness, noise_seeds
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import (
@@ -255,7 +256,7 @@ def test_mass_that_explodes_is_left_out():
 
 def test_no_point_gives_nan():
     """Parameters over many orders of magnitude."""
-    rng, n = np.random.default_rng(13), 100
+    rng, n = np.random.default_rng(13), 40
     names = ("alpha", "beta", "sigma", "initial_var")
     sizes = 10 ** rng.uniform([-2, -2, -6, -8], [6, 6, 4, 4], (n, 4))
     sizes[:, :2] *= rng.choice([-1, 1], (n, 2))
@@ -305,6 +306,27 @@ def test_systems_that_it_cannot_treat_are_refused_with_advice():
     assert "BootstrapPF" in message
     substeps = psf.EulerMaruyama(lambda x: [-(x[0] ** 3)], [[1.0]], dt=0.1, substeps=2)
     assert "smaller dt" in refused(transition=substeps, process_noise=None)
+
+
+def test_in_a_model_it_is_a_deterministic_likelihood_for_dram():
+    record = double_well()
+    parameters = double_well_parameters(DOUBLE_WELL)
+    with pm.Model() as model:
+        sigma = pm.Flat("sigma")
+        psf.StateSpace(
+            "d",
+            DOUBLE_WELL_SYSTEM,
+            psf.GridFilter(),
+            params=parameters | {"sigma": sigma},
+            steps=record.steps,
+            observed=record.observed,
+        )
+    expected = grid_terms(DOUBLE_WELL, record.observed, record.steps).sum()
+    assert model.compile_logp()({"sigma": 0.6}) == pytest.approx(expected, rel=1e-12)
+    assert exactness(model)
+    assert not noise_seeds(model)
+    with pytest.raises(psf.GradientUnavailableError, match="does not come with a gradient"):
+        model.compile_dlogp()
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.1, -1e-8, np.nan, "1e-8", True])
