@@ -43,6 +43,8 @@ TOO_COARSE, TOO_SHORT = -1, -2
 REFINEMENT = 0.7
 """Factor of the spacing where it is too coarse."""
 
+_KNOWN = 1e-15  # a deviation below this share of the mean is lost in the mean's rounding
+
 
 @compiled
 def no_table():
@@ -68,7 +70,7 @@ def begin_of(system: OneState) -> Any:
         source = np.array([mean]), np.array([sd]), np.ones(1)
         if not (np.isfinite(mean) and np.isfinite(sd)):
             return NO_FINITE_MEMBER, (np.int64(0), 1.0, np.ones(1)), source
-        if sd == 0.0:
+        if sd <= _KNOWN * abs(mean):
             return NONE, (np.int64(1), mean, np.ones(1)), source  # point 1 of this spacing
         spacing = min(spacing, 0.6 * sd)
         low, n = reached(*source, spacing, reach)

@@ -53,7 +53,7 @@ def kalman_terms(reference, observed, steps=STEPS):
     )
 
 
-def linear(growth, noise, sensor, spread):
+def linear(growth, noise, sensor, spread, start=0.4):
     """x' = growth x + N(0, noise^2), seen with an error of this deviation."""
     dt = DoubleWell.dt
     return DoubleWell(
@@ -61,7 +61,7 @@ def linear(growth, noise, sensor, spread):
         beta=0.0,
         sigma=noise / np.sqrt(dt),
         noise_var=sensor**2,
-        initial_mean=0.4,
+        initial_mean=start,
         initial_var=spread**2,
     )
 
@@ -82,13 +82,23 @@ def simulated(reference, steps=STEPS, seed=0):
 def test_it_is_the_kalman_filter_on_linear_systems(growth, noise):
     """Sensors far finer than the noise of a step, starts known and far broader than it."""
     for sensor in (1.0, 0.3, 0.03, 0.003):
-        for spread in (0.0, 1e-6, 0.3, 5.0):
+        for spread in (0.0, 1e-20, 1e-6, 0.3, 5.0):
             system = linear(growth, noise, sensor, spread)
             observed = simulated(system)
             terms = grid_terms(system, observed)
             exact = kalman_terms(system, observed)
             np.testing.assert_allclose(terms, exact, rtol=0.0, atol=1e-9)
             assert terms[3] == 0.0
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-20])
+@pytest.mark.parametrize("start", [0.0, -1e6])
+def test_a_known_start_may_be_zero_or_far_off(start, spread):
+    system = linear(0.9, 1.0, 0.3, spread, start)
+    observed = simulated(system)
+    np.testing.assert_allclose(
+        grid_terms(system, observed), kalman_terms(system, observed), rtol=0.0, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("first_step", [0, 4])
