@@ -9,7 +9,13 @@ import numpy as np
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.ops import HEALTH_SIZE, LogLikelihood, evaluator
+from pymc_statespace_filters.ops import (
+    HEALTH_SIZE,
+    BatchLogLikelihood,
+    LogLikelihood,
+    evaluator,
+    has_batch,
+)
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import (
     check_inputs,
@@ -97,17 +103,26 @@ def log_likelihood(
         ) from None
     theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
     seeds = np.broadcast_to(seeds, shape)
-    evaluate = evaluator(LogLikelihood(system, filter))
-    terms = np.empty((*shape, at.size))
-    health = np.empty((*shape, HEALTH_SIZE))
-    origin = np.asarray(t0)
-    for index in np.ndindex(shape):
-        point = np.ascontiguousarray(theta[index])
-        terms[index], health[index] = evaluate(
-            point, at, data, forces, origin, np.asarray(seeds[index])
-        )
-    warn_of(filter, health.reshape(-1, HEALTH_SIZE))
-    return terms
+    points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
+    record = (at, data, forces, np.asarray(t0))
+    terms, health = _evaluate(LogLikelihood(system, filter), points, record, seeds.ravel())
+    warn_of(filter, health)
+    return terms.reshape(*shape, at.size)
+
+
+def _evaluate(
+    op: LogLikelihood, points: np.ndarray, record: tuple, seeds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Terms and health of every point: side by side where the filter can, else in turn."""
+    if len(points) > 1 and has_batch(op):
+        # Such a filter draws nothing: any seed will do.
+        return evaluator(BatchLogLikelihood(op.system, op.filter))(points, *record, seeds[0])
+    evaluate = evaluator(op)
+    terms = np.empty((len(points), record[0].size))
+    health = np.empty((len(points), HEALTH_SIZE))
+    for i, point in enumerate(points):
+        terms[i], health[i] = evaluate(point, *record, np.asarray(seeds[i]))
+    return terms, health
 
 
 def warn_of(filter: Filter, health: np.ndarray) -> None:

@@ -8,13 +8,12 @@ from pymc.logprob.abstract import _logprob
 from pytensor.graph.basic import Variable
 from pytensor.link.numba.dispatch.basic import numba_njit
 from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
-from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.filters import Filter
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.ops import LogLikelihood, cache_key, check_record
+from pymc_statespace_filters.ops import LogLikelihood, cache_key, check_record, vectorized
 from pymc_statespace_filters.simulation import simulator
 
 
@@ -94,4 +93,4 @@ def _log_density(
     arguments = (theta, steps, value, inputs, t0, seed)
     cores = (1, 1, 2, 2, 0, 0)
     batched = any(a.type.ndim > n for a, n in zip(arguments, cores, strict=True))
-    return (Blockwise(likelihood) if batched else likelihood)(*arguments)[0]
+    return (vectorized(likelihood, *arguments) if batched else likelihood(*arguments))[0]

@@ -13,6 +13,7 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters._batch import compile_batch
 from pymc_statespace_filters.filters._recursion import Recursion, compile_taped, compile_value
 from pymc_statespace_filters.filters._reverse import compile_gradient, compile_reverse
 from pymc_statespace_filters.lowering import (
@@ -76,8 +77,12 @@ class EKF:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         return compile_value(_recursion(system))
 
+    def compile_batch(self, system: StateSpaceModel) -> Compiled:
+        """The same of many points: theta (B, k) -> terms (B, J) and health (B, 3)."""
+        return compile_batch(_recursion(system))
+
     def compile_taped(self, system: StateSpaceModel) -> Compiled:
-        """The same with a third result: the tape, from which `compile_reverse` differentiates."""
+        """That of one point with a third result: the tape, which `compile_reverse` reads."""
         return compile_taped(_recursion(system))
 
     def compile_reverse(self, system: StateSpaceModel) -> Compiled:

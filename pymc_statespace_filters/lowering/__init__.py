@@ -30,6 +30,7 @@ from pymc_statespace_filters.lowering.graphs import (
     observation_moments,
     symbols_of,
 )
+from pymc_statespace_filters.lowering.lanes import LANES, LANES_AT_ONCE, lane_functions
 from pymc_statespace_filters.lowering.members import MachineEntries, machine_entries
 from pymc_statespace_filters.lowering.noise import is_linear
 from pymc_statespace_filters.lowering.one_state import (
@@ -38,15 +39,19 @@ from pymc_statespace_filters.lowering.one_state import (
     has_smooth_transition,
     one_state,
 )
+from pymc_statespace_filters.lowering.unroll import NotUnrollableError
 
 __all__ = [
     "COUNTS",
+    "LANES",
+    "LANES_AT_ONCE",
     "NUMBERS",
     "Compiled",
     "Entry",
     "Graph",
     "Machine",
     "MachineEntries",
+    "NotUnrollableError",
     "OneState",
     "VectorFunction",
     "address_of",
@@ -61,6 +66,7 @@ __all__ = [
     "jacobian_of",
     "jit",
     "key_of",
+    "lane_functions",
     "log_normal",
     "machine_entries",
     "observation_moments",

@@ -6,7 +6,7 @@ does it for every column of an ensemble. Both are written out in scalars where t
 small enough, and call PyTensor's own array code otherwise; a caller cannot tell the difference.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
         for group, is_scalar in zip(values, function.scalar, strict=True)
     ]
     body = [*lines, f"return {', '.join(results)}"]
-    return _build(name, function.arguments, body, writer)
+    return build(name, function.arguments, body, writer)
 
 
 def member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
@@ -115,7 +115,7 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     )
     inside, results = writer.statements(values), [writer.as_float(v) for v in values]
     loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
-    return _build(name, arguments, [*before, *loop(inside, results, target)], writer)
+    return build(name, arguments, [*before, *loop(inside, results, target)], writer)
 
 
 def _loop(inside: list[str], results: list[str], target: str) -> list[str]:
@@ -156,7 +156,7 @@ def _indented(lines: Sequence[str]) -> list[str]:
     return ["    " + line for line in lines]
 
 
-def sorted_by_number(values: Sequence[Value]) -> list[Value]:
+def sorted_by_number(values: Iterable[Value]) -> list[Value]:
     """Expressions in the order of their making, so that the source is canonical."""
     return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
 
@@ -165,7 +165,8 @@ def _tuple(names: Sequence[str]) -> str:
     return "(" + "".join(f"{name}, " for name in names) + ")"
 
 
-def _build(name: str, arguments: str, body: list[str], writer: Writer) -> Compiled:
+def build(name: str, arguments: str, body: list[str], writer: Writer) -> Compiled:
+    """Compile a body that a writer wrote."""
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     function, source = function_of(name, arguments, body, {**writer.vocabulary, **others})
     return Compiled(function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values())))

@@ -54,13 +54,19 @@ _TEMPLATES: dict[type, str] = {
 class Writer:
     """Writes the statements that compute some expressions, each at most once.
 
-    The names of functions have the meaning that the ``vocabulary`` gives them.
+    The names of functions have the meaning that the ``vocabulary`` gives them; what is ``known``
+    was computed before and is read by the code given.
     """
 
-    def __init__(self, input_code: dict[str, str], vocabulary: Mapping[str, Any] = FOR_ONE) -> None:
+    def __init__(
+        self,
+        input_code: dict[str, str],
+        vocabulary: Mapping[str, Any] = FOR_ONE,
+        known: Mapping[Value, str] | None = None,
+    ) -> None:
         self.vocabulary = vocabulary
         self._input_code = input_code
-        self._names: dict[Expression, str] = {}
+        self._names: dict[Value, str] = dict(known or {})
         self.fallbacks: dict[str, tuple[ps.ScalarOp, int]] = {}
 
     def statements(self, values: Iterable[Value]) -> list[str]:
@@ -113,7 +119,7 @@ class Writer:
         return f"{name}({', '.join(self.as_float(a) for a in args)})"
 
 
-def _in_order(values: Iterable[Value], written: dict[Expression, str]) -> list[Expression]:
+def _in_order(values: Iterable[Value], written: Mapping[Value, str]) -> list[Expression]:
     """Expressions that ``values`` need, arguments first; no recursion, graphs may be deep."""
     order: list[Expression] = []
     seen = set(written)

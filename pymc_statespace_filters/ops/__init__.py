@@ -1,5 +1,6 @@
 """The log-likelihood of a record as PyTensor operations: its value, and its derivative."""
 
+from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch, vectorized
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.record import (
@@ -13,6 +14,7 @@ from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapeReversal
 
 __all__ = [
     "HEALTH_SIZE",
+    "BatchLogLikelihood",
     "LogLikelihood",
     "LogLikelihoodGradient",
     "RecordOp",
@@ -21,4 +23,6 @@ __all__ = [
     "cache_key",
     "check_record",
     "evaluator",
+    "has_batch",
+    "vectorized",
 ]

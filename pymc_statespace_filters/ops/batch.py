@@ -1,0 +1,113 @@
+"""Many parameter points and one record: one operation, where a filter moves them side by side."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytensor.tensor as pt
+from pytensor.gradient import DisconnectedType, grad_not_implemented
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.replace import _vectorize_node
+from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
+from pytensor.tensor.blockwise import Blockwise
+
+from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.record import (
+    HEALTH_SIZE,
+    RECORD_INPUTS,
+    RecordOp,
+    cache_key,
+    check_observed,
+    check_record,
+    kernel,
+)
+
+
+class BatchLogLikelihood(RecordOp):
+    """`LogLikelihood` of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
+
+    input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
+
+    def compile(self) -> Compiled:
+        """The filter's machine code for many points."""
+        return self.filter.compile_batch(self.system)  # type: ignore[union-attr]
+
+    def results(self) -> list[Variable]:
+        """Terms and health of every point."""
+        return [pt.dmatrix(), pt.dmatrix()]
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """A row for every point."""
+        n_points = input_shapes[0][0]
+        return [(n_points, input_shapes[1][0]), (n_points, HEALTH_SIZE)]
+
+    def pullback(
+        self,
+        inputs: Sequence[Variable],
+        outputs: Sequence[Variable],
+        cotangents: Sequence[Variable],
+    ) -> list[Variable]:
+        """Reverse-mode derivative by theta, point by point."""
+        theta_bar = pt.zeros_like(inputs[0])
+        if not isinstance(cotangents[0].type, DisconnectedType):
+            gradient = Blockwise(LogLikelihoodGradient(self.system, self.filter))
+            theta_bar = gradient(*inputs, cotangents[0])
+        data_bars = [
+            grad_not_implemented(self, i, variable, "only parameters have a gradient")
+            for i, variable in enumerate(inputs[1:], start=1)
+        ]
+        return [theta_bar, *data_bars]
+
+
+def has_batch(op: LogLikelihood) -> bool:
+    """Whether the operation's filter moves many points side by side."""
+    return hasattr(op.filter, "compile_batch")
+
+
+def vectorized(op: LogLikelihood, theta: Variable, *record: Variable) -> list[Variable]:
+    """Terms and health over leading dimensions, of the parameters alone or of any input."""
+    cores = [ndim for _, _, ndim in RECORD_INPUTS[1:]]
+    extra = [value.type.ndim - ndim for value, ndim in zip(record, cores, strict=True)]
+    one_record = max(extra) < theta.type.ndim and all(
+        length == 1
+        for value, n in zip(record, extra, strict=True)
+        for length in value.type.shape[:n]
+    )
+    if not (one_record and theta.type.ndim > 1 and has_batch(op)):
+        return Blockwise(op)(*[theta, *record], return_list=True)
+    record = tuple(value[(0,) * n] if n else value for value, n in zip(record, extra, strict=True))
+    shape = tuple(theta.shape)[:-1]
+    batch = BatchLogLikelihood(op.system, op.filter)
+    if len(shape) == 1:
+        return batch(theta, *record)
+    points = theta.reshape((pt.prod(pt.stack(shape)), theta.shape[-1]))
+    results = batch(points, *record)
+    return [result.reshape((*shape, result.shape[-1])) for result in results]
+
+
+@_vectorize_node.register(LogLikelihood)
+def _vectorize(op: LogLikelihood, node: Apply, *inputs: Variable) -> list[Variable]:
+    return vectorized(op, *inputs)
+
+
+@register_funcify_and_cache_key(BatchLogLikelihood)
+def _numba_batch(op: BatchLogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
+    compiled = kernel(op)
+    run = compiled.function
+    check, check_rows = check_record(op.system), check_observed(op.system)
+
+    @numba_njit
+    def batch_log_likelihood(theta, steps, observed, inputs, t0, seed):
+        check(steps, inputs)
+        check_rows(steps, observed)
+        return run(
+            theta.copy(),
+            steps.copy(),
+            observed.copy(),
+            inputs.copy(),
+            t0.item(),
+            seed.item(),
+        )
+
+    return batch_log_likelihood, cache_key(op.system, compiled)
