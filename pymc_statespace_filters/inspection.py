@@ -1,17 +1,19 @@
 """What samplers, evidence and diagnostics need to know of the state-space variables in a model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pymc as pm
+import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
+from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import COLLAPSED, FAILURES
-from pymc_statespace_filters.ops import LogLikelihood
+from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.random_variable import StateSpaceRV
 
 __all__ = [
@@ -19,6 +21,7 @@ __all__ = [
     "FAILURES",
     "exactness",
     "health_outputs",
+    "hold_noise",
     "noise_seeds",
 ]
 
@@ -51,6 +54,28 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
     nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
     return [node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)]
+
+
+def hold_noise(
+    graphs: Sequence[Variable], seeds: Mapping[str, SharedVariable]
+) -> tuple[list[Variable], dict[TensorVariable, TensorVariable]]:
+    """Graphs that read stored normals where they made them from a seed, with the same values.
+
+    The mapping gives for each new input the expression of its value, which depends on the seed and
+    on the steps of the record alone.
+    """
+    replaced: dict[Variable, Variable] = {}
+    normals: dict[TensorVariable, TensorVariable] = {}
+    names = {seed: name for name, seed in seeds.items()}
+    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
+        if isinstance(node.op, LogLikelihood) and node.inputs[-1] in names:
+            *arguments, seed = node.inputs
+            system, filter = node.op.system, node.op.filter
+            stored = pt.dvector(f"{names[seed]}_normals")
+            normals[stored] = StoredNoise(system, filter)(arguments[1], seed)
+            outputs = LogLikelihoodOfNoise(system, filter)(*arguments, stored)
+            replaced |= dict(zip(node.outputs, outputs, strict=True))
+    return clone_replace(list(graphs), replaced), normals
 
 
 def exactness(model: pm.Model) -> bool:

@@ -28,13 +28,14 @@ def evaluate(pickled, point):
 
 
 @pytest.mark.filterwarnings("ignore:.*use of fork\\(\\) may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.EnKF(20)], ids=["EKF", "EnKF"])
 @pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
-def test_a_compiled_model_gives_the_same_bits_in_a_child(method):
+def test_a_compiled_model_gives_the_same_bits_in_a_child(method, filter):
     if method not in multiprocessing.get_all_start_methods():
         pytest.skip(f"no {method} on this platform")
     with pm.Model() as model:
         pm.Normal("a", 0.5, 0.2)
-        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
+        psf.StateSpace("d", PAIR, filter, steps=STEPS, observed=PAIR_DATA)
     logp = model.compile_logp()
     context = multiprocessing.get_context(method)
     with ProcessPoolExecutor(1, mp_context=context) as pool:

@@ -90,14 +90,17 @@ class EnsembleFilter:
         prepare, initialise, propagate, log_density = (f.symbol for f in functions[:4])
         observe = functions.observe.symbol if functions.observe is not None else ""
         free, dt = machine.free, machine.dt
-        sizes = (machine.n, machine.p, machine.n_inputs, machine.n_constants, free.size)
-        constants = np.array([*sizes, *[0] * (N_TABLE - len(sizes)), *free], dtype=np.int64)
-        leading = (filter.size(), *filter.noise_sizes(machine))
-        settings = np.array([*leading, *filter.settings()], dtype=np.float64)
+        shape = (machine.n, machine.p, machine.n_inputs, machine.n_constants, free.size)
+        constants = np.array([*shape, *[0] * (N_TABLE - len(shape)), *free], dtype=np.int64)
+        sizes = filter.noise_sizes(machine)
+        settings = np.array([filter.size(), *sizes, *filter.settings()], dtype=np.float64)
 
         @compiled
         def run(theta, steps, observed, inputs, t0, noise):
             seed, normals = noise
+            n_steps = steps[-1] if steps.size else np.int64(0)
+            if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
+                raise ModelError("normals must be those of this filter, system and steps")
             terms, health = np.full(steps.size, -np.inf), np.empty(3)
             health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
             table = constants.copy()
@@ -117,11 +120,12 @@ class EnsembleFilter:
 
     def stored_noise(self, system: StateSpaceModel) -> Compiled:
         """The function (steps, seed) -> the normals that an evaluation with this seed uses."""
-        machine = ensemble_machine(system)
-        width, initial, process, observation, resampling = self.algorithm(machine).noise_sizes(
-            machine
-        )
-        sizes = NoiseSizes(width, initial, process, observation, resampling)
+        return self.stored_normals(ensemble_machine(system))
+
+    def stored_normals(self, machine: Machine) -> Compiled:
+        """Bind the making of normals to the sizes of one system."""
+        sizes = self.algorithm(machine).noise_sizes(machine)
+        width, initial, process, observation, resampling = sizes
         STORE_NORMALS.compile()
         store = STORE_NORMALS.external
 

@@ -10,6 +10,7 @@ from pymc_statespace_filters.ops.record import (
     check_record,
     evaluator,
 )
+from pymc_statespace_filters.ops.stored_noise import LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapeReversal
 
 __all__ = [
@@ -17,7 +18,9 @@ __all__ = [
     "BatchLogLikelihood",
     "LogLikelihood",
     "LogLikelihoodGradient",
+    "LogLikelihoodOfNoise",
     "RecordOp",
+    "StoredNoise",
     "TapeReversal",
     "TapedLogLikelihood",
     "cache_key",

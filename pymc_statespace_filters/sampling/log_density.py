@@ -14,7 +14,7 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.inspection import health_outputs
+from pymc_statespace_filters.inspection import health_outputs, hold_noise
 
 # Reason of a failure that no filter reports.
 NOT_A_NUMBER = -1
@@ -50,6 +50,9 @@ class LogDensity:
         Any point of the model; only shapes are read.
     seeds : mapping of str to shared variable
         The noise seeds, by the name of their StateSpace variable.
+    holds_noise : bool
+        Whether every evaluation is on the noise of the model's own seeds. Their normals are then
+        made once, in `prepare`, and the seeds of a call are not read.
     compile_kwargs : dict, optional
         Passed to PyMC's compiler.
 
@@ -66,23 +69,31 @@ class LogDensity:
         point: Mapping[str, np.ndarray],
         seeds: Mapping[str, TensorVariable],
         compile_kwargs: dict | None = None,
+        *,
+        holds_noise: bool = False,
     ):
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
         logp = model.logp()
-        outputs, joined = join_nonshared_inputs(
-            point, [logp, *health_outputs([logp])], held, shared_inputs=seed_inputs
-        )
-        inputs = [joined, *not_held, *seed_inputs.values()]
+        outputs = [logp, *health_outputs([logp])]
+        noise_inputs = list(seed_inputs.values())
+        self._make_normals = None
+        if holds_noise and seeds:
+            outputs, normals = hold_noise(outputs, seeds)
+            noise_inputs, seed_inputs = list(normals), {}
+            self._make_normals = compile_pymc([], list(normals.values()))
+        outputs, joined = join_nonshared_inputs(point, outputs, held, shared_inputs=seed_inputs)
+        inputs = [joined, *not_held, *noise_inputs]
         self._n_inputs = len(inputs)
         self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
         self._call: Callable[..., Sequence[np.ndarray]] | None = None
+        self._normals: Sequence[np.ndarray] | None = None
 
     def __getstate__(self) -> dict:
         """Leave the machine code behind: another process takes its own."""
-        return self.__dict__ | {"_call": None}
+        return self.__dict__ | {"_call": None, "_normals": None}
 
     def prepare(self) -> Callable[..., Sequence[np.ndarray]]:
         """Take hold of the machine code and of the data as they are now."""
@@ -96,6 +107,8 @@ class LogDensity:
                 return machine_code(*args, *data)
 
         self._call = call
+        if self._make_normals is not None:
+            self._normals = self._make_normals()
         return call
 
     def __call__(
@@ -110,14 +123,15 @@ class LogDensity:
         others : sequence of ndarray
             Values of the variables named in ``others``.
         seeds : sequence of ndarray of int64, shape ()
-            One for each noise seed.
+            One for each noise seed; not read where the noise is held.
 
         Returns
         -------
         Evaluation
         """
         call = self._call or self.prepare()
-        value, *healths = call(position, *others, *seeds)
+        noise = seeds if self._normals is None else self._normals
+        value, *healths = call(position, *others, *noise)
         log_density = float(value)
         n_effective = np.inf
         for health in healths:

@@ -182,7 +182,9 @@ class DRAM(BlockedStep):
         self._seed_names = tuple(f"{name}_seed" for name in seeds)
         self._seed_variables = tuple(seeds.values())
         default = model.initial_point(random_seed=0)
-        self._log_density = LogDensity(model, self.vars, default, seeds, compile_kwargs)
+        self._log_density = LogDensity(
+            model, self.vars, default, seeds, compile_kwargs, holds_noise=not refresh_noise
+        )
         self._held = HeldVariables(self.vars, default)
         self._starts = Starts(model, self._held, default)
         dim = self._held.dim

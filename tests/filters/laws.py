@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._random import INITIAL, OBSERVATION, PROCESS, padded
 from pymc_statespace_filters.filters._random import fill_normals as fill
 from tests.filters.machines import DOUBLE_WELL, double_well_machine, evaluate, oscillator_record
@@ -107,6 +108,19 @@ class EnsembleFilterLaws:
         assert np.array_equal(given[0], steps)
         assert np.array_equal(given[1], observed, equal_nan=True)
         assert given[2] == 1
+
+    def test_stored_normals_give_what_their_seed_gives_to_the_bit(self, filter_):
+        machine, steps, observed = OSCILLATOR
+        stored = filter_.stored_normals(machine).function(np.asarray(steps, np.int64), 7)
+        by_seed = run(filter_, machine, steps, observed, seed=7)
+        by_normals = run(filter_, machine, steps, observed, seed=8, normals=stored)
+        assert np.array_equal(by_seed[0], by_normals[0])
+        assert np.array_equal(by_seed[1], by_normals[1])
+        assert stored.mean() == pytest.approx(0, abs=5 / np.sqrt(stored.size))  # 5 sd
+        moved = run(filter_, machine, steps, observed, normals=-stored)[0]
+        assert np.all((moved != by_seed[0]) | (moved == 0))
+        with pytest.raises(ModelError, match="normals must be those of this filter"):
+            run(filter_, machine, steps, observed, normals=stored[:-1])
 
     def test_a_later_observation_changes_no_earlier_term(self, filter_):
         machine, steps, observed = OSCILLATOR

@@ -105,3 +105,12 @@ def test_settings():
     assert BootstrapPF(10) != BootstrapPF(10, resampling="multinomial")
     assert BootstrapPF.noisy
     assert BootstrapPF.unbiased
+
+
+def test_stored_normals_serve_multinomial_resampling_too():
+    machine, steps, observed = SCALAR
+    filter_ = BootstrapPF(50, resampling="multinomial", resample_below=1)
+    stored = filter_.stored_normals(machine).function(np.asarray(steps, np.int64), 7)
+    by_seed, _ = run(filter_, machine, steps, observed, seed=7)
+    by_normals, _ = run(filter_, machine, steps, observed, normals=stored)
+    assert np.array_equal(by_seed, by_normals)

@@ -7,9 +7,10 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.inspection import FAILURES
-from pymc_statespace_filters.ops import LogLikelihood
+from pymc_statespace_filters.inspection import FAILURES, noise_seeds
+from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.sampling import DRAM
+from pymc_statespace_filters.sampling.log_density import LogDensity
 from tests.sampling.test_dram import sample
 from tests.sampling.test_noise import Redrawing
 
@@ -162,3 +163,24 @@ def test_a_filter_needs_all_its_parameters_held():
         DRAM([model["phi"]])
     with linear_model(psf.EKF()) as model:
         DRAM([model["phi"]])
+
+
+@pytest.mark.parametrize("filter", [psf.EnKF(30), psf.BootstrapPF(30)], ids=["EnKF", "BootstrapPF"])
+def test_held_noise_is_made_once_and_gives_what_its_seed_gives(filter):
+    model = linear_model(filter)
+    seeds, start = noise_seeds(model), model.initial_point(random_seed=0)
+    by_seed, by_normals = (
+        LogDensity(model, model.value_vars, start, seeds, holds_noise=holds)
+        for holds in (False, True)
+    )
+    made_inside = {type(n.op) for n in by_normals._function.maker.fgraph.apply_nodes}
+    assert LogLikelihoodOfNoise in made_inside
+    assert not made_inside & {LogLikelihood, StoredNoise}
+    values = []
+    for seed in (3, 4):
+        seeds["d"].set_value(np.array(seed))
+        by_normals.prepare()
+        for position in (np.array([0.4, -0.3]), np.array([0.1, 0.2])):
+            values.append(by_normals(position, (), [np.array(99)]))
+            assert values[-1] == by_seed(position, (), [np.array(seed)])
+    assert len(set(values)) == 4

@@ -1,0 +1,96 @@
+"""Entries: called by name and by address, compiled once, found again by another process."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numba import carray, njit, types
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.lowering import NUMBERS, Entry, address_of, call_address, entries
+from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
+
+ROOT = Path(__file__).parents[2]
+
+
+def scale(x, n, factor):
+    values = carray(x, (n,))
+    for i in range(n):
+        values[i] *= factor
+
+
+SCALE = Entry(scale, (NUMBERS, types.intp, types.float64), "scale", None)
+by_name, symbol = SCALE.external, SCALE.symbol
+
+
+@njit
+def twice(x):
+    by_name(x.ctypes.data, x.size, 2.0)
+    return x
+
+
+@njit
+def thrice(address, x):
+    call_address(address, (x.ctypes.data, x.size, 3.0))
+    return x
+
+
+@njit
+def address():
+    return address_of(symbol)
+
+
+def test_is_called_by_name_and_by_address():
+    SCALE.compile()
+    assert twice(np.arange(3.0)).tolist() == [0, 2, 4]
+    assert thrice(address(), np.arange(3.0)).tolist() == [0, 3, 6]
+    assert njit(lambda: address_of(""))() == 0
+
+
+def test_a_second_entry_under_the_same_key_is_the_first():
+    one, two = (Entry(scale, (NUMBERS, types.intp, types.float64), "s", "key") for _ in range(2))
+    assert one.symbol == two.symbol
+    unnamed = Entry(scale, (NUMBERS, types.intp, types.float64), "s", None)
+    assert unnamed.symbol != Entry(scale, (), "s", None).symbol
+
+
+def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
+    evaluate = partial(
+        psf.log_likelihood, params={"a": 0.6}, observed=FORCED_DATA, steps=STEPS, inputs=FORCE
+    )
+    evaluate(forced(), psf.BootstrapPF(10))
+    before = set(entries._compiled)
+    evaluate(forced(), psf.BootstrapPF(20, resampling="multinomial"))
+    assert set(entries._compiled) == before
+    evaluate(forced(initial_mean=[0.25]), psf.BootstrapPF(10))
+    new = set(entries._compiled) - before
+    assert new
+    assert not any("bootstrap" in symbol or "fill_normals" in symbol for symbol in new)
+
+
+PROCESS = """
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.lowering import entries
+from tests.small_systems import FORCE, FORCED_DATA, FORCED, STEPS
+value = psf.log_likelihood(
+    FORCED, psf.EnKF(10), {"a": 0.6}, FORCED_DATA, steps=STEPS, inputs=FORCE
+)
+print(value.sum(), sum(c.cache_hits for c in entries._compiled.values()), len(entries._compiled))
+"""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    def answer():
+        run = [sys.executable, "-W", "ignore", "-c", PROCESS]
+        out = subprocess.run(
+            run, capture_output=True, text=True, check=True, env=environment, cwd=ROOT
+        )
+        return out.stdout.split()
+
+    environment = os.environ | {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path}"}
+    value, hits, compiled = answer()
+    assert (hits, int(compiled) > 5) == ("0", True)
+    assert answer() == [value, compiled, compiled]
