@@ -3,8 +3,8 @@
 The density at a target v is sum_l w_l |H|^-1 K(H^-1 (x_l - v)), where H is the lower Cholesky
 factor of the weighted covariance times N_eff^{-1/(n+4)}. Members and targets are whitened by H
 first, so that the sums see plain distances. In one and two directions they go over a lattice
-(`_lattice_sum`), O(N); in more, for few members, and for targets in the far tails they are exact
-(`_kernel_sum`), O(N) a target.
+(`_lattice_sum`), O(N), for targets far outside the cloud too (`_tilted_sum`); in more directions,
+for few members and for single targets in the tails they are exact (`_kernel_sum`), O(N) a target.
 
 A direction in which the members do not spread at all (a state known exactly, or a copy of another)
 is left out: all members and all targets lie in the same subspace, and the density is the one on it,
@@ -16,7 +16,6 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.filters._compile import compiled, pasted
-from pymc_statespace_filters.filters._elementary import log
 from pymc_statespace_filters.filters._ensemble import count_true, covariance, mean
 from pymc_statespace_filters.filters._gaussian import LOG_TWO_PI, semidefinite_cholesky
 from pymc_statespace_filters.filters._kernel_sum import (
@@ -24,7 +23,8 @@ from pymc_statespace_filters.filters._kernel_sum import (
     kernel_sum_workspace,
     log_kernel_sum,
 )
-from pymc_statespace_filters.filters._lattice_sum import FLOOR, lattice_sums, lattice_workspace
+from pymc_statespace_filters.filters._lattice_sum import lattice_workspace
+from pymc_statespace_filters.filters._tilted_sum import log_lattice_sums, tilted_workspace
 
 _SQRT_HALF = math.sqrt(0.5)
 _KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a value known exactly
@@ -47,7 +47,8 @@ def density_workspace(n, width):
     """Scratch of ``log_kernel_density`` for n directions and a padded number of members."""
     whitened = np.empty((n, width)), np.empty((n, width))
     missed = np.empty(width, np.int64)
-    return whitened, missed, kernel_sum_workspace(width), lattice_workspace(width)
+    exact, lattice = kernel_sum_workspace(width), lattice_workspace(width)
+    return whitened, missed, exact, lattice, tilted_workspace(n, width)
 
 
 @compiled
@@ -100,26 +101,25 @@ def log_kernel_density(w, X, V, free, H, active, work, out):
 
     Members of zero weight are left out, and may be NaN. A target that is not finite gets -inf.
     """
-    (sources, targets), missed, sum_work, lattice_work = work
+    (sources, targets), missed, sum_work, lattice_work, tilted_work = work
     n_active = _whiten(H, active, free, X, sources)
     _whiten(H, active, free, V, targets)
+    if _by_lattice(n_active, out.size):
+        works = sum_work, lattice_work, tilted_work
+        n_missed, members = log_lattice_sums(w, sources, targets, n_active, works, missed, out)
+    else:
+        n_missed, members = out.size, (np.int64(0), np.int64(0))
+        for i in range(n_missed):
+            missed[i] = i
+    if n_missed > 0:
+        if members[0] == 0:
+            members = compact(w, sources, n_active, sum_work)
+        for k in range(n_missed):
+            i = missed[k]
+            out[i] = log_kernel_sum(sources, n_active, members[1], targets, i, sum_work)
     log_kernel = 0.0
     for a in range(active.size):
         if active[a]:
             log_kernel -= math.log(H[a, a]) + 0.5 * LOG_TWO_PI
-
-    known = _by_lattice(n_active, out.size)
-    known = known and lattice_sums(w, sources, targets, n_active, lattice_work, out)
-    n_missed = 0
     for i in range(out.size):
-        if not (known and out[i] > FLOOR):
-            missed[n_missed] = i
-            n_missed += 1
-    if known:
-        for i in range(out.size):
-            out[i] = log(out[i]) + log_kernel
-    if n_missed > 0:
-        n_blocks = compact(w, sources, n_active, sum_work)
-        for k in range(n_missed):
-            i = missed[k]
-            out[i] = log_kernel + log_kernel_sum(sources, n_active, n_blocks, targets, i, sum_work)
+        out[i] += log_kernel

@@ -24,7 +24,7 @@ def kernel_sum_workspace(width):
 
 @compiled
 def compact(w, sources, n_dims, work):
-    """Move the members of positive weight to the front; return the number of blocks they fill."""
+    """Move the members of positive weight to the front; return their number and their blocks."""
     log_w, _, _ = work
     n_sources = 0
     for i in range(w.size):
@@ -38,7 +38,7 @@ def compact(w, sources, n_dims, work):
         for a in range(n_dims):
             sources[a, i] = 0.0
         log_w[i] = -np.inf
-    return n_blocks
+    return n_sources, n_blocks
 
 
 @pasted

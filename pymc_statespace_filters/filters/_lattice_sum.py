@@ -87,14 +87,14 @@ def _range(y, w, least, lanes):
 
 
 @pasted
-def _extent(y, v, w, lanes):
+def _extent(y, v, w, every, lanes):
     """Where the lattice must be: its first coordinate, and a number of points.
 
     Members farther than ``_WITHIN`` from all targets stay outside, and targets so far from all
-    members; there are no points if that leaves nothing.
+    members; there are no points if that leaves nothing. ``every`` is an array of zeros.
     """
     y_low, y_high = _range(y, w, _NEGLIGIBLE, lanes)
-    v_low, v_high = _range(v, w, -1.0, lanes)
+    v_low, v_high = _range(v, every, -1.0, lanes)
     first = max(min(y_low, v_low), max(y_low, v_low) - _WITHIN)
     last = min(max(y_high, v_high), min(y_high, v_high) + _WITHIN)
     if not first <= last:
@@ -173,20 +173,20 @@ def _blur(n_dims, columns, rows, lattice, other):
     return lattice, 0
 
 
-@pasted
+@compiled
 def lattice_sums(w, sources, targets, n_dims, work, out):
     """sum_l w_l exp(-|y_l - v_i|^2) for the columns of ``targets``, in one or two directions.
 
-    Zero where it is not known. Returns False, and does nothing, if the lattice would be too large.
+    Zero where it is not known. Returns False if the lattice would be too large.
     """
     bells, lanes, (first, extent), (lattice, other) = work
     cell, lead, ratio = bells
     extent[1] = 1.0
+    for i in range(out.size):
+        out[i] = 0.0
     for a in range(n_dims):
-        first[a], extent[a] = _extent(sources[a], targets[a], w, lanes)
+        first[a], extent[a] = _extent(sources[a], targets[a], w, out, lanes)
     if extent[0] == 0.0 or extent[1] == 0.0:
-        for i in range(out.size):
-            out[i] = 0.0
         return True
     n_points = (extent[0] + 2.0 * _BLUR) * (extent[1] + 2.0 * _BLUR * (n_dims - 1))
     if n_points > min(lattice.size, 0.25 * w.size * out.size):

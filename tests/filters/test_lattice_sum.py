@@ -148,6 +148,20 @@ def test_dead_members_and_targets(n):
 
 
 @pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("bandwidths", [5, 10, 20, 100])
+def test_all_targets_outside_the_cloud(n, bandwidths):
+    # A surprising observation of a precise sensor: particles in a small heap, far from the forecast
+    rng, X, _ = cloud(n, 1000)
+    w = rng.dirichlet(np.full(1000, 0.5))
+    _, H, _, _ = bandwidth(X, w)
+    for spread in (1e-3, 1.0, 10.0):
+        V = X.max(axis=1)[:, None] + H @ (bandwidths + spread * rng.standard_normal(X.shape))
+        V[0, 5] = np.nan
+        assert errors(X, w, V, np.arange(1000) != 5).max() < REACHED
+        assert log_density(X, w, V)[5] == -np.inf
+
+
+@pytest.mark.parametrize("n", [1, 2])
 def test_no_target_near_any_member(n):
     _, X, w = cloud(n, 300)
     V = X + 1e3
