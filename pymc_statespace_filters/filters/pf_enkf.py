@@ -20,6 +20,7 @@ from pymc_statespace_filters.filters._ensemble import (
 )
 from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters._kernel_density import (
+    density_method,
     density_workspace,
     log_kernel_density,
     scott_bandwidth,
@@ -36,6 +37,7 @@ from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, log_sum, normalise
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.lowering import Entry, Machine
+from pymc_statespace_filters.model import StateSpaceModel
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 
@@ -228,6 +230,38 @@ class PFEnKF(EnsembleFilter):
         object.__setattr__(self, "resample_below", fraction)
         check_choice("resampling", self.resampling, SCHEMES)
         check_choice("likelihood", self.likelihood, _LIKELIHOODS)
+
+    def density_method(self, system: StateSpaceModel) -> str:
+        """How the kernel densities are summed for a system whose free states all spread.
+
+        Parameters
+        ----------
+        system : StateSpaceModel
+
+        Returns
+        -------
+        str
+            "lattice" (O(N)), "exact" (O(N^2)), or "none" where nothing is nudged and the filter is
+            the bootstrap filter.
+
+        Examples
+        --------
+        >>> import pymc_statespace_filters as psf
+        >>> walk = psf.StateSpaceModel(
+        ...     transition=lambda x, q: [x[0] + q[0]],
+        ...     process_noise=[[1.0]],
+        ...     observation=lambda x: [x[0]],
+        ...     observation_noise=[[0.5]],
+        ...     initial_mean=[0.0],
+        ...     initial_cov=[[1.0]],
+        ... )
+        >>> psf.PFEnKF(1000).density_method(walk), psf.PFEnKF(30).density_method(walk)
+        ('lattice', 'exact')
+        """
+        n_free = system.n - len(system.carried)
+        if not system.gaussian_observation or n_free == 0:
+            return "none"
+        return density_method(n_free, self.n_particles)
 
     def size(self) -> int:
         """Return the number of particles."""
