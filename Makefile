@@ -2,6 +2,8 @@
 
 VENV   ?= .venv
 LATEST ?= .venv-latest
+# The packages that `make bench` compares with; the names are those that benchmarks/ looks for.
+BENCH  := .venv-bench
 
 # The first of these that runs, is of a version that PyMC supports and can make environments.
 CANDIDATES = python3 python3.14 python3.13 python3.12
@@ -18,7 +20,7 @@ IN = $(VENV)/bin
 PYTEST = -m pytest -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-quick test test-slow test-latest lint docs bench lock clean
+.PHONY: help demo demo-quick test test-slow test-latest lint docs bench bench-quick lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -48,8 +50,11 @@ lint: $(VENV)/.installed  ## style, format, types, and who imports whom
 docs: $(VENV)/.installed  ## the documentation, in docs/_build/html
 	$(IN)/python -m sphinx -W --keep-going --quiet -b html docs docs/_build/html
 
-bench: $(VENV)/.installed  ## timings, side by side
-	$(IN)/python benchmarks/foundation.py
+bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  ## all timings beside other packages, into docs/; ARGS="--only ekf"
+	$(IN)/python -m benchmarks $(ARGS)
+
+bench-quick: $(VENV)/.installed  ## our filters beside loops by hand, a minute
+	$(IN)/python -m benchmarks.quick
 
 lock: $(LATEST)/.exists  ## resolve anew; PYTHON=python3.12, so that the versions suit every Python
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]' hatchling editables
@@ -66,6 +71,17 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(IN)/pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(IN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+# A package that cannot be installed here must not stop the others: the table says who did not run.
+$(BENCH)/.installed: benchmarks/requirements.txt
+$(BENCH)-pymc-extras/.installed: benchmarks/requirements-pymc-extras.txt
+$(BENCH)/.installed $(BENCH)-pymc-extras/.installed:
+	@$(if $(PYTHON),,$(NO_PYTHON))
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check -r $< || \
+	  while read -r line; do case $$line in \#*) ;; *) \
+	    $(@D)/bin/pip install --quiet --disable-pip-version-check --no-deps "$$line" || true;; esac; done < $<
 	touch $@
 
 $(LATEST)/.exists:

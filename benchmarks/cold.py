@@ -1,0 +1,71 @@
+"""What the first call of a model costs, compilation included, imports not.
+
+Each first call is made in a process of its own with an empty cache; then again in a second
+process; then for another system with as many states, in the same cache.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+
+from benchmarks.measure import ROOT
+from benchmarks.peers.client import ONE_THREAD
+
+KINDS = {
+    "EKF, value": "ours.of(name, psf.EKF()).value()",
+    "EKF, value and gradient": "ours.of(name, psf.EKF()).value_and_gradient()",
+    "EnKF(1250)": "ours.of(name, psf.EnKF(1250)).value()",
+    "BootstrapPF(1250)": "ours.of(name, psf.BootstrapPF(1250)).value()",
+    "PFEnKF(250)": "ours.of(name, psf.PFEnKF(250)).value()",
+}
+
+# Simulating the record compiles too: it is done before the clock starts.
+CHILD = """
+import sys, time
+import pymc_statespace_filters as psf
+from benchmarks import ours
+name = sys.argv[1]
+ours.simulated = (lambda data: lambda *_: data)(ours.simulated(*ours.SYSTEMS[name]))
+start = time.process_time()
+({what}).function(0)
+print(time.process_time() - start)
+"""
+
+
+@dataclass(frozen=True)
+class Cold:
+    """CPU seconds of the first call: empty cache, second process, another model."""
+
+    kind: str
+    states: int
+    first: float
+    second: float
+    another: float
+
+    def as_json(self) -> dict:
+        return asdict(self)
+
+
+def seconds(what: str, name: str, cache: str) -> float:
+    flags = {"PYTENSOR_FLAGS": f"base_compiledir={cache}", "NUMBA_CACHE_DIR": cache}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", CHILD.format(what=what), name],
+        cwd=ROOT,
+        env=os.environ | ONE_THREAD | flags | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return float(done.stdout.split()[-1])
+
+
+def cold() -> list[Cold]:
+    rows = []
+    for kind, what in KINDS.items():
+        with tempfile.TemporaryDirectory() as cache:
+            first, second = (seconds(what, "mass_spring_damper", cache) for _ in range(2))
+            another = seconds(what, "linear", cache)
+        rows.append(Cold(kind, 2, first, second, another))
+    return rows

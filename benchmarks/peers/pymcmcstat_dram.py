@@ -1,0 +1,69 @@
+"""pymcmcstat: its DRAM chains on the likelihood by the loop of ``loops.py``.
+
+Not part of the conversation in ``serve``: a chain is run per seed, and all go to one file.
+``python -m benchmarks.peers.pymcmcstat_dram RECORDS CHAINS N_SEEDS TUNE DRAWS``
+"""
+
+import sys
+import time
+from importlib.metadata import version
+
+import numpy as np
+import scipy
+
+from benchmarks.loops import ekf_double_well
+
+# Its release of 2021 imports a name that SciPy has since dropped; with it back, it runs.
+scipy.pi, scipy.sin, scipy.cos = np.pi, np.sin, np.cos
+
+from pymcmcstat.MCMC import MCMC  # noqa: E402
+
+NAMES = ("alpha", "beta", "log_sigma", "log_gamma")
+
+
+def minus_two_log_posterior(q, steps, observed):
+    """The density that PyMC samples: scales in logs, with the Jacobian of that."""
+    alpha, beta, log_sigma, log_gamma = q
+    theta = np.array([alpha, beta, np.exp(log_sigma), np.exp(log_gamma)])
+    prior = -0.5 * (alpha**2 + beta**2) / 100.0
+    prior += -0.5 * (theta[2] ** 2 + theta[3] ** 2) + log_sigma + log_gamma
+    return -2.0 * (ekf_double_well(theta, steps, observed) + prior)
+
+
+def chain(seed, n, start, steps, observed):
+    np.random.seed(seed)  # noqa: NPY002 - it draws from the global generator
+    mcmc = MCMC()
+    mcmc.data.add_data_set(x=np.zeros(1), y=np.zeros(1))
+    # The record travels by closure: the data structure of the package is for regressions.
+    mcmc.simulation_options.define_simulation_options(
+        nsimu=n, updatesigma=False, method="dram", verbosity=0, waitbar=False
+    )
+    mcmc.model_settings.define_model_settings(
+        sos_function=lambda q, data, custom=None: minus_two_log_posterior(q, steps, observed),
+        sigma2=1.0,
+    )
+    for name, value in zip(NAMES, start, strict=True):
+        mcmc.parameters.add_model_parameter(
+            name=name, theta0=value, prior_mu=0.0, prior_sigma=np.inf
+        )
+    begin = time.process_time()
+    mcmc.run_simulation()
+    return mcmc.simulation_results.results["chain"], time.process_time() - begin
+
+
+def main(records, target, n_seeds, tune, draws):
+    data = np.load(records)
+    alpha, beta, sigma, gamma = data["double_well_theta"]
+    start = np.array([alpha, beta, np.log(sigma), np.log(gamma)])
+    steps, observed = data["steps"], data["double_well_observed"]
+    minus_two_log_posterior(start, steps, observed)
+    chains, seconds = zip(
+        *(chain(seed, tune + draws, start, steps, observed) for seed in range(n_seeds)),
+        strict=True,
+    )
+    np.savez(
+        target, chains=np.array(chains)[:, tune:], seconds=seconds, version=version("pymcmcstat")
+    )
+
+
+main(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:]))

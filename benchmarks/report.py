@@ -1,0 +1,156 @@
+"""From what was measured to the tables and figures of the documentation."""
+
+import csv
+import json
+import os
+import platform
+from pathlib import Path
+
+from benchmarks import figures
+from benchmarks.cold import Cold
+from benchmarks.growth import Curve
+from benchmarks.measure import FOLDER, ROOT, Row
+from benchmarks.ratios import ratios
+from benchmarks.sampling import Chains
+
+TARGET = ROOT / "docs" / "_static"
+KINDS = {"sampling": Chains, "cold": Cold, "particles": Curve, "steps": Curve, "states": Curve}
+
+
+def write(parts: list[str]) -> str:
+    """Write everything; returns the tables as text."""
+    kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
+    found = {
+        part: [KINDS[part](**row) if part in KINDS else Row.of_json(row) for row in k["rows"]]
+        for part, k in kept.items()
+    }
+    rows = [row for part in parts if part not in KINDS for row in found[part]]
+    sampling, cold, *curves = (found.get(part, []) for part in KINDS)
+    growth = [curve for part in curves for curve in part]
+    sections = [
+        machine(kept),
+        ratio_table(ratios(rows, growth, sampling)),
+        likelihood_tables(rows),
+        sampling_table(sampling),
+        cold_table(cold),
+    ]
+    text = "\n".join(section for section in sections if section)
+    (TARGET / "benchmarks.inc").write_text(text)
+    write_csv(rows, TARGET / "benchmarks.csv")
+    figures.bars(rows, TARGET / "benchmarks.png")
+    figures.curves(growth, TARGET / "benchmarks_growth.png")
+    return text
+
+
+def table(head: list[str], lines: list[list[str]]) -> str:
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+
+
+def machine(kept: dict[str, dict]) -> str:
+    versions: dict[str, str] = {}
+    for part in kept.values():
+        versions |= part["versions"]
+    loads = [part["load"] for part in kept.values()]
+    listed = ", ".join(f"{name} {number}" for name, number in sorted(versions.items()))
+    return (
+        f"Measured on {cpu()} ({os.cpu_count()} cores, one used), {platform.system()}, Python "
+        f"{platform.python_version()}; load average {min(loads):.1f} to {max(loads):.1f} "
+        f"(1.0 is a quiet machine). Versions: {listed}.\n"
+    )
+
+
+def cpu() -> str:
+    info = Path("/proc/cpuinfo")
+    names = [
+        line.split(":")[1].strip()
+        for line in (info.read_text().split("\n") if info.exists() else [])
+        if line.startswith("model name")
+    ]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def ratio_table(found: list[tuple[str, float | None, str]]) -> str:
+    lines = [[what, number(ratio), meaning] for what, ratio, meaning in found]
+    return "\n## Ratios\n\n" + table(["of", "ratio", ""], lines)
+
+
+def likelihood_tables(rows: list[Row]) -> str:
+    text = ["\n## Likelihoods\n"]
+    for work in dict.fromkeys(row.work for row in rows):
+        group = [row for row in rows if row.work == work]
+        ours = best_of_ours(group)
+        lines = [
+            [
+                row.who,
+                seconds(row.timing.median),
+                f"{seconds(row.timing.low)} to {seconds(row.timing.high)}",
+                number(row.timing.median / ours) if ours else "",
+                row.answer,
+                row.note,
+            ]
+            if row.timing
+            else [row.who, "not run", "", "", "", row.note]
+            for row in group
+        ]
+        head = ["", "CPU time", "range", "times ours", "log-likelihood", ""]
+        text.append(f"### {work}\n\n{table(head, lines)}")
+    return "\n".join(text)
+
+
+def best_of_ours(group: list[Row]) -> float | None:
+    """The row that the others are divided by: ours, as a model uses it."""
+    return next((row.timing.median for row in group if row.who == "ours" and row.timing), None)
+
+
+def sampling_table(chains: list[Chains]) -> str:
+    if not chains:
+        return ""
+    lines = [
+        [
+            c.sampler,
+            f"{c.iterations_per_second:.0f}",
+            f"{c.ess_per_second:.0f}",
+            f"{c.ess_low:.0f} to {c.ess_high:.0f}",
+            c.note,
+        ]
+        if c.iterations_per_second == c.iterations_per_second
+        else [c.sampler, "not run", "", "", c.note]
+        for c in chains
+    ]
+    head = ["sampler", "draws per second", "smallest ESS per second", "over the seeds", ""]
+    return "\n## Sampling\n\n" + table(head, lines)
+
+
+def cold_table(rows: list[Cold]) -> str:
+    if not rows:
+        return ""
+    lines = [[r.kind, *(f"{s:.1f} s" for s in (r.first, r.second, r.another))] for r in rows]
+    head = ["two states", "first call", "in a second process", "another model, same install"]
+    return "\n## First calls\n\n" + table(head, lines)
+
+
+def write_csv(rows: list[Row], target: Path) -> None:
+    with target.open("w", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(["work", "who", "seconds", "low", "high", "rounds", "answer", "note"])
+        for row in rows:
+            t = row.timing
+            times = (
+                [f"{t.median:.4g}", f"{t.low:.4g}", f"{t.high:.4g}", t.rounds] if t else [""] * 4
+            )
+            out.writerow([row.work, row.who, *times, row.answer, row.note])
+
+
+def seconds(value: float) -> str:
+    """Seconds with three digits, in the unit that fits."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value * 1e9:.3g} ns"
+
+
+def number(value: float | None) -> str:
+    if value is None:
+        return "not measured"
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}" if value >= 10 else f"{value:.2f}"

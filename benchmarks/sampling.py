@@ -1,0 +1,145 @@
+"""Chains on the double well by EKF: draws and effective draws per CPU second.
+
+Every sampler starts at the parameters of the record and runs one chain per seed. All of its
+iterations, tuning included, count as time; the effective sample size is that of the draws kept.
+What PyMC spends before the first iteration is measured by a run of one draw and taken off.
+"""
+
+import os
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import pymc as pm
+from arviz_stats.base import array_stats
+
+import pymc_statespace_filters as psf
+from benchmarks.measure import FOLDER, ROOT
+from benchmarks.peers.client import ONE_THREAD
+from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, STEPS, simulated
+
+N_SEEDS, TUNE, DRAWS = 5, 2000, 5000
+NAMES = ("alpha", "beta", "sigma", "gamma")
+
+
+@dataclass(frozen=True)
+class Chains:
+    """What one sampler did: per CPU second, medians over the seeds, the lowest and the highest."""
+
+    sampler: str
+    iterations_per_second: float = np.nan
+    ess_per_second: float = np.nan
+    ess_low: float = np.nan
+    ess_high: float = np.nan
+    note: str = ""
+
+    def as_json(self) -> dict:
+        return asdict(self)
+
+
+def the_model() -> pm.Model:
+    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH)
+    with pm.Model() as model:
+        pm.Normal("alpha", 0, 10)
+        pm.Normal("beta", 0, 10)
+        pm.HalfNormal("sigma", 1)
+        pm.HalfNormal("gamma", 1)
+        psf.StateSpace("d", DOUBLE_WELL, psf.EKF(), steps=STEPS, observed=observed)
+    return model
+
+
+def summarised(sampler: str, chains, seconds, note: str = "") -> Chains:
+    """Chains (seed, draw, parameter), and the CPU seconds of each."""
+    smallest = [min(array_stats.ess(chain[None, :, i]) for i in range(4)) for chain in chains]
+    rates = np.array(smallest) / seconds
+    speed = np.median((TUNE + DRAWS) / np.array(seconds))
+    return Chains(sampler, speed, np.median(rates), rates.min(), rates.max(), note)
+
+
+def by_pymc(sampler: str, step: Callable) -> Chains:
+    """Chains of ``pm.sample`` with a step method."""
+    quiet = {"progressbar": False, "quiet": True, "compute_convergence_checks": False}
+
+    def run(seed, tune, draws):
+        start = time.process_time()
+        idata = pm.sample(
+            draws,
+            tune=tune,
+            chains=1,
+            cores=1,
+            step=step(),
+            initvals=DOUBLE_WELL_TRUTH,
+            random_seed=seed,
+            **quiet,
+        )
+        seconds = time.process_time() - start
+        return np.stack([idata.posterior[name].values[0] for name in NAMES], axis=1), seconds
+
+    with the_model():
+        run(0, 1, 1)
+        before = np.median([run(0, 1, 1)[1] for _ in range(3)])
+        chains, seconds = zip(*(run(s, TUNE, DRAWS) for s in range(N_SEEDS)), strict=True)
+    return summarised(sampler, chains, np.array(seconds) - before)
+
+
+def compiled_chains() -> Chains:
+    """Our chains compiled whole."""
+    if not hasattr(psf, "sample_dram"):
+        return Chains("psf.sample_dram", note="not available")
+
+    def run(seed, tune, draws):
+        start = time.process_time()
+        idata = psf.sample_dram(
+            draws,
+            tune,
+            chains=1,
+            cores=1,
+            initvals=DOUBLE_WELL_TRUTH,
+            random_seed=seed,
+            progressbar=False,
+        )
+        seconds = time.process_time() - start
+        return np.stack([idata.posterior[name].values[0] for name in NAMES], axis=1), seconds
+
+    with the_model():
+        run(0, 1, 4)
+        before = np.median([run(0, 1, 4)[1] for _ in range(3)])
+        chains, seconds = zip(*(run(s, TUNE, DRAWS) for s in range(N_SEEDS)), strict=True)
+    return summarised("psf.sample_dram", chains, np.array(seconds) - before)
+
+
+def by_pymcmcstat() -> Chains:
+    sampler, target = "pymcmcstat", FOLDER / "pymcmcstat.npz"
+    python = ROOT / ".venv-bench" / "bin" / "python"
+    if not python.exists():
+        return Chains(sampler, note="no environment .venv-bench")
+    numbers = map(str, (N_SEEDS, TUNE, DRAWS))
+    command = [python, "-W", "ignore", "-m", "benchmarks.peers.pymcmcstat_dram"]
+    done = subprocess.run(
+        [*command, FOLDER / "records.npz", target, *numbers],
+        cwd=ROOT,
+        env=os.environ | ONE_THREAD | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        return Chains(sampler, note=done.stderr.strip().split("\n")[-1][:200])
+    result = np.load(target)
+    return summarised(
+        f"pymcmcstat {result['version']}",
+        result["chains"],
+        result["seconds"],
+        "on the numba loop by hand; runs once names that SciPy dropped are put back",
+    )
+
+
+def sampling() -> list[Chains]:
+    return [
+        by_pymc("pm.sample(step=psf.DRAM())", psf.DRAM),
+        by_pymc("pm.sample(step=psf.DRAM(stages=1))", lambda: psf.DRAM(stages=1)),
+        compiled_chains(),
+        by_pymc("pm.sample(step=pm.DEMetropolisZ())", pm.DEMetropolisZ),
+        by_pymcmcstat(),
+    ]
