@@ -159,14 +159,11 @@ def pf_enkf(peers: Peers) -> list[Row]:
 def grid(peers: Peers) -> list[Row]:
     return compare(
         "Deterministic filters, double well",
-        {"GridFilter": by_grid, "EKF": ours.of("double_well", psf.EKF()).value},
+        {
+            "GridFilter": ours.of("double_well", psf.GridFilter()).value,
+            "EKF": ours.of("double_well", psf.EKF()).value,
+        },
     )
-
-
-def by_grid() -> Timed:
-    if not hasattr(psf, "GridFilter"):
-        raise NotImplementedError("not available")
-    return ours.of("double_well", psf.GridFilter()).value()
 
 
 def held_cpp(options: str, name: str, filter: str, n_members: int) -> Timed:

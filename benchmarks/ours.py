@@ -22,12 +22,12 @@ class Likelihood:
         self.at = theta_of(system, truth)
         self.inputs, self.observed = simulated(system, truth, self.steps)
 
-    def total(self, theta, noise=0):
+    def total(self, theta, noise=0, operation=ops.LogLikelihood):
         record = [pytensor.shared(a) for a in (self.steps, self.observed, self.inputs)]
-        operation = ops.LogLikelihood(self.system, self.filter)
         if isinstance(noise, int):
             noise = pt.constant(noise, dtype="int64")
-        return operation(theta, *record, np.float64(0.0), noise)[0].sum()
+        terms, _ = operation(self.system, self.filter)(theta, *record, np.float64(0.0), noise)
+        return terms.sum()
 
     def value(self) -> Timed:
         """With new noise at every call, where the filter has noise."""
@@ -37,12 +37,11 @@ class Likelihood:
 
     def on_held_noise(self) -> Timed:
         """On normals that are drawn and stored once: common random numbers."""
-        if not hasattr(ops, "HeldNoise"):
-            raise NotImplementedError("held noise is not available")
         theta, stored, seed = pt.dvector("theta"), pt.dvector("stored"), pt.lscalar("seed")
-        normals = ops.HeldNoise(self.system, self.filter)(pt.constant(self.steps), seed)
+        normals = ops.StoredNoise(self.system, self.filter)(pt.constant(self.steps), seed)
         draw = pytensor.function([seed], normals, mode="NUMBA")
-        run = machine_code([theta, stored], [self.total(theta, stored)])
+        total = self.total(theta, stored, ops.LogLikelihoodOfNoise)
+        run = machine_code([theta, stored], [total])
         return Timed(lambda noise: run(self.at, noise)[0].item(), draw)
 
     def value_and_gradient(self) -> Timed:
