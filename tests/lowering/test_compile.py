@@ -72,9 +72,9 @@ def test_a_member_function_is_the_same_on_arrays(on_arrays):
 
 def test_what_no_member_enters_is_computed_before_the_loop(monkeypatch):
     bodies = []
-    build = lowering._build
+    build = lowering.build
     monkeypatch.setattr(
-        lowering, "_build", lambda name, a, body, f: bodies.append(body) or build(name, a, body, f)
+        lowering, "build", lambda name, a, body, f: bodies.append(body) or build(name, a, body, f)
     )
     member_function("move", "c, Z, X", member_graph(), "X[{i}, member]")
     (body,) = bodies

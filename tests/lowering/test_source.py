@@ -16,11 +16,11 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.lowering import compile as lowering, ensemble_machine
 
 sources = []
-build = lowering._build
+build = lowering.build
 def noted(name, arguments, body, fallbacks):
     sources.extend([name, arguments, *body])
     return build(name, arguments, body, fallbacks)
-lowering._build = noted
+lowering.build = noted
 
 def drift(x, t, u, a, b=1.5):
     x0, x1, x2 = x
