@@ -9,6 +9,15 @@ from numba import njit
 
 compiled = njit(error_model="numpy", nogil=True, fastmath={"contract"})
 
+internal = njit(
+    error_model="numpy",
+    nogil=True,
+    fastmath={"contract"},
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+)
+"""For a function that only compiled functions call: what Python would need is not compiled."""
+
 pasted = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
 """For a function with one caller, or a few instructions inside a loop that must become vector code.
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.filters._compile import compiled, pasted, reducing
+from pymc_statespace_filters.filters._compile import internal, pasted, reducing
 from pymc_statespace_filters.filters._elementary import exp
 
 MAX_POINTS = 8192
@@ -23,7 +23,7 @@ _LARGEST_INDEX = 2.0**50
 _BLOCK = 8  # the points that a source reaches are a multiple of this: no remainder in vector loops
 
 
-@compiled
+@pasted
 def lattice(low, n, spacing):
     """The points, as the members of an ensemble: (1, n)."""
     X = np.empty((1, n))
@@ -32,7 +32,7 @@ def lattice(low, n, spacing):
     return X
 
 
-@compiled
+@internal
 def reached(mean, sd, mass, spacing, reach):
     """The lattice of all points within ``reach`` deviations of some mean: (low, number).
 
@@ -66,7 +66,7 @@ def _add_gaussian(first, spacing, mean, sd, mass, out):
         out[b] += height * exp(-0.5 * z * z)
 
 
-@compiled
+@internal
 def _target(mean, sd, spacing, reach):
     """Numbers of the first point, and of the one after the last, that a source reaches."""
     if not (np.isfinite(mean) and np.isfinite(sd)):
@@ -76,7 +76,7 @@ def _target(mean, sd, spacing, reach):
     return first, first + _BLOCK * max(blocks, 1.0)
 
 
-@compiled
+@internal
 def spread(low, n, spacing, mean, sd, mass, reach):
     """Masses on a lattice of the mixture sum_i mass_i N(mean_i, sd_i^2), cut at ``reach``."""
     out = np.zeros(n)
@@ -89,7 +89,7 @@ def spread(low, n, spacing, mean, sd, mass, reach):
     return out
 
 
-@compiled
+@pasted
 def kernel(spacing, mean, sd, reach):
     """Where every source sends its mass, row after row: (first targets, ends of rows, masses)."""
     n = mean.size
@@ -106,7 +106,7 @@ def kernel(spacing, mean, sd, reach):
     return first, end, masses
 
 
-@compiled
+@pasted
 def move(first, end, masses, mass, low, n):
     """The same as `spread`, with the rows of a kernel made before."""
     out = np.zeros(n)
@@ -120,7 +120,7 @@ def move(first, end, masses, mass, low, n):
     return out
 
 
-@compiled
+@internal
 def significant(mass, share):
     """The range [first, last) outside of which masses are below a share of the largest."""
     largest = 0.0
@@ -134,7 +134,7 @@ def significant(mass, share):
     return first, last
 
 
-@compiled
+@pasted
 def aliasing(mean, sd, source_spacing, spacing):
     """Share of each source's mass that the trapezoidal rule may misplace in one step.
 
@@ -167,7 +167,7 @@ def total(mass, shares):
     return result
 
 
-@compiled
+@pasted
 def weigh(mass, log_density):
     """Log of sum_i mass_i exp(log_density_i), and the terms over the largest; NaN, inf are zero."""
     terms = np.empty(mass.size)
@@ -185,7 +185,7 @@ def weigh(mass, log_density):
     return largest + math.log(whole), terms
 
 
-@compiled
+@pasted
 def highest(log_density):
     """The largest value that is not infinite or NaN."""
     largest = -np.inf
@@ -195,7 +195,7 @@ def highest(log_density):
     return largest
 
 
-@compiled
+@pasted
 def normalise(mass):
     """Make the sum one, in place."""
     whole = 0.0
@@ -205,7 +205,7 @@ def normalise(mass):
         mass[i] /= whole
 
 
-@compiled
+@pasted
 def coarseness(mass):
     """How much the sums of every third point disagree: the spectrum at 2 pi / (3 spacing).
 

@@ -8,11 +8,10 @@ every time, for the points from its first on.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import internal, pasted
 from pymc_statespace_filters.filters._failures import (
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
@@ -35,7 +34,8 @@ from pymc_statespace_filters.filters._lattice import (
     total,
     weigh,
 )
-from pymc_statespace_filters.lowering import OneState
+from pymc_statespace_filters.filters._one_state import move_points
+from pymc_statespace_filters.filters._system import log_density
 
 # Reasons to begin again, beside the failures.
 TOO_COARSE, TOO_SHORT = -1, -2
@@ -46,11 +46,11 @@ REFINEMENT = 0.7
 _KNOWN = 1e-15  # a deviation below this share of the mean is lost in the mean's rounding
 
 
-@compiled
+@internal
 def no_table():
     """A table of no points."""
-    nothing = np.empty(0)
-    return np.int64(0), nothing, nothing, nothing, kernel(1.0, nothing, nothing, 1.0)
+    nothing, none = np.empty(0), np.empty(0, np.int64)
+    return np.int64(0), nothing, nothing, nothing, (none, none, nothing)
 
 
 @pasted
@@ -59,144 +59,119 @@ def cut_of(reach):
     return math.exp(-0.5 * reach * reach)
 
 
-def begin_of(system: OneState) -> Any:
-    start = system.start
-
-    @pasted
-    def begin(theta, spacing, reach):
-        """The grid at step 0, and the mixture (of one) that its masses are taken from."""
-        mean, variance = start(theta)
-        sd = math.sqrt(variance)
-        source = np.array([mean]), np.array([sd]), np.ones(1)
-        if not (np.isfinite(mean) and np.isfinite(sd)):
-            return NO_FINITE_MEMBER, (np.int64(0), 1.0, np.ones(1)), source
-        if sd <= _KNOWN * abs(mean):
-            return NONE, (np.int64(1), mean, np.ones(1)), source  # point 1 of this spacing
-        spacing = min(spacing, 0.6 * sd)
-        low, n = reached(*source, spacing, reach)
-        if n > MAX_POINTS:
-            return GRID_TOO_LARGE, (low, spacing, np.ones(1)), source
-        return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
-
-    return begin
+@internal
+def begin(system, spacing, reach):
+    """The grid at step 0, and the mixture (of one) that its masses are taken from."""
+    mean, sd, one = system.mean, system.sd, np.full(1, 1.0)
+    source = np.full(1, mean), np.full(1, sd), one
+    if not (np.isfinite(mean) and np.isfinite(sd)):
+        return NO_FINITE_MEMBER, (np.int64(0), 1.0, one), source
+    if sd <= _KNOWN * abs(mean):
+        return NONE, (np.int64(1), mean, one), source  # point 1 of this spacing
+    spacing = min(spacing, 0.6 * sd)
+    low, n = reached(*source, spacing, reach)
+    if n > MAX_POINTS:
+        return GRID_TOO_LARGE, (low, spacing, one), source
+    return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
 
 
-def forecast_of(system: OneState) -> Any:
-    moments, same_every_step = _moments(system.move), system.same_every_step
-    drop_escaping = _drop_escaping(system.move)
-
-    @pasted
-    def forecast(theta, inputs, k, t, spacing, reach, grid, table):
-        """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
-        low, here, mass = grid
-        tabled = same_every_step and here == spacing and mass.size > 1
+@internal
+def forecast(system, k, t, spacing, reach, grid, table):
+    """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
+    low, here, mass = grid
+    tabled = system.same_every_step and here == spacing and mass.size > 1
+    first, mean, sd, shares, rows = table
+    if not tabled or low < first or low + mass.size > first + mean.size:
+        first, n = low, mass.size
+        if tabled:  # room for the density to move
+            first, n = low - n // 4, n + n // 2
+        mean, sd, shares = _moments(system, k, t, lattice(first, n, here), here, spacing)
         if tabled:
-            first = table[0]
-            if low < first or low + mass.size > first + table[1].size:
-                first, n = low - mass.size // 4, mass.size + mass.size // 2
-                mean, sd, shares = moments(theta, inputs, k, t, lattice(first, n, here), here, here)
-                table = first, mean, sd, shares, kernel(spacing, mean, sd, reach)
-            first = low - table[0]
-            last = first + mass.size
-            mean, sd, shares = table[1][first:last], table[2][first:last], table[3][first:last]
-        else:
-            X = lattice(low, mass.size, here)
-            mean, sd, shares = moments(theta, inputs, k, t, X, here, spacing)
-        lost = total(mass, shares)
-        if lost == np.inf:
-            return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
-        target, n = reached(mean, sd, mass, spacing, reach)
-        if n > MAX_POINTS:
-            target, n = drop_escaping(theta, inputs, k, t, mean, sd, mass, spacing, reach)
-        source = mean, sd, mass
-        if n == 0 or n > MAX_POINTS:
-            code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
-            return code, grid, source, table, lost
-        if tabled:
-            starts, ends, masses = table[4]
-            first = low - table[0]
-            out = move(starts[first:], ends[first:], masses, mass, target, n)
-        else:
-            out = spread(target, n, spacing, *source, reach)
-        i, j = significant(out, cut_of(reach))
-        return NONE, (target + i, spacing, out[i:j]), source, table, lost
-
-    return forecast
+            rows = kernel(spacing, mean, sd, reach)
+            table = first, mean, sd, shares, rows
+    here_on = slice(low - first, low - first + mass.size)
+    mean, sd, shares = mean[here_on], sd[here_on], shares[here_on]
+    lost = total(mass, shares)
+    if lost == np.inf:
+        return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
+    target, n = reached(mean, sd, mass, spacing, reach)
+    if n > MAX_POINTS:
+        target, n = _drop_escaping(system, k, t, mean, sd, mass, spacing, reach)
+    source = mean, sd, mass
+    if n == 0 or n > MAX_POINTS:
+        code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
+        return code, grid, source, table, lost
+    if tabled:
+        starts, ends, masses = rows
+        out = move(starts[low - first :], ends[low - first :], masses, mass, target, n)
+    else:
+        out = spread(target, n, spacing, *source, reach)
+    i, j = significant(out, cut_of(reach))
+    return NONE, (target + i, spacing, out[i:j]), source, table, lost
 
 
-def _moments(step: Any) -> Any:
-    @pasted
-    def moments(theta, inputs, k, t, X, source_spacing, spacing):
-        """Mean and deviation of the next state from every point, and what a step may misplace."""
-        M = np.empty((2, X.shape[1]))
-        step(theta, inputs, k, t, X, M)
-        mean, sd = M[0], M[1]
-        for i in range(sd.size):
-            sd[i] = math.sqrt(sd[i])
-        return mean, sd, aliasing(mean, sd, source_spacing, spacing)
-
-    return moments
+@pasted
+def _moments(system, k, t, X, source_spacing, spacing):
+    """Mean and deviation of the next state from every point, and what a step may misplace."""
+    M = np.empty((2, X.shape[1]))
+    move_points(system, k, t, X, M)
+    mean, sd = M[0], M[1]
+    for i in range(sd.size):
+        sd[i] = math.sqrt(sd[i])
+    return mean, sd, aliasing(mean, sd, source_spacing, spacing)
 
 
-def _drop_escaping(step: Any) -> Any:
-    @pasted
-    def drop_escaping(theta, inputs, k, t, mean, sd, mass, spacing, reach):
-        """Take the mass off exploding points, the fastest first, until a lattice holds the rest.
+@internal
+def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
+    """Take the mass off exploding points, the fastest first, until a lattice holds the rest.
 
-        Those are points whose path without noise is infinite some steps later.
-        """
-        X, M = np.empty((1, mean.size)), np.empty((2, mean.size))
+    Those are points whose path without noise is infinite some steps later.
+    """
+    X, M = np.empty((1, mean.size)), np.empty((2, mean.size))
+    for i in range(mean.size):
+        M[0, i] = mean[i]
+    low, n = np.int64(0), np.int64(MAX_POINTS + 1)
+    for _ in range(20):
         for i in range(mean.size):
-            M[0, i] = mean[i]
-        low, n = np.int64(0), np.int64(MAX_POINTS + 1)
-        for _ in range(20):
-            for i in range(mean.size):
-                X[0, i] = M[0, i]
-            step(theta, inputs, k, t, X, M)
-            for i in range(mass.size):
-                if not np.isfinite(M[0, i]):
-                    mass[i] = 0.0
-            low, n = reached(mean, sd, mass, spacing, reach)
-            if n <= MAX_POINTS:
-                break
-        return low, n
-
-    return drop_escaping
+            X[0, i] = M[0, i]
+        move_points(system, k, t, X, M)
+        for i in range(mass.size):
+            if not np.isfinite(M[0, i]):
+                mass[i] = 0.0
+        low, n = reached(mean, sd, mass, spacing, reach)
+        if n <= MAX_POINTS:
+            break
+    return low, n
 
 
-def see_of(system: OneState, tolerance: float) -> Any:
-    log_density = system.log_density
+@internal
+def see(system, k, t, d, reach, grid, source, error, tolerance):
+    """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
 
-    @pasted
-    def see(theta, inputs, k, t, d, reach, grid, source, error):
-        """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
-
-        ``error`` is the mass that the steps since the last update may have misplaced: it may lie
-        where the observation looks.
-        """
-        low, spacing, mass = grid
-        cut = cut_of(reach)
-        while True:
-            log_likelihood = np.empty(mass.size)
-            log_density(theta, inputs, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
-            term, posterior = weigh(mass, log_likelihood)
-            if term == -np.inf:
-                return ZERO_WEIGHTS, grid, term
-            first, last = significant(posterior, cut)
-            normalise(posterior)
-            known = mass.size == 1
-            if not known and posterior[0] + posterior[-1] > tolerance:
-                return TOO_SHORT, grid, term
-            if known or coarseness(posterior) <= tolerance:
-                if math.log(error) + highest(log_likelihood) - term > math.log(tolerance):
-                    return TOO_COARSE, grid, term
-                return NONE, (low + first, spacing, posterior[first:last]), term
-            start, end = (low + first - 2) * spacing, (low + last + 1) * spacing
-            spacing *= REFINEMENT
-            low = np.int64(math.floor(start / spacing))
-            n = np.int64(math.ceil(end / spacing)) - low + 1
-            if n > MAX_POINTS:
-                return GRID_TOO_LARGE, grid, term
-            mass = spread(low, n, spacing, *source, reach)
-
-    return see
+    ``error`` is the mass that the steps since the last update may have misplaced: it may lie
+    where the observation looks.
+    """
+    low, spacing, mass = grid
+    cut = cut_of(reach)
+    while True:
+        log_likelihood = np.empty(mass.size)
+        log_density(system, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
+        term, posterior = weigh(mass, log_likelihood)
+        if term == -np.inf:
+            return ZERO_WEIGHTS, grid, term
+        first, last = significant(posterior, cut)
+        normalise(posterior)
+        known = mass.size == 1
+        if not known and posterior[0] + posterior[-1] > tolerance:
+            return TOO_SHORT, grid, term
+        if known or coarseness(posterior) <= tolerance:
+            if math.log(error) + highest(log_likelihood) - term > math.log(tolerance):
+                return TOO_COARSE, grid, term
+            return NONE, (low + first, spacing, posterior[first:last]), term
+        start, end = (low + first - 2) * spacing, (low + last + 1) * spacing
+        spacing *= REFINEMENT
+        low = np.int64(math.floor(start / spacing))
+        n = np.int64(math.ceil(end / spacing)) - low + 1
+        if n > MAX_POINTS:
+            return GRID_TOO_LARGE, grid, term
+        mass = spread(low, n, spacing, *source, reach)

@@ -43,42 +43,38 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
     of = carray(table, (N_TABLE,))
     free = carray(table, (N_TABLE + of[4],))[N_TABLE:]
     c = np.empty(of[3])
-    call_address(of[5], (theta, n_theta, c.ctypes.data))
+    call_address(of[5], (theta, n_theta, c))
     return System(
         of[0], of[1], dt, free, c, carray(inputs, (n_rows, of[2])), of[6], of[7], of[8], of[9]
     )
 
 
 @pasted
-def _call(address, system, k, t, z, width, X, out):
-    call_address(
-        address,
-        (
-            system.c.ctypes.data, system.inputs.ctypes.data, k, t, z, width, X.ctypes.data, out,
-            np.int64(X.shape[1]),
-        ),
-    )  # fmt: skip
+def call_members(address, system, k, t, z, width, X, out):
+    """Call a function of all members, by the form that all of them have in `lowering.members`."""
+    n_members = np.int64(X.shape[1])
+    call_address(address, (system.c, system.inputs, k, t, z, width, X, out, n_members))
 
 
 @pasted
 def initialise(system, z, width, X):
     """Draw every member's state at step 0 from normals at the address z."""
-    _call(system.initialise, system, NOTHING, 0.0, z, width, X, NOTHING)
+    call_members(system.initialise, system, NOTHING, 0.0, z, width, X, NOTHING)
 
 
 @pasted
 def propagate(system, k, t, z, width, X):
     """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
-    _call(system.propagate, system, k, t, z, width, X, NOTHING)
+    call_members(system.propagate, system, k, t, z, width, X, NOTHING)
 
 
 @pasted
 def observe(system, k, t, z, width, X, D):
     """Simulate an observation of every member (Eq. 4.15)."""
-    _call(system.observe, system, k, t, z, width, X, D.ctypes.data)
+    call_members(system.observe, system, k, t, z, width, X, D)
 
 
 @pasted
 def log_density(system, k, t, d, X, log_p):
     """Write log p(d | x) of every member; components of d that are NaN are left out."""
-    _call(system.log_density, system, k, t, d.ctypes.data, NOTHING, X, log_p.ctypes.data)
+    call_members(system.log_density, system, k, t, d, NOTHING, X, log_p)

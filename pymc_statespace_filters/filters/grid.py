@@ -15,36 +15,56 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
+from numba import carray, types
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import compiled, internal, pasted
 from pymc_statespace_filters.filters._failures import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
+    OUT_OF_MEMORY,
     ZERO_WEIGHTS,
 )
+from pymc_statespace_filters.filters._one_state import move_points, read_one_state
 from pymc_statespace_filters.filters._point_mass import (
     REFINEMENT,
     TOO_COARSE,
     TOO_SHORT,
-    begin_of,
-    forecast_of,
+    begin,
+    forecast,
     no_table,
-    see_of,
+    see,
 )
 from pymc_statespace_filters.lowering import (
+    COUNTS,
+    NUMBERS,
     Compiled,
+    Entry,
     OneState,
+    address_of,
+    digest,
     has_additive_process_noise,
     has_smooth_transition,
     key_of,
     one_state,
+    one_state_entries,
 )
 from pymc_statespace_filters.model import StateSpaceModel
 
 _LENGTHENING = 1.6
 _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
 _PER_STEP = 1e-5  # of the tolerance, what one step's error is planned for
+
+_ARGUMENTS = (
+    types.intp, types.intp, types.intp,  # addresses of the system's functions
+    types.intp, types.intp, types.intp, types.float64,  # p, inputs, same every step?, time step
+    types.float64,  # tolerance
+    NUMBERS, types.intp,  # theta
+    COUNTS, types.intp, NUMBERS,  # steps and record
+    NUMBERS, types.intp,  # rows of inputs
+    types.float64,  # t0
+    NUMBERS, NUMBERS,  # terms, health
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -130,66 +150,90 @@ class GridFilter:
     def compile(self, system: StateSpaceModel) -> Compiled:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         functions = one_state(system)
-        return Compiled(_evaluation(functions, self.tolerance), key_of(repr(self), functions.key))
+        return Compiled(_bound(functions, self.tolerance), key_of(repr(self), functions.key))
 
 
-def _evaluation(system: OneState, tolerance: float) -> Any:
-    attempt, first_spacing = _attempt(system, tolerance), _first_spacing(system, tolerance)
-    valid = system.valid
+def _bound(functions: OneState, tolerance: float) -> Any:
+    """Bind the filter's entry to the functions of one system."""
+    entries = one_state_entries(functions)
+    for entry in (POINT_MASS, *entries):
+        entry.compile()
+    evaluate = POINT_MASS.external
+    start, move, log_density = (entry.symbol for entry in entries)
+    n_inputs, p, dt = functions.n_inputs, functions.p, functions.dt
+    same_every_step = int(functions.same_every_step)
 
     @compiled
-    def run(theta, steps, observed, inputs, t0, seed):
-        terms, health = np.empty(steps.size), np.empty(3)
-        health[0], health[1], health[2] = np.inf, NONE, -1.0
-        code, j = np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-        spacing, reach = np.inf, _SHORTEST_REACH
-        is_valid = valid(theta)
-        if is_valid and steps.size:
-            spacing = first_spacing(theta, inputs, t0, steps[-1])
-        while is_valid:
-            code, j = attempt(theta, steps, observed, inputs, t0, spacing, reach, terms)
-            if code == TOO_COARSE:
-                spacing *= REFINEMENT
-            elif code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
-                reach *= _LENGTHENING
-            else:
-                break
-        if code != NONE:
-            for failed in range(j, steps.size):
-                terms[failed] = -np.inf
-            health[1], health[2] = code if code > NONE else ZERO_WEIGHTS, j
+    def run(theta, steps, observed, inputs, t0, noise):
+        terms, health = np.full(steps.size, -np.inf), np.empty(3)
+        health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
+        evaluate(
+            address_of(start), address_of(move), address_of(log_density),
+            p, n_inputs, same_every_step, dt, tolerance,
+            theta.ctypes.data, theta.size, steps.ctypes.data, steps.size, observed.ctypes.data,
+            inputs.ctypes.data, inputs.shape[0], t0, terms.ctypes.data, health.ctypes.data,
+        )  # fmt: skip
         return terms, health
 
     return run
 
 
-def _first_spacing(system: OneState, tolerance: float) -> Any:
-    step, start = system.move, system.start
-
-    @pasted
-    def first_spacing(theta, inputs, t0, n_steps):
-        """The spacing that the first step asks for around the start; see `_lattice.aliasing`."""
-        spacing = np.inf
-        if n_steps == 0:
-            return spacing
-        mean, variance = start(theta)
-        sd = math.sqrt(variance)
-        X, M = np.empty((1, 3)), np.empty((2, 3))
-        for i in range(3):
-            X[0, i] = mean + (i - 1) * sd
-        step(theta, inputs, 0, t0, X, M)
-        slope = (M[0, 2] - M[0, 0]) / (2.0 * sd) if sd > 0.0 else 1.0
-        for i in range(3):
-            width = math.sqrt(M[1, i] / (1.0 + slope * slope))
-            if width > 0.0:
-                spacing = min(spacing, width)
-        return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-
-    return first_spacing
+def _point_mass(
+    start, move, log_density, p, n_inputs, same_every_step, dt, tolerance, theta, n_theta,
+    steps, n_observations, observed, inputs, n_rows, t0, terms, health,
+):  # fmt: skip
+    system = read_one_state(
+        start, move, log_density, dt, same_every_step,
+        carray(theta, (n_theta,)), carray(inputs, (n_rows, n_inputs)),
+    )  # fmt: skip
+    record = carray(observed, (n_observations, p))
+    out, state = carray(terms, (n_observations,)), carray(health, (3,))
+    code, j = _evaluate(system, carray(steps, (n_observations,)), record, t0, tolerance, out)
+    for failed in range(j, n_observations):
+        out[failed] = -np.inf
+    failure = code if code >= NONE else ZERO_WEIGHTS
+    state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
 @pasted
-def nothing_seen(d):
+def _evaluate(system, steps, observed, t0, tolerance, terms):
+    """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
+    if not system.is_valid:
+        return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
+    spacing, reach = np.inf, _SHORTEST_REACH
+    if steps.size:
+        spacing = _first_spacing(system, t0, steps[-1], tolerance)
+    while True:
+        code, j = _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms)
+        if code == TOO_COARSE:
+            spacing *= REFINEMENT
+        elif code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
+            reach *= _LENGTHENING
+        else:
+            return code, j
+
+
+@internal
+def _first_spacing(system, t0, n_steps, tolerance):
+    """The spacing that the first step asks for around the start; see `_lattice.aliasing`."""
+    spacing = np.inf
+    if n_steps == 0:
+        return spacing
+    sd = system.sd
+    X, M = np.empty((1, 3)), np.empty((2, 3))
+    for i in range(3):
+        X[0, i] = system.mean + (i - 1) * sd
+    move_points(system, 0, t0, X, M)
+    slope = (M[0, 2] - M[0, 0]) / (2.0 * sd) if sd > 0.0 else 1.0
+    for i in range(3):
+        width = math.sqrt(M[1, i] / (1.0 + slope * slope))
+        if width > 0.0:
+            spacing = min(spacing, width)
+    return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
+
+
+@pasted
+def _nothing_seen(d):
     """Whether every component is missing."""
     for value in d:
         if not np.isnan(value):
@@ -197,37 +241,32 @@ def nothing_seen(d):
     return True
 
 
-def _attempt(system: OneState, tolerance: float) -> Any:
+@pasted
+def _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms):
     """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
-    begin, forecast, dt = begin_of(system), forecast_of(system), system.dt
-    see = see_of(system, tolerance)
-
-    @pasted
-    def attempt(theta, steps, observed, inputs, t0, spacing, reach, terms):
-        k = np.int64(0)
-        code, grid, source = begin(theta, spacing, reach)
-        table = no_table()
+    k = np.int64(0)
+    code, grid, source = begin(system, spacing, reach)
+    table = no_table()
+    error = 0.0
+    for j in range(steps.size):
+        while k < steps[j] and code == NONE:
+            t = t0 + k * system.dt
+            code, grid, source, table, lost = forecast(system, k, t, spacing, reach, grid, table)
+            error += lost
+            if code == NONE and error > tolerance:
+                code = TOO_COARSE
+            k += 1
+        if code != NONE:
+            return code, j
+        if _nothing_seen(observed[j]):
+            terms[j] = 0.0
+            continue
+        t = t0 + k * system.dt
+        code, grid, terms[j] = see(system, k, t, observed[j], reach, grid, source, error, tolerance)
+        if code != NONE:
+            return code, j
         error = 0.0
-        for j in range(steps.size):
-            while k < steps[j] and code == NONE:
-                code, grid, source, table, lost = forecast(
-                    theta, inputs, k, t0 + k * dt, spacing, reach, grid, table
-                )
-                error += lost
-                if code == NONE and error > tolerance:
-                    code = TOO_COARSE
-                k += 1
-            if code != NONE:
-                return code, j
-            if nothing_seen(observed[j]):
-                terms[j] = 0.0
-                continue
-            code, grid, terms[j] = see(
-                theta, inputs, k, t0 + k * dt, observed[j], reach, grid, source, error
-            )
-            if code != NONE:
-                return code, j
-            error = 0.0
-        return code, steps.size
+    return code, steps.size
 
-    return attempt
+
+POINT_MASS = Entry(_point_mass, _ARGUMENTS, "point_mass", digest("point_mass"))

@@ -31,7 +31,12 @@ from pymc_statespace_filters.lowering.graphs import (
     symbols_of,
 )
 from pymc_statespace_filters.lowering.lanes import LANES, LANES_AT_ONCE, lane_functions
-from pymc_statespace_filters.lowering.members import MachineEntries, machine_entries
+from pymc_statespace_filters.lowering.members import (
+    MachineEntries,
+    OneStateEntries,
+    machine_entries,
+    one_state_entries,
+)
 from pymc_statespace_filters.lowering.noise import is_linear
 from pymc_statespace_filters.lowering.one_state import (
     OneState,
@@ -53,6 +58,7 @@ __all__ = [
     "MachineEntries",
     "NotUnrollableError",
     "OneState",
+    "OneStateEntries",
     "VectorFunction",
     "address_of",
     "call",
@@ -72,6 +78,7 @@ __all__ = [
     "observation_moments",
     "observation_sampler",
     "one_state",
+    "one_state_entries",
     "semidefinite_cholesky",
     "symbols_of",
     "vector_functions",

@@ -114,13 +114,19 @@ def address_of(typing_context, symbol):
 
 @intrinsic
 def call_address(typing_context, address, arguments):
-    """Call the entry at an address with a tuple of numbers and addresses."""
+    """Call the entry at an address with a tuple of numbers, addresses, and arrays.
+
+    Of an array the entry gets the address; unlike one whose address was taken, it lives until then.
+    """
 
     def generate(context, builder, signature, values):
-        kinds = [context.get_value_type(t) for t in signature.args[1]]
-        kind = ir.FunctionType(ir.VoidType(), kinds)
-        function = builder.inttoptr(values[0], kind.as_pointer())
-        builder.call(function, cgutils.unpack_tuple(builder, values[1]))
+        kinds = signature.args[1]
+        given = list(cgutils.unpack_tuple(builder, values[1]))
+        for i, kind in enumerate(kinds):
+            if isinstance(kind, types.Array):
+                given[i] = context.make_array(kind)(context, builder, given[i]).data
+        function = ir.FunctionType(ir.VoidType(), [value.type for value in given])
+        builder.call(builder.inttoptr(values[0], function.as_pointer()), given)
         return context.get_dummy_value()
 
     return types.void(types.intp, arguments), generate

@@ -8,6 +8,7 @@ from numba import carray, types
 from pymc_statespace_filters.lowering.compiled import key_of
 from pymc_statespace_filters.lowering.ensemble import Machine
 from pymc_statespace_filters.lowering.entries import NUMBERS, Entry
+from pymc_statespace_filters.lowering.one_state import OneState
 
 # c, inputs, k, t, what comes to all members (Z and its columns, or d), X, out, number of members
 _MEMBERS = (
@@ -23,6 +24,14 @@ class MachineEntries(NamedTuple):
     propagate: Entry
     log_density: Entry
     observe: Entry | None
+
+
+class OneStateEntries(NamedTuple):
+    """Those of a `OneState`: ``start`` writes (valid or 0, mean, variance)."""
+
+    start: Entry
+    move: Entry
+    log_density: Entry
 
 
 def machine_entries(machine: Machine) -> MachineEntries:
@@ -53,14 +62,42 @@ def machine_entries(machine: Machine) -> MachineEntries:
         X, d, log_p = carray(x, (n, n_members)), carray(z, (p,)), carray(out, (n_members,))
         log_density(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, d, X, log_p)
 
-    def entry(function: Callable, arguments: tuple) -> Entry:
-        name = function.__name__
-        return Entry(function, arguments, name, key_of(f"{name} {sizes}", machine.key))
-
+    key = key_of(repr(sizes), machine.key)
     return MachineEntries(
-        prepare=entry(prepare_constants, (NUMBERS, types.intp, NUMBERS)),
-        initialise=entry(initialise_members, _MEMBERS),
-        propagate=entry(propagate_members, _MEMBERS),
-        log_density=entry(log_density_members, _MEMBERS),
-        observe=entry(observe_members, _MEMBERS) if machine.observe is not None else None,
+        prepare=_entry(prepare_constants, (NUMBERS, types.intp, NUMBERS), key),
+        initialise=_entry(initialise_members, _MEMBERS, key),
+        propagate=_entry(propagate_members, _MEMBERS, key),
+        log_density=_entry(log_density_members, _MEMBERS, key),
+        observe=_entry(observe_members, _MEMBERS, key) if machine.observe is not None else None,
     )
+
+
+def one_state_entries(system: OneState) -> OneStateEntries:
+    """Entries around the functions of a system of one state, not compiled yet."""
+    p, n_inputs, n_theta = system.p, system.n_inputs, system.n_theta
+    start, valid, move, log_density = system.start, system.valid, system.move, system.log_density
+
+    def start_state(theta, n_theta, first):
+        c, out = carray(theta, (n_theta,)), carray(first, (3,))
+        out[0] = valid(c)
+        moments = start(c)
+        out[1], out[2] = moments[0], moments[1]
+
+    def move_state(c, inputs, k, t, z, width, x, out, n_members):
+        X, M = carray(x, (1, n_members)), carray(out, (2, n_members))
+        move(carray(c, (n_theta,)), carray(inputs, (k + 1, n_inputs)), k, t, X, M)
+
+    def log_density_state(c, inputs, k, t, z, width, x, out, n_members):
+        X, d, log_p = carray(x, (1, n_members)), carray(z, (p,)), carray(out, (n_members,))
+        log_density(carray(c, (n_theta,)), carray(inputs, (k + 1, n_inputs)), k, t, d, X, log_p)
+
+    return OneStateEntries(
+        start=_entry(start_state, (NUMBERS, types.intp, NUMBERS), system.key),
+        move=_entry(move_state, _MEMBERS, system.key),
+        log_density=_entry(log_density_state, _MEMBERS, system.key),
+    )
+
+
+def _entry(function: Callable, arguments: tuple, key: str | None) -> Entry:
+    name = function.__name__
+    return Entry(function, arguments, name, key_of(name, key))

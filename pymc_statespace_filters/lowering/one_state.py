@@ -43,6 +43,9 @@ class OneState:
     * ``same_every_step`` tells that ``move`` depends on neither inputs nor time.
     """
 
+    n_theta: int
+    p: int
+    n_inputs: int
     dt: float
     same_every_step: bool
     start: Any
@@ -99,11 +102,13 @@ def one_state(system: StateSpaceModel) -> OneState:
     }
     same_every_step = is_free_of(("u", "t"), moments, step)
     keys = [part.key for part in parts.values()]
+    sizes = (system.n_theta, system.p, system.n_inputs)
     return OneState(
+        *sizes,
         dt=system.dt,
         same_every_step=same_every_step,
         **{name: part.function for name, part in parts.items()},
-        key=key_of(repr((system.dt, same_every_step)), *keys),
+        key=key_of(repr((sizes, system.dt, same_every_step)), *keys),
     )
 
 
