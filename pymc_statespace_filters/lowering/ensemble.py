@@ -1,17 +1,26 @@
 """What a system gives to the filters that move many members: compiled, member by member."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from numba import carray, types
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.lowering.compile import member_function, vector_functions
-from pymc_statespace_filters.lowering.compiled import Compiled, Graph, VectorFunction, jit, key_of
+from pymc_statespace_filters.lowering.compiled import (
+    Compiled,
+    Graph,
+    VectorFunction,
+    digest,
+    jit,
+    key_of,
+)
+from pymc_statespace_filters.lowering.entries import NUMBERS, Entry
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.lowering.graphs import call, observation_moments, symbols_of
 from pymc_statespace_filters.lowering.noise import merged_noise
@@ -179,27 +188,37 @@ def _log_density(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
 def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]) -> Compiled:
     """theta -> c: parameters, initial mean, then the lower square root of every covariance."""
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    values = {"theta": theta}
-    outputs = [theta, call(system.equations.initial_mean, system, values)]
-    outputs += [call(graph, system, values).ravel() for graph in blocks.values()]
-    graph = Graph({"theta": theta}, [pt.concatenate(outputs)])
+    mean = call(system.equations.initial_mean, system, {"theta": theta})
+    return _followed_by_roots([theta, mean], system, theta, blocks)
+
+
+def _followed_by_roots(
+    outputs: Sequence[TensorVariable],
+    system: StateSpaceModel,
+    theta: TensorVariable,
+    blocks: Mapping[str, FrozenFunctionGraph],
+) -> Compiled:
+    """theta -> these vectors, then the lower square root of every covariance, in one array."""
+    covs = [call(graph, system, {"theta": theta}) for graph in blocks.values()]
+    graph = Graph({"theta": theta}, [pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])])
     flat = vector_functions({"moments": VectorFunction("c", graph)})["moments"]
-    sizes = tuple(graph.outputs[0].type.shape[0] for graph in blocks.values())
-    moments, first = flat.function, system.n_theta + system.n
+    length, sizes = graph.outputs[0].type.shape[0], tuple(cov.type.shape[0] for cov in covs)
+    moments, first = flat.function, length - sum(size**2 for size in sizes)
+    SQUARE_ROOT.compile()
+    take_root = SQUARE_ROOT.external
 
     def prepare(theta):
-        c = np.empty(first + sum_of_squares)
+        c = np.empty(length)
         values = moments(theta)
         for i in range(c.size):
             c[i] = values[i]
         start = first
         for size in sizes:
-            semidefinite_cholesky(c[start : start + size * size].reshape(size, size))
+            take_root(c[start:].ctypes.data, size)
             start += size * size
         return c
 
-    sum_of_squares = sum(size**2 for size in sizes)
-    return Compiled(jit(prepare), key_of(repr(sizes), flat.key))
+    return Compiled(jit(prepare), key_of(repr((length, sizes)), flat.key, SQUARE_ROOT.key))
 
 
 def covariance_check(system: StateSpaceModel) -> Compiled:
@@ -214,12 +233,15 @@ def covariance_check(system: StateSpaceModel) -> Compiled:
     }
     if not blocks:
         return Compiled(jit(lambda theta: True), key_of("nothing to check"))
-    prepare = _prepare(system, blocks)
+    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
+    prepare = _followed_by_roots([], system, theta, blocks)
     roots = prepare.function
-    first = system.n_theta + system.n
 
     def check(theta):
-        return not np.isnan(roots(theta)[first:]).any()
+        for value in roots(theta):
+            if np.isnan(value):
+                return False
+        return True
 
     return Compiled(jit(check), key_of("check", prepare.key))
 
@@ -233,7 +255,9 @@ def semidefinite_cholesky(a):
     in pascals, the next in metres.
     """
     n = a.shape[0]
-    variance = np.diag(a).copy()
+    variance = np.empty(n)
+    for j in range(n):
+        variance[j] = a[j, j]
     for j in range(n):
         pivot = a[j, j]
         for k in range(j):
@@ -256,3 +280,11 @@ def semidefinite_cholesky(a):
                 a[i, j] = 0.0
         for i in range(j):
             a[i, j] = 0.0
+
+
+def _take_root(a, size):
+    semidefinite_cholesky(carray(a, (size, size)))
+
+
+SQUARE_ROOT = Entry(_take_root, (NUMBERS, types.intp), "square_root", digest("square_root"))
+"""`semidefinite_cholesky` of the matrix at an address, compiled once for all systems."""

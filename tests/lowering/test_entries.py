@@ -39,6 +39,13 @@ def thrice(address, x):
 
 
 @njit
+def of_a_temporary(address, n):
+    out = np.ones(2 * n)
+    call_address(address, (out[n:], n, 3.0))
+    return out
+
+
+@njit
 def address():
     return address_of(symbol)
 
@@ -48,6 +55,11 @@ def test_is_called_by_name_and_by_address():
     assert twice(np.arange(3.0)).tolist() == [0, 2, 4]
     assert thrice(address(), np.arange(3.0)).tolist() == [0, 3, 6]
     assert njit(lambda: address_of(""))() == 0
+
+
+def test_an_array_is_handed_over_by_its_address():
+    SCALE.compile()
+    assert of_a_temporary(address(), 2).tolist() == [1, 1, 3, 3]
 
 
 def test_a_second_entry_under_the_same_key_is_the_first():
@@ -69,6 +81,20 @@ def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
     new = set(entries._compiled) - before
     assert new
     assert not any("bootstrap" in symbol or "fill_normals" in symbol for symbol in new)
+
+
+def test_the_point_mass_filter_is_compiled_once_for_all_systems_and_tolerances():
+    evaluate = partial(
+        psf.log_likelihood, params={"a": 0.6}, observed=FORCED_DATA, steps=STEPS, inputs=FORCE
+    )
+    evaluate(forced(), psf.GridFilter())
+    before = set(entries._compiled)
+    evaluate(forced(), psf.GridFilter(tolerance=1e-6))
+    assert set(entries._compiled) == before
+    evaluate(forced(initial_mean=[0.35]), psf.GridFilter())
+    new = set(entries._compiled) - before
+    assert new
+    assert not any("point_mass" in symbol for symbol in new)
 
 
 PROCESS = """
