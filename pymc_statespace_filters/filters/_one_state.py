@@ -31,7 +31,7 @@ class OneStateSystem(NamedTuple):
 @pasted
 def read_one_state(start, move, log_density, dt, same_every_step, theta, inputs):
     """Give names to what the entry of the filter was called with, and ask for the start."""
-    first = np.empty(3)
+    first = np.zeros(3)
     call_address(start, (theta, theta.size, first))
     is_valid, mean, sd = first[0] != 0.0, first[1], math.sqrt(first[2])
     return OneStateSystem(

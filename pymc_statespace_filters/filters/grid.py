@@ -148,7 +148,7 @@ class GridFilter:
         return right_density and has_smooth_transition(system)
 
     def compile(self, system: StateSpaceModel) -> Compiled:
-        """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
+        """The function (theta, steps, observed, inputs, t0, noise) -> (terms, health)."""
         functions = one_state(system)
         return Compiled(_bound(functions, self.tolerance), key_of(repr(self), functions.key))
 
@@ -182,6 +182,7 @@ def _point_mass(
     start, move, log_density, p, n_inputs, same_every_step, dt, tolerance, theta, n_theta,
     steps, n_observations, observed, inputs, n_rows, t0, terms, health,
 ):  # fmt: skip
+    """The filter as one function for all systems; see `compile` for what it writes."""
     system = read_one_state(
         start, move, log_density, dt, same_every_step,
         carray(theta, (n_theta,)), carray(inputs, (n_rows, n_inputs)),
