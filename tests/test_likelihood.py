@@ -1,6 +1,8 @@
 """Log-likelihoods of a record: timing, missing data, densities of every kind, batches."""
 
+import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pymc as pm
@@ -214,3 +216,22 @@ def test_defaults_are_used_and_can_be_overridden():
     np.testing.assert_allclose(by_default, kalman(), rtol=1e-12)
     given = psf.log_likelihood(system, psf.EKF(), {"s": 0.3, "a": 0.5}, RECORD, steps=STEPS)
     np.testing.assert_allclose(given, kalman(a=0.5), rtol=1e-12)
+
+
+def test_threads_may_evaluate_at_once():
+    """The arguments of a call are its own: else a hundredth of these calls fail or mix records."""
+    system, interval = walk(), sys.getswitchinterval()
+
+    def terms(a):
+        record, steps = RECORD[: 2 + a % 3], STEPS[: 2 + a % 3]
+        return psf.log_likelihood(system, psf.EKF(), POINT | {"a": 0.1 * a}, record, steps=steps)
+
+    alone = [terms(a) for a in range(4)]
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            together = list(pool.map(terms, [0, 1, 2, 3] * 1000))
+    finally:
+        sys.setswitchinterval(interval)
+    for a, result in enumerate(together):
+        np.testing.assert_array_equal(result, alone[a % 4])

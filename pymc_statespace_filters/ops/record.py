@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, ClassVar
 
+import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.graph.basic import Apply, Variable
@@ -81,11 +82,22 @@ def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
 
 @cache
 def evaluator(op: RecordOp) -> Any:
-    """A compiled Python function of the operation's inputs; its machine code is cached on disk."""
+    """A compiled Python function of the operation's inputs; its machine code is cached on disk.
+
+    It is the machine code itself. The object around it keeps the arguments of a call in cells that
+    all callers share, and another thread's arguments would get in between.
+    """
     inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in op.input_types]
-    return pytensor.function(
+    function = pytensor.function(
         inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
     )
+    machine_code = function.vm.jit_fn
+    dtypes = [dtype for _, dtype, _ in op.input_types]
+
+    def evaluate(*values: Any) -> tuple:
+        return machine_code(*map(np.asarray, values, dtypes))
+
+    return evaluate
 
 
 def check_record(system: StateSpaceModel) -> Any:
