@@ -25,7 +25,7 @@ def contenders(name: str) -> dict[str, Timed]:
         "BootstrapPF(1250)": ours.of(name, psf.BootstrapPF(1250)).value(),
         "PFEnKF(1250)": ours.of(name, psf.PFEnKF(1250)).value(),
     }
-    if hasattr(psf, "GridFilter") and name == "double_well":
+    if name == "double_well":
         found["GridFilter()"] = ours.of(name, psf.GridFilter()).value()
     return found
 

@@ -84,32 +84,6 @@ def by_pymc(sampler: str, step: Callable) -> Chains:
     return summarised(sampler, chains, np.array(seconds) - before)
 
 
-def compiled_chains() -> Chains:
-    """Our chains compiled whole."""
-    if not hasattr(psf, "sample_dram"):
-        return Chains("psf.sample_dram", note="not available")
-
-    def run(seed, tune, draws):
-        start = time.process_time()
-        idata = psf.sample_dram(
-            draws,
-            tune,
-            chains=1,
-            cores=1,
-            initvals=DOUBLE_WELL_TRUTH,
-            random_seed=seed,
-            progressbar=False,
-        )
-        seconds = time.process_time() - start
-        return np.stack([idata.posterior[name].values[0] for name in NAMES], axis=1), seconds
-
-    with the_model():
-        run(0, 1, 4)
-        before = np.median([run(0, 1, 4)[1] for _ in range(3)])
-        chains, seconds = zip(*(run(s, TUNE, DRAWS) for s in range(N_SEEDS)), strict=True)
-    return summarised("psf.sample_dram", chains, np.array(seconds) - before)
-
-
 def by_pymcmcstat() -> Chains:
     sampler, target = "pymcmcstat", FOLDER / "pymcmcstat.npz"
     python = ROOT / ".venv-bench" / "bin" / "python"
@@ -139,7 +113,6 @@ def sampling() -> list[Chains]:
     return [
         by_pymc("pm.sample(step=psf.DRAM())", psf.DRAM),
         by_pymc("pm.sample(step=psf.DRAM(stages=1))", lambda: psf.DRAM(stages=1)),
-        compiled_chains(),
         by_pymc("pm.sample(step=pm.DEMetropolisZ())", pm.DEMetropolisZ),
         by_pymcmcstat(),
     ]

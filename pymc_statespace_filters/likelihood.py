@@ -59,7 +59,7 @@ def log_likelihood(
     t0 : float
         Time of step 0.
     seed : int or array_like of int
-        The noise inside the filter; broadcasts with the parameters. Ignored by `EKF`.
+        The noise inside the filter, if it has any; broadcasts with the parameters.
 
     Returns
     -------

@@ -3,8 +3,10 @@
 A filter has the attributes ``noisy`` (its likelihood is an estimate that depends on a seed) and
 ``has_gradient``, and three methods: ``check(system)`` raises if it cannot treat the system,
 ``is_exact_for(system)`` says whether its likelihood, or the mean of its estimates, is the system's,
-and ``compile(system)`` gives the machine code ``(theta, steps, observed, inputs, t0, seed) ->
-(terms, health)``.
+and ``compile(system)`` gives the machine code ``(theta, steps, observed, inputs, t0, noise) ->
+(terms, health)``; ``noise`` is a seed and a vector of stored normals, which deterministic filters
+do not read. What only some filters have is a method of theirs: ``stored_noise`` of the noisy ones,
+``compile_batch``, and with a gradient ``compile_gradient``, ``compile_taped``, ``compile_reverse``.
 """
 
 from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES
