@@ -75,16 +75,20 @@ def scott_bandwidth(w, n_effective, X, free, x_mean, P, H, active):
 
 
 @compiled
-def _whiten(H, active, free, X, out):
-    """Leave H^-1 X / sqrt(2) of the active directions in the first rows of ``out``; how many."""
+def _whiten(H, active, free, X, origin, out):
+    """Leave H^-1 (X - origin) / sqrt(2) of the active directions in the first rows of ``out``.
+
+    Returns how many rows. The origin is a particle: far from zero x / h would be rounded to more
+    than the distances between particles bear.
+    """
     row = 0
     for a in range(active.size):
         if not active[a]:
             continue
-        x, y = X[free[a]], out[row]
+        x, y, x_0 = X[free[a]], out[row], origin[a]
         scale, before = 1.0 / H[a, a], 0
         for i in range(x.size):
-            y[i] = (_SQRT_HALF * scale) * x[i]
+            y[i] = (_SQRT_HALF * scale) * (x[i] - x_0)
         for b in range(a):
             if active[b]:
                 share, z = scale * H[a, b], out[before]
@@ -102,8 +106,14 @@ def log_kernel_density(w, X, V, free, H, active, work, out):
     Members of zero weight are left out, and may be NaN. A target that is not finite gets -inf.
     """
     (sources, targets), missed, sum_work, lattice_work, tilted_work = work
-    n_active = _whiten(H, active, free, X, sources)
-    _whiten(H, active, free, V, targets)
+    first = 0
+    while first < w.size - 1 and not w[first] > 0.0:
+        first += 1
+    origin = np.empty(free.size)
+    for a in range(free.size):
+        origin[a] = X[free[a], first]
+    n_active = _whiten(H, active, free, X, origin, sources)
+    _whiten(H, active, free, V, origin, targets)
     if _by_lattice(n_active, out.size):
         works = sum_work, lattice_work, tilted_work
         n_missed, members = log_lattice_sums(w, sources, targets, n_active, works, missed, out)

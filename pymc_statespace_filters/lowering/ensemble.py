@@ -262,7 +262,7 @@ def semidefinite_cholesky(a):
         pivot = a[j, j]
         for k in range(j):
             pivot -= a[j, k] ** 2
-        if pivot < -1e-10 * abs(variance[j]) or pivot != pivot:
+        if pivot < -1e-10 * abs(variance[j]) or not np.isfinite(pivot):
             a[:] = np.nan
             return
         root = np.sqrt(pivot) if pivot > 1e-14 * variance[j] else 0.0

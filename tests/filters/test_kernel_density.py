@@ -122,3 +122,15 @@ def test_moments_that_are_not_finite_are_refused():
     w = np.full(10, 0.1)
     X = np.linspace(-1e200, 1e200, 10)[None]
     assert not bandwidth(X, w)[0]
+
+
+@pytest.mark.parametrize("n_particles", [30, 300])
+@pytest.mark.parametrize("n", [1, 2])
+def test_how_far_the_particles_are_from_zero_makes_no_difference(n, n_particles):
+    _, X, w = weighted_particles(n, n_particles, seed=4)
+    X = np.round(X * 2**20) / 2**20  # so that a large power of two is added without rounding
+    V = 3 * X
+    near, far = log_density(X, w, V), log_density(X + 2.0**30, w, V + 2.0**30)
+    # the moments are rounded, at 1e-16 of the distance: 1e-7 of a bandwidth; the tails feel it
+    assert far[:5] == pytest.approx(near[:5], rel=1e-5)
+    assert np.abs(far - near).max() < 1e-5 * np.abs(near).max()

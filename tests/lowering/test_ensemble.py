@@ -100,7 +100,9 @@ def test_square_root_of_a_singular_covariance(rank):
     assert (np.triu(root, 1) == 0).all()
 
 
-@pytest.mark.parametrize("cov", [[[-1.0]], [[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+@pytest.mark.parametrize(
+    "cov", [[[-1.0]], [[-np.inf]], [[np.inf]], [[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]]
+)
 def test_square_root_of_what_is_no_covariance_is_nan(cov):
     root = np.array(cov)
     semidefinite_cholesky(root)
