@@ -29,8 +29,9 @@ from pymc_statespace_filters.lowering.source import Writer, depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
 from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
 
-# Beyond this many scalar operations machine code takes longer to make than it saves.
-MAX_EXPRESSIONS = 1500
+# Up to here the arrays' code takes as long to make and is up to eighty times slower: rings of 8
+# states with a gradient and of 16 without, dense systems of 10. Beyond, nobody would wait for it.
+MAX_EXPRESSIONS = 6000
 MAX_OUTPUT_ELEMENTS = 200
 
 # LLVM makes no vector code of a loop before which more than 128 pairs of rows would have to be

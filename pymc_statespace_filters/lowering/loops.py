@@ -103,7 +103,9 @@ def _numba_loops(op: Loops, node: Apply | None = None, **kwargs) -> tuple:
 def use_loops(graph: FunctionGraph) -> None:
     """Replace, in place, the products, Cholesky factors and triangular solves of a graph."""
     for node in graph.toposort():
-        if all(v.type.dtype == "float64" for v in (*node.inputs, *node.outputs)):
+        # Slices and the like have no number type.
+        kinds = {getattr(v.type, "dtype", None) for v in (*node.inputs, *node.outputs)}
+        if kinds == {"float64"}:
             replacement = _written_in_loops(node)
             if replacement is not None:
                 graph.replace(node.outputs[0], replacement, import_missing=True)

@@ -180,3 +180,26 @@ def test_keys_tell_settings_apart():
     }
     assert len(keys) == 4
     assert None not in keys
+
+
+def test_gradients_of_rolled_states_are_the_same_on_arrays(monkeypatch):
+    """The derivative of a roll holds slices, which are no numbers."""
+
+    def drift(x, pull):
+        return -x + pull * pt.roll(x, 1)
+
+    system = psf.StateSpaceModel(
+        transition=psf.EulerMaruyama(drift, 0.5 * np.eye(3), dt=0.1),
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.1]],
+        initial_mean=[1.0, 0.0, -1.0],
+        initial_cov=np.eye(3),
+    )
+    record = (np.array([0.7]), np.array([0, 4]), np.array([[0.9], [0.2]]), np.zeros((0, 0)), 0.0, 0)
+    slopes = []
+    for limit in (lowering.MAX_EXPRESSIONS, 0):
+        monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", limit)
+        gradient = psf.EKF().compile_gradient(system).function
+        slopes.append(gradient(*record, np.ones(2)))
+    assert slopes[0] != 0.0
+    np.testing.assert_allclose(*slopes, rtol=1e-12)
