@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmarks.peers.serve import every_step, record, serve
 
-import jax  # isort: skip  # after serve, which sets its options
-import jax.numpy as jnp
+import jax.numpy as jnp  # isort: skip  # after serve, which sets its options
 from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
 
 from benchmarks.peers import jax_systems
@@ -56,22 +55,7 @@ def task(name: str, gradient: bool):
         loglik = result.marginal_loglik
         return (loglik if loglik.ndim == 0 else loglik[-1]) + offset
 
-    def make():
-        if not gradient:
-            run = jax.jit(value)
-            return lambda seed: run(theta).block_until_ready()
-        run = jax.jit(jax.value_and_grad(value))
-        return lambda seed: jax.block_until_ready(run(theta))[0]
-
-    return make
+    return lambda: jax_systems.call_of(value, theta, gradient)
 
 
-serve(
-    {
-        f"{name}/{what}": task(name, what == "gradient")
-        for name in ("double_well", "mass_spring_damper")
-        for what in ("value", "gradient")
-    },
-    "dynamax",
-    "jax",
-)
+serve(jax_systems.tasks_of(task), "dynamax", "jax")

@@ -11,6 +11,8 @@ from benchmarks.peers.serve import record, serve
 import jax  # isort: skip  # after serve, which sets its options
 import jax.numpy as jnp
 
+from benchmarks.peers import jax_systems
+
 DT = 0.01
 # Steps unrolled at a time: the fastest of 1, 2, 4, 5, 10 and 20 for each task.
 UNROLL = {
@@ -88,20 +90,9 @@ def task(name: str, gradient: bool):
             def value(theta):
                 return mass_spring_damper(theta, gaps, observed[:, 0], inputs, unroll)
 
-        if not gradient:
-            run = jax.jit(value)
-            return lambda seed: run(theta).block_until_ready()
-        run = jax.jit(jax.value_and_grad(value))
-        return lambda seed: jax.block_until_ready(run(theta))[0]
+        return jax_systems.call_of(value, theta, gradient)
 
     return make
 
 
-serve(
-    {
-        f"{name}/{what}": task(name, what == "gradient")
-        for name in ("double_well", "mass_spring_damper")
-        for what in ("value", "gradient")
-    },
-    "jax",
-)
+serve(jax_systems.tasks_of(task), "jax")

@@ -1,8 +1,28 @@
-"""One step of the systems as functions of a state vector, for the packages that run on JAX."""
+"""What the packages that run on JAX share: the systems' steps, jitted calls, names of tasks."""
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 
 DT = 0.01
+
+
+def call_of(value: Callable, theta, gradient: bool) -> Callable:
+    """The value at theta, or value and gradient, jitted; the seed is not used."""
+    run = jax.jit(jax.value_and_grad(value) if gradient else value)
+    if gradient:
+        return lambda seed: jax.block_until_ready(run(theta))[0]
+    return lambda seed: run(theta).block_until_ready()
+
+
+def tasks_of(task: Callable) -> dict[str, Callable]:
+    """``task(name, gradient)`` of both systems, by the names that the benchmark asks for."""
+    return {
+        f"{name}/{what}": task(name, what == "gradient")
+        for name in ("double_well", "mass_spring_damper")
+        for what in ("value", "gradient")
+    }
 
 
 def double_well_step(theta, x):

@@ -13,11 +13,11 @@ from pymc_statespace_filters.filters._failures import (
     NO_FINITE_MEMBER,
     NONE,
 )
+from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.filters._recursion import (
     Recursion,
     compile_value,
     compiled_of,
-    is_missing,
 )
 from pymc_statespace_filters.lowering import (
     LANES,

@@ -5,23 +5,22 @@ become vector code: exp takes two thirds of the time of that one, log as well. I
 the relative error is below 1e-15. The polynomial of log is that of fdlibm (Sun Microsystems, 1993).
 """
 
-import numpy as np
-
 from pymc_statespace_filters.filters._compile import pasted
+from pymc_statespace_filters.lowering.exponentials import (
+    EXPONENT_BITS,
+    LN2_HIGH,
+    LN2_LOW,
+    LOG2_E,
+    MANTISSA,
+    ONE_OVER_SQRT_HALF,
+    SQRT_HALF,
+    TWO_52,
+    TWO_52_BIASED,
+)
 from pymc_statespace_filters.lowering.instructions import ROUND, bits_of, float_of, polynomial
 from pymc_statespace_filters.lowering.trigonometry import COS, SIN
 
-_LN2_HIGH = 6.93147180369123816490e-01  # 32 bits, so that its product with a small integer is exact
-_LN2_LOW = 1.90821492927058770002e-10
-_LOG2_E = 1.4426950408889634
 _HALF_PI = 1.5707963267948966
-
-_MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
-_EXPONENT_BITS = np.uint64(52)
-_SQRT_HALF = np.uint64(0x3FE6A09E667F3BCD)
-_ONE_OVER_SQRT_HALF = np.uint64(0x3FF0000000000000 - 0x3FE6A09E667F3BCD)
-_TWO_52 = np.uint64(0x4330000000000000)  # the bits of 2.0**52: or-ing an integer in adds it
-_TWO_52_BIASED = 4503599627370496.0 + 1023.0
 
 EXP_LOWEST = -708.0
 
@@ -30,9 +29,9 @@ EXP_LOWEST = -708.0
 def exp(x):
     """exp(x) for x <= 0; below -708, and for NaN, about 3e-308."""
     x = x if x > EXP_LOWEST else EXP_LOWEST
-    shifted = x * _LOG2_E + ROUND
+    shifted = x * LOG2_E + ROUND
     k = shifted - ROUND
-    r = (x - k * _LN2_HIGH) - k * _LN2_LOW  # |r| <= ln(2) / 2
+    r = (x - k * LN2_HIGH) - k * LN2_LOW  # |r| <= ln(2) / 2
     p = 1.0 / 479001600.0  # Taylor to r**12: truncation 2e-16
     p = p * r + 1.0 / 39916800.0
     p = p * r + 1.0 / 3628800.0
@@ -46,15 +45,15 @@ def exp(x):
     p = p * r + 0.5
     p = p * r + 1.0
     p = p * r + 1.0
-    return float_of(bits_of(p) + (bits_of(shifted) << _EXPONENT_BITS))
+    return float_of(bits_of(p) + (bits_of(shifted) << EXPONENT_BITS))
 
 
 @pasted
 def log(x):
     """log(x) for positive, normal, finite x."""
-    bits = bits_of(x) + _ONE_OVER_SQRT_HALF
-    k = float_of((bits >> _EXPONENT_BITS) | _TWO_52) - _TWO_52_BIASED
-    f = float_of((bits & _MANTISSA) + _SQRT_HALF) - 1.0  # x = 2**k (1 + f), |f| < 0.42
+    bits = bits_of(x) + ONE_OVER_SQRT_HALF
+    k = float_of((bits >> EXPONENT_BITS) | TWO_52) - TWO_52_BIASED
+    f = float_of((bits & MANTISSA) + SQRT_HALF) - 1.0  # x = 2**k (1 + f), |f| < 0.42
     s = f / (2.0 + f)
     z = s * s
     p = 1.479819860511658591e-01
@@ -65,8 +64,8 @@ def log(x):
     p = p * z + 3.999999999940941908e-01
     p = p * z + 6.666666666666735130e-01
     half_square = 0.5 * f * f
-    tail = s * (half_square + p * z) + k * _LN2_LOW
-    return k * _LN2_HIGH - ((half_square - tail) - f)
+    tail = s * (half_square + p * z) + k * LN2_LOW
+    return k * LN2_HIGH - ((half_square - tail) - f)
 
 
 @pasted

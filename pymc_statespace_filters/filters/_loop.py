@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._failures import NONE
+from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.filters._noise import (
     NoiseSizes,
     initial_normals,
@@ -29,14 +29,6 @@ _ARGUMENTS = (
 )  # fmt: skip
 
 _N_LEADING = 6  # number of members and five of `NoiseSizes`
-
-
-@pasted
-def _nothing_seen(d):
-    for value in d:
-        if not np.isnan(value):
-            return False
-    return True
 
 
 def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: int) -> Entry:
@@ -86,11 +78,12 @@ def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: i
             while k < at[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), sizes.width, X)
                 k += 1
-            d = record[j]
-            if _nothing_seen(d):
+            if is_missing(record, j):
                 out[j] = 0.0
                 continue
-            increment, n_effective, failure = update(system, j, k, t0 + k * dt, d, noise, X, work)
+            increment, n_effective, failure = update(
+                system, j, k, t0 + k * dt, record[j], noise, X, work
+            )
             state[0] = min(state[0], n_effective)
             if failure != NONE:
                 state[1], state[2] = failure, j

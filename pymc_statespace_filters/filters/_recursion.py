@@ -15,6 +15,7 @@ from pymc_statespace_filters.filters._failures import (
     NO_FINITE_MEMBER,
     NONE,
 )
+from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.lowering import (
     Compiled,
     Graph,
@@ -89,15 +90,6 @@ def _tape(size: int) -> _Tape:
         return terms, health, tape[: row if health[1] == NONE else 0]
 
     return _Tape(jit(new), jit(save), jit(result))
-
-
-@jit
-def is_missing(observed, j):
-    """Whether nothing was seen at observation j."""
-    for i in range(observed.shape[1]):
-        if not np.isnan(observed[j, i]):
-            return False
-    return True
 
 
 def compile_value(recursion: Recursion) -> Compiled:

@@ -9,11 +9,11 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.filters._recursion import (
     Recursion,
     compile_taped,
     compiled_of,
-    is_missing,
 )
 from pymc_statespace_filters.lowering import Compiled, Graph, VectorFunction, vector_functions
 

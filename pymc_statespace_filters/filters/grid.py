@@ -25,6 +25,7 @@ from pymc_statespace_filters.filters._failures import (
     OUT_OF_MEMORY,
     ZERO_WEIGHTS,
 )
+from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.filters._one_state import move_points, read_one_state
 from pymc_statespace_filters.filters._point_mass import (
     REFINEMENT,
@@ -234,15 +235,6 @@ def _first_spacing(system, t0, n_steps, tolerance):
 
 
 @pasted
-def _nothing_seen(d):
-    """Whether every component is missing."""
-    for value in d:
-        if not np.isnan(value):
-            return False
-    return True
-
-
-@pasted
 def _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms):
     """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
     k = np.int64(0)
@@ -259,7 +251,7 @@ def _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms):
             k += 1
         if code != NONE:
             return code, j
-        if _nothing_seen(observed[j]):
+        if is_missing(observed, j):
             terms[j] = 0.0
             continue
         t = t0 + k * system.dt

@@ -22,11 +22,11 @@ from pymc_statespace_filters.lowering.instructions import (
     sign_bit,
 )
 
-_LOG2_E, _LOG2_E_LOW = 1.4426950408889634, 2.0355273740931033e-17
+LOG2_E, _LOG2_E_LOW = 1.4426950408889634, 2.0355273740931033e-17
 _LOG10_E, _LOG10_E_LOW = 0.4342944819032518, 1.098319650216765e-17
 _LN2, _LN2_REST = 0.6931471805599453, 2.3190468138462996e-17
 # Short enough that the product with an exponent is exact.
-_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LOG10_2_HIGH, _LOG10_2_LOW = 0.301029995663157, 8.241712586023572e-13
 _THIRD, _THIRD_LOW = 0.3333333333333333, 1.850371707708594e-17
 
@@ -34,12 +34,12 @@ _SMALLEST_NORMAL = 2.2250738585072014e-308
 _TWO_54 = 2.0**54
 _TINY = 2.0**-54  # below it, expm1(x) and log1p(x) are x
 _BEYOND = 1000.0  # exp of it overflows, exp of minus it underflows
-_MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
-_EXPONENT_BITS = np.uint64(52)
-_SQRT_HALF = np.uint64(0x3FE6A09E667F3BCD)
-_ONE_OVER_SQRT_HALF = np.uint64(0x3FF0000000000000 - 0x3FE6A09E667F3BCD)
-_TWO_52 = np.uint64(0x4330000000000000)  # the bits of 2.0**52: or-ing an integer in adds it
-_TWO_52_BIASED = 4503599627370496.0 + 1023.0
+MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
+EXPONENT_BITS = np.uint64(52)
+SQRT_HALF = np.uint64(0x3FE6A09E667F3BCD)
+ONE_OVER_SQRT_HALF = np.uint64(0x3FF0000000000000 - 0x3FE6A09E667F3BCD)
+TWO_52 = np.uint64(0x4330000000000000)  # the bits of 2.0**52: or-ing an integer in adds it
+TWO_52_BIASED = 4503599627370496.0 + 1023.0
 
 # (exp(r) - 1 - r) / r**2 for |r| <= ln(2) / 2
 _EXP = (
@@ -66,7 +66,7 @@ _ARCTANH = (
 @inlined
 def _halved(x):
     """(k, r) with x = k ln(2) + r, |r| <= ln(2) / 2."""
-    k = fma(x, _LOG2_E, ROUND) - ROUND
+    k = fma(x, LOG2_E, ROUND) - ROUND
     return k, fma(-k, _LN2_REST, fma(-k, _LN2, x))
 
 
@@ -131,9 +131,9 @@ def _split(x):
     """(k, f) of a positive finite x, subnormal ones included."""
     tiny = x < _SMALLEST_NORMAL
     enlarged = x * _TWO_54
-    bits = bits_of(enlarged if tiny else x) + _ONE_OVER_SQRT_HALF
-    k = float_of((bits >> _EXPONENT_BITS) | _TWO_52) - _TWO_52_BIASED
-    f = float_of((bits & _MANTISSA) + _SQRT_HALF) - 1.0
+    bits = bits_of(enlarged if tiny else x) + ONE_OVER_SQRT_HALF
+    k = float_of((bits >> EXPONENT_BITS) | TWO_52) - TWO_52_BIASED
+    f = float_of((bits & MANTISSA) + SQRT_HALF) - 1.0
     lower = k - 54.0
     return lower if tiny else k, f
 
@@ -169,7 +169,7 @@ def log(x):
     """The natural logarithm, to 0.7 ulp."""
     k, f = _split(x)
     high, low = _log_parts(f)
-    return _log_domain(x, _sum(k * _LN2_HIGH, high, fma(k, _LN2_LOW, low)))
+    return _log_domain(x, _sum(k * LN2_HIGH, high, fma(k, LN2_LOW, low)))
 
 
 @inlined
@@ -180,7 +180,7 @@ def log1p(x):
     lost = (1.0 - (y - rounded_x)) + (x - rounded_x)
     k, f = _split(y)
     high, low = _log_parts(f)
-    result = _sum(k * _LN2_HIGH, high, fma(k, _LN2_LOW, low) + lost / y)
+    result = _sum(k * LN2_HIGH, high, fma(k, LN2_LOW, low) + lost / y)
     return x if abs(x) < _TINY else _log_domain(y, result)
 
 
@@ -197,7 +197,7 @@ def _log_in_base(x, step, step_low, unit, unit_low):
 @inlined
 def log2(x):
     """The logarithm to base 2, to 0.7 ulp."""
-    return _log_in_base(x, 1.0, 0.0, _LOG2_E, _LOG2_E_LOW)
+    return _log_in_base(x, 1.0, 0.0, LOG2_E, _LOG2_E_LOW)
 
 
 @inlined
@@ -232,9 +232,9 @@ def _long_log(x):
     half = s + t
     half_low = ((s - half) + t) + (t_low + s_low)
     # log(x) = k ln(2) + 2 arctanh(s)
-    steps = k * _LN2_HIGH
+    steps = k * LN2_HIGH
     total = steps + 2.0 * half
-    total_low = ((steps - total) + 2.0 * half) + fma(k, _LN2_LOW, 2.0 * half_low)
+    total_low = ((steps - total) + 2.0 * half) + fma(k, LN2_LOW, 2.0 * half_low)
     high = total + total_low
     return high, (total - high) + total_low
 
@@ -252,7 +252,7 @@ def power(x, y):
     rest = rest if abs(exponent) < _BEYOND else 0.0
     exponent = _BEYOND if exponent > _BEYOND else exponent
     exponent = -_BEYOND if exponent < -_BEYOND else exponent
-    k = fma(exponent, _LOG2_E, ROUND) - ROUND
+    k = fma(exponent, LOG2_E, ROUND) - ROUND
     long_r, long_rest = fma(-k, _LN2, exponent), fma(-k, _LN2_REST, rest)
     r = long_r + long_rest
     r_low = (long_r - r) + long_rest

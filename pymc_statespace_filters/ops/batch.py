@@ -1,13 +1,11 @@
 """Many parameter points and one record: one operation, where a filter moves them side by side."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import pytensor.tensor as pt
-from pytensor.gradient import DisconnectedType, grad_not_implemented
+from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.replace import _vectorize_node
-from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 from pytensor.tensor.blockwise import Blockwise
 
 from pymc_statespace_filters.lowering import Compiled
@@ -17,10 +15,7 @@ from pymc_statespace_filters.ops.record import (
     HEALTH_SIZE,
     RECORD_INPUTS,
     RecordOp,
-    cache_key,
-    check_observed,
-    check_record,
-    kernel,
+    by_theta_alone,
 )
 
 
@@ -53,11 +48,7 @@ class BatchLogLikelihood(RecordOp):
         if not isinstance(cotangents[0].type, DisconnectedType):
             gradient = Blockwise(LogLikelihoodGradient(self.system, self.filter))
             theta_bar = gradient(*inputs, cotangents[0])
-        data_bars = [
-            grad_not_implemented(self, i, variable, "only parameters have a gradient")
-            for i, variable in enumerate(inputs[1:], start=1)
-        ]
-        return [theta_bar, *data_bars]
+        return by_theta_alone(self, inputs, theta_bar)
 
 
 def has_batch(op: LogLikelihood) -> bool:
@@ -89,25 +80,3 @@ def vectorized(op: LogLikelihood, theta: Variable, *record: Variable) -> list[Va
 @_vectorize_node.register(LogLikelihood)
 def _vectorize(op: LogLikelihood, node: Apply, *inputs: Variable) -> list[Variable]:
     return vectorized(op, *inputs)
-
-
-@register_funcify_and_cache_key(BatchLogLikelihood)
-def _numba_batch(op: BatchLogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
-    compiled = kernel(op)
-    run = compiled.function
-    check, check_rows = check_record(op.system), check_observed(op.system)
-
-    @numba_njit
-    def batch_log_likelihood(theta, steps, observed, inputs, t0, seed):
-        check(steps, inputs)
-        check_rows(steps, observed)
-        return run(
-            theta.copy(),
-            steps.copy(),
-            observed.copy(),
-            inputs.copy(),
-            t0.item(),
-            seed.item(),
-        )
-
-    return batch_log_likelihood, cache_key(op.system, compiled)

@@ -1,25 +1,16 @@
 """The log-likelihood of a record as a PyTensor operation."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
-import numpy as np
 import pytensor.tensor as pt
-from pytensor.gradient import DisconnectedType, grad_not_implemented
+from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
-from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
 from pymc_statespace_filters.errors import GradientUnavailableError
 from pymc_statespace_filters.lowering import Compiled
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.record import (
-    HEALTH_SIZE,
-    RecordOp,
-    cache_key,
-    check_observed,
-    check_record,
-    kernel,
-)
+from pymc_statespace_filters.ops.record import HEALTH_SIZE, RecordOp, by_theta_alone
 
 
 class LogLikelihood(RecordOp):
@@ -31,6 +22,7 @@ class LogLikelihood(RecordOp):
     """
 
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
+    handed_as: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
 
     def compile(self) -> Compiled:
         """The filter's machine code."""
@@ -63,36 +55,4 @@ class LogLikelihood(RecordOp):
             theta_bar = pt.zeros_like(inputs[0])
         else:
             theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
-        data_bars = [
-            grad_not_implemented(self, i, variable, "only parameters have a gradient")
-            for i, variable in enumerate(inputs[1:], start=1)
-        ]
-        return [theta_bar, *data_bars]
-
-
-# Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
-# combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
-
-
-@register_funcify_and_cache_key(LogLikelihood)
-def _numba_log_likelihood(op: LogLikelihood, node: Apply | None = None, **kwargs: Any) -> tuple:
-    compiled = kernel(op)
-    run = compiled.function
-    check, check_rows = check_record(op.system), check_observed(op.system)
-
-    no_normals = np.empty(0)
-
-    @numba_njit
-    def log_likelihood(theta, steps, observed, inputs, t0, seed):
-        check(steps, inputs)
-        check_rows(steps, observed)
-        return run(
-            theta.copy(),
-            steps.copy(),
-            observed.copy(),
-            inputs.copy(),
-            t0.item(),
-            (seed.item(), no_normals.copy()),
-        )
-
-    return log_likelihood, cache_key(op.system, compiled)
+        return by_theta_alone(self, inputs, theta_bar)

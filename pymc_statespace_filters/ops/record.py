@@ -5,15 +5,17 @@ Nothing that matters is closed over, so that neither merging of equal nodes nor 
 machine code on disk can mix two data sets up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
+from pytensor.gradient import grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
+from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import Filter
@@ -37,6 +39,9 @@ class RecordOp(Op):
 
     __props__ = ("system", "filter")
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
+    checks_record: ClassVar[bool] = True
+    # How an input is written in the call of the kernel, where not as a number or a copy.
+    handed_as: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.system = system
@@ -139,3 +144,54 @@ def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
 def kernel(op: RecordOp) -> Compiled:
     """The machine code of an operation, compiled once."""
     return op.compile()
+
+
+class ThetaDerivative(RecordOp):
+    """An operation whose result is a cotangent of theta."""
+
+    def results(self) -> list[Variable]:
+        """The derivative by theta."""
+        return [pt.dvector()]
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """The shape of theta."""
+        return [input_shapes[0]]
+
+
+def by_theta_alone(op: Op, inputs: Sequence[Variable], theta_bar: Variable) -> list[Variable]:
+    """Cotangents of all inputs, of which theta's is known and the record has none."""
+    data_bars = [
+        grad_not_implemented(op, i, variable, "only parameters have a gradient")
+        for i, variable in enumerate(inputs[1:], start=1)
+    ]
+    return [theta_bar, *data_bars]
+
+
+@register_funcify_and_cache_key(RecordOp)
+def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
+    """Check the record, then call the kernel.
+
+    Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
+    combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
+    The function is written out for each operation; one that looped over its inputs would cost time
+    in every call and seconds of compilation.
+    """
+    compiled = kernel(op)
+    names = [name for name, _, _ in op.input_types]
+    handed = [
+        op.handed_as.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
+        for name, _, ndim in op.input_types
+    ]
+    checks = ["check(steps, inputs)", "check_observed(steps, observed)"] * op.checks_record
+    lines = [*checks, f"return run({', '.join(handed)})"]
+    source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
+    namespace = {
+        "np": np,
+        "run": compiled.function,
+        "check": check_record(op.system),
+        "check_observed": check_observed(op.system),
+        "no_normals": np.empty(0),
+    }
+    exec(compile(source, f"<call of {op}>", "exec"), namespace)
+    key = cache_key(op.system, compiled)
+    return numba_njit(namespace["call"]), None if key is None else key_of(source, key)
