@@ -2,6 +2,7 @@
 
 from pymc_statespace_filters.distribution import StateSpace
 from pymc_statespace_filters.errors import (
+    CheckpointWarning,
     DataMismatchError,
     EvidenceWarning,
     FilterWarning,
@@ -29,6 +30,7 @@ __all__ = [
     "DRAM",
     "EKF",
     "BootstrapPF",
+    "CheckpointWarning",
     "DataMismatchError",
     "DimensionCorrection",
     "EnKF",

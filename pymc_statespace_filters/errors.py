@@ -36,3 +36,7 @@ class FilterWarning(UserWarning):
 
 class EvidenceWarning(UserWarning):
     """An evidence estimate is less certain than its number looks."""
+
+
+class CheckpointWarning(UserWarning):
+    """A part of a checkpoint is damaged; the chain goes on from what stands before it."""
