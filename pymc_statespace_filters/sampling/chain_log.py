@@ -123,7 +123,10 @@ class ChainLog:
         new_draws, new_state = _plain(draws), _plain(state)
         contents = json.dumps({"draws": _contents(new_draws), "state": _contents(new_state)})
         arrays = [*new_draws.values(), *new_state.values()]
-        pieces: list[Any] = [contents.encode(), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
+        pieces: list[Any] = [
+            contents.encode(),
+            *(array.reshape(-1).view(np.uint8).data for array in arrays),
+        ]
         head = _HEAD.pack(_MARK, sum(map(len, pieces)), len(pieces[0]))
         checksum = _checksum(self._tip.checksum, head, *pieces)
         try:
