@@ -102,8 +102,9 @@ class ChainLog:
     def append(self, draws: Arrays, state: Arrays) -> None:
         """Write one record; when this returns, it is on the disk.
 
-        The cost is that of the new draws and the state alone. A record that could not be written
-        is taken back.
+        The cost is that of the new draws and the state alone; most of it is spent without Python's
+        lock. Until it returns nobody may change the arrays, which are not copied. A record that
+        could not be written is taken back.
 
         Parameters
         ----------

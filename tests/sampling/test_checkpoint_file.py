@@ -17,6 +17,7 @@ from pymc_statespace_filters.sampling.chain_log import ChainLog
 from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.folder_lock import FolderLock, _host, _name, _Owner, _owner
 
+PROC = Path("/proc/self/stat")  # where the system tells when a process began
 ASKED = {"draws": 1000, "chains": 2, "model": "5f2c", "stages": [2, 1], "step": None}
 
 
@@ -333,7 +334,7 @@ def test_a_living_process_keeps_others_out_and_a_killed_one_does_not(tmp_path):
             assert len(list(tmp_path.iterdir())) == 1
         finally:
             process.kill()
-        if hasattr(os, "waitid"):  # dead, and not yet buried
+        if PROC.exists():  # dead, and not yet buried
             os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
             FolderLock(tmp_path).release()
             assert not list(tmp_path.iterdir())
@@ -342,7 +343,7 @@ def test_a_living_process_keeps_others_out_and_a_killed_one_does_not(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="nothing tells when it began")
+@pytest.mark.skipif(not PROC.exists(), reason="nothing tells when it began")
 def test_a_process_that_has_the_number_of_a_dead_one_is_not_it(tmp_path):
     (tmp_path / _name(_Owner(_host(), os.getppid(), 1))).touch()
     (tmp_path / _name(_Owner(_host(), os.getpid(), 1))).touch()
