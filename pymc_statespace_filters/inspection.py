@@ -1,7 +1,7 @@
 """What samplers, evidence and diagnostics need to know of the state-space variables in a model."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import pymc as pm
 import pytensor.tensor as pt
@@ -19,9 +19,11 @@ from pymc_statespace_filters.random_variable import StateSpaceRV
 __all__ = [
     "COLLAPSED",
     "FAILURES",
+    "MovedNoise",
     "exactness",
     "health_outputs",
     "hold_noise",
+    "move_noise",
     "noise_seeds",
 ]
 
@@ -76,6 +78,65 @@ def hold_noise(
             outputs = LogLikelihoodOfNoise(system, filter)(*arguments, stored)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     return clone_replace(list(graphs), replaced), normals
+
+
+class MovedNoise(NamedTuple):
+    """The symbols of `move_noise`; one entry a noisy variable in each tuple, in the same order.
+
+    Attributes
+    ----------
+    correlation : TensorVariable
+        Input, from 0 to 1: that of the moved normals with the present ones.
+    normals : tuple of TensorVariable
+        Inputs: the present normals, finite, ``sizes`` of them.
+    moved : tuple of TensorVariable
+        The moved normals, to be kept if the move is accepted.
+    sizes : tuple of TensorVariable
+        How many normals there are, from the steps of the record alone.
+    """
+
+    correlation: TensorVariable
+    normals: tuple[TensorVariable, ...]
+    moved: tuple[TensorVariable, ...]
+    sizes: tuple[TensorVariable, ...]
+
+
+def move_noise(
+    graphs: Sequence[Variable], seeds: Mapping[str, SharedVariable]
+) -> tuple[list[Variable], MovedNoise]:
+    """Graphs whose noise is moved from given normals instead of made from a seed.
+
+    Normals u become rho u + sqrt(1 - rho^2) v, where v are fresh ones, those of the seed; they are
+    standard normals again (Deligiannidis, Doucet and Pitt 2018). Filters are replaced by their
+    smooth versions, for which a small move of the normals is a small move of the estimate. With
+    rho = 0 the estimate is that of the seed.
+
+    Raises
+    ------
+    ModelError
+        If a filter has no smooth version for its system.
+    """
+    correlation = pt.dscalar("correlation")
+    innovation = pt.sqrt(1.0 - correlation**2)
+    replaced: dict[Variable, Variable] = {}
+    noises: list[tuple[TensorVariable, TensorVariable, TensorVariable]] = []
+    names = {seed: name for name, seed in seeds.items()}
+    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
+        if isinstance(node.op, LogLikelihood) and node.inputs[-1] in names:
+            *arguments, seed = node.inputs
+            system, noisy, steps = node.op.system, node.op.filter, arguments[1]
+            filter: Any = noisy.smooth()  # type: ignore[union-attr]
+            filter.check(system)
+            normals = pt.dvector(f"{names[seed]}_normals")
+            fresh = StoredNoise(system, filter)(steps, seed)
+            moved = correlation * normals + innovation * fresh
+            # The sum of one element, or of none: the last step of an empty record is 0.
+            size = filter.n_normals(system, pt.sum(steps[-1:]), steps.shape[0])
+            outputs = LogLikelihoodOfNoise(system, filter)(*arguments, moved)
+            replaced |= dict(zip(node.outputs, outputs, strict=True))
+            noises.append((normals, moved, size))
+    columns = zip(*noises, strict=True) if noises else ((), (), ())
+    return clone_replace(list(graphs), replaced), MovedNoise(correlation, *columns)
 
 
 def exactness(model: pm.Model) -> bool:

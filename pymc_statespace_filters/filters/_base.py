@@ -65,6 +65,16 @@ class EnsembleFilter:
         """Return the filter that treats this system: itself, unless nothing is to be nudged."""
         return self
 
+    def smooth(self) -> "EnsembleFilter":
+        """Return this filter with an estimate that changes little when its normals do."""
+        return self
+
+    def n_normals(self, system: StateSpaceModel, n_steps: Any, n_observations: Any) -> Any:
+        """How many normals an evaluation stores; of numbers a number, of symbols an expression."""
+        machine = ensemble_machine(system)
+        sizes = self.algorithm(machine).noise_sizes(machine)
+        return n_stored.py_func(sizes, n_steps, n_observations)
+
     def noise_sizes(self, machine: Machine) -> NoiseSizes:
         """Return how many normals the filter takes where."""
         simulated = machine.r if self.simulates else 0

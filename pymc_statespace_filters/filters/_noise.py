@@ -57,14 +57,9 @@ def noise_of(seed, stored, sizes, n_steps):
 
 @pasted
 def n_stored(sizes, n_steps, n_observations):
-    """How many normals an evaluation stores."""
-    return _observation_place(sizes, n_steps, n_observations)
-
-
-@pasted
-def _observation_place(sizes, n_steps, j):
-    before = (sizes.initial + n_steps * sizes.process) * sizes.width
-    return before + j * (sizes.observation * sizes.width + sizes.resampling)
+    """How many normals an evaluation stores; those of one more observation begin there."""
+    of_states = (sizes.initial + n_steps * sizes.process) * sizes.width
+    return of_states + n_observations * (sizes.observation * sizes.width + sizes.resampling)
 
 
 @pasted
@@ -96,7 +91,7 @@ def process_normals(noise, k):
 def observation_normals(noise, j, k):
     """Address of the normals of the simulated observation j, at step k."""
     sizes = noise.sizes
-    place = _observation_place(sizes, noise.n_steps, j)
+    place = n_stored(sizes, noise.n_steps, j)
     return _normals(noise, np.int64(OBSERVATION), k, place, sizes.observation, sizes.width)
 
 
@@ -105,7 +100,7 @@ def resampling_normals(noise, j, k):
     """Normals of a resampling after observation j, at step k, a vector."""
     sizes = noise.sizes
     if noise.stored.size > 0:
-        place = _observation_place(sizes, noise.n_steps, j) + sizes.observation * sizes.width
+        place = n_stored(sizes, noise.n_steps, j) + sizes.observation * sizes.width
         return noise.stored[place : place + sizes.resampling]
     _fill(
         noise.seed, np.int64(RESAMPLING), k, noise.buffer.ctypes.data, np.int64(1), sizes.resampling

@@ -1,7 +1,9 @@
 """Resampling: draw N ancestors in proportion to the weights (thesis, section 4.4.1), in O(N).
 
-Both schemes are a set of N increasing points in (0, 1) and the same walk along the cumulative
-weights.
+Every scheme is a set of N increasing points in (0, 1) and a walk along the cumulative weights. In
+"sorted" the points are the systematic ones and the walk goes from neighbour to neighbour
+(`_order`), so that normals and particles that move little are resampled almost alike, and stand in
+that order afterwards (Deligiannidis, Doucet and Pitt 2018; Gerber and Chopin 2015).
 
 Differences from the source: the thesis copies particle n when v_n <= u < v_{n+1}, an interval that
 belongs to particle n + 1; here it is v_{n-1} <= u < v_n with v_0 = 0. It also draws N + 1 times;
@@ -13,7 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._order import (
+    MOST_STATES,
+    OrderWork,
+    order_particles,
+    order_workspace,
+)
 from pymc_statespace_filters.filters._random import exponential, padded, uniform
 
 
@@ -39,28 +48,34 @@ def multinomial(z, points):
         points[i] /= points[n]
 
 
-POINTS = {"systematic": systematic, "multinomial": multinomial}
+POINTS = {"systematic": systematic, "multinomial": multinomial, "sorted": systematic}
 SCHEMES = tuple(POINTS)
-_SYSTEMATIC = SCHEMES.index("systematic")
+_MULTINOMIAL, _SORTED = SCHEMES.index("multinomial"), SCHEMES.index("sorted")
 
 
 class Resampling(NamedTuple):
     """When and how to resample, and scratch for it."""
 
     threshold: float
-    systematic: bool
+    multinomial: bool
+    in_order: bool
     always: bool
     points: np.ndarray
     ancestors: np.ndarray
+    order_work: OrderWork
+    w_ordered: np.ndarray
 
 
 @pasted
-def resampler(fraction, scheme, n_particles):
+def resampler(fraction, scheme, n_states, n_particles):
     """Resample below this fraction of the particles, by the scheme of this number."""
     points, ancestors = np.empty(n_particles + 1), np.empty(n_particles, np.int64)
+    in_order = scheme == _SORTED
+    n_ordered = n_particles if in_order else 0
     return Resampling(
-        fraction * n_particles, scheme == _SYSTEMATIC, fraction == 1.0, points, ancestors
-    )
+        fraction * n_particles, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
+        points, ancestors, order_workspace(n_states, n_ordered), np.empty(n_ordered),
+    )  # fmt: skip
 
 
 @pasted
@@ -72,11 +87,15 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
     if not (resampling.always or n_effective < resampling.threshold):
         return
     points, ancestors, N = resampling.points, resampling.ancestors, w.size
-    if resampling.systematic:
-        systematic(z, points)
-    else:
+    if resampling.multinomial:
         multinomial(z, points)
-    choose_ancestors(w, points, ancestors)
+    else:
+        systematic(z, points)
+    if resampling.in_order:
+        order = order_particles(w, X, resampling.order_work)
+        choose_in_order(w, order, points, resampling.w_ordered, ancestors)
+    else:
+        choose_ancestors(w, points, ancestors)
     copy_ancestors(ancestors, X, buffer)
     for i in range(N):
         log_w[i] = -math.log(N)
@@ -85,6 +104,15 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
 def n_normals(scheme: str, n_particles: int) -> int:
     """Normals that a scheme takes, a whole number of blocks."""
     return 2 * padded(n_particles + 1) if scheme == "multinomial" else padded(2)
+
+
+def check_sortable(scheme: str, n_states: int) -> None:
+    """Raise if the scheme orders particles and cannot order those of so many states."""
+    if scheme == "sorted" and n_states > MOST_STATES:
+        raise ModelError(
+            f"resampling='sorted' orders particles of at most {MOST_STATES} states, this system "
+            f"has {n_states}; take resampling='systematic'"
+        )
 
 
 @compiled
@@ -106,6 +134,16 @@ def choose_ancestors(w, points, ancestors):
             n += 1
             cumulative += w[n]
         ancestors[i] = n
+
+
+@compiled
+def choose_in_order(w, order, points, w_ordered, ancestors):
+    """Ancestor of each point on a walk along the particles in this order."""
+    for i in range(order.size):
+        w_ordered[i] = w[order[i]]
+    choose_ancestors(w_ordered, points, ancestors)
+    for i in range(ancestors.size):
+        ancestors[i] = order[ancestors[i]]
 
 
 @compiled

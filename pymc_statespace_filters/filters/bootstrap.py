@@ -1,7 +1,7 @@
 """Bootstrap particle filter (thesis, section 4.4, Eqs. 4.27-4.28, 4.43-4.44): the unbiased one."""
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import resampling_normals
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
+    check_sortable,
     n_normals,
     resample_if_few,
     resampler,
@@ -22,6 +23,7 @@ from pymc_statespace_filters.filters._resampling import (
 from pymc_statespace_filters.filters._system import log_density
 from pymc_statespace_filters.filters._weights import effective_number, normalise
 from pymc_statespace_filters.lowering import Entry
+from pymc_statespace_filters.model import StateSpaceModel
 
 
 @pasted
@@ -33,7 +35,7 @@ def _workspace(system, n_members, width, settings):
     alive = np.empty(N, np.bool_)
     return (
         (w, log_w, log_p, alive),
-        resampler(settings[0], np.int64(settings[1]), N),
+        resampler(settings[0], np.int64(settings[1]), system.n, N),
         np.empty((system.n, N)),
     )
 
@@ -70,14 +72,16 @@ class BootstrapPF(EnsembleFilter):
     resample_below : float
         Resample after an observation if the effective number of particles (Eq. 4.43) is below this
         fraction of N: 1 resamples at every observation, 0 never.
-    resampling : {"systematic", "multinomial"}
-        Scheme; "multinomial" is the thesis's, "systematic" has less noise.
+    resampling : {"systematic", "multinomial", "sorted"}
+        Scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is systematic
+        along particles in order, one state by its size, up to eight along a Hilbert curve: the
+        estimate then moves little when its normals do.
 
     Raises
     ------
     ModelError
         If ``n_particles`` is not an integer of at least 2, ``resample_below`` is not between 0 and
-        1, or ``resampling`` is not one of the two names.
+        1, or ``resampling`` is not one of the three names.
 
     Notes
     -----
@@ -110,6 +114,15 @@ class BootstrapPF(EnsembleFilter):
     def settings(self) -> tuple[float, ...]:
         """Return the threshold of resampling and the number of its scheme."""
         return self.resample_below, SCHEMES.index(self.resampling)
+
+    def check(self, system: StateSpaceModel) -> None:
+        """Raise if particles of so many states cannot be ordered and are to be."""
+        super().check(system)
+        check_sortable(self.resampling, system.n)
+
+    def smooth(self) -> EnsembleFilter:
+        """Return this filter with an estimate that changes little when its normals do."""
+        return replace(self, resampling="sorted")
 
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""

@@ -1,7 +1,7 @@
 """Particle filter with an ensemble Kalman proposal (thesis, section 4.4, Eqs. 4.29-4.44)."""
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals, resampling_normals
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
+    check_sortable,
     n_normals,
     resample_if_few,
     resampler,
@@ -76,7 +77,14 @@ def _workspace(system, n_members, width, settings):
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
     density = density_workspace(n_free, width)
     scratch = _Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
-    return likelihood, D, X_f, weights, scratch, resampler(settings[0], np.int64(settings[1]), N)
+    return (
+        likelihood,
+        D,
+        X_f,
+        weights,
+        scratch,
+        resampler(settings[0], np.int64(settings[1]), system.n, N),
+    )
 
 
 @pasted
@@ -181,8 +189,10 @@ class PFEnKF(EnsembleFilter):
     resample_below : float
         Resample after an observation if the effective number of particles (Eq. 4.43) is below this
         fraction of N: 1 resamples at every observation, 0 never.
-    resampling : {"systematic", "multinomial"}
-        Scheme; "multinomial" is the thesis's, "systematic" has less noise.
+    resampling : {"systematic", "multinomial", "sorted"}
+        Scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is systematic
+        along particles in order, one state by its size, up to eight along a Hilbert curve: the
+        estimate then moves little when its normals do.
     likelihood : {"predictive", "weights", "as_printed"}
         How p(d_j | d_1 .. d_{j-1}) is estimated. "predictive": previous weights on the forecast
         particles. "weights": log of the mean unnormalised weight. "as_printed": Eqs. 4.36 and 4.42
@@ -271,6 +281,15 @@ class PFEnKF(EnsembleFilter):
         """Return the threshold of resampling and the numbers of its scheme and the likelihood."""
         likelihood = _LIKELIHOODS.index(self.likelihood)
         return self.resample_below, SCHEMES.index(self.resampling), likelihood
+
+    def check(self, system: StateSpaceModel) -> None:
+        """Raise if particles of so many states cannot be ordered and are to be."""
+        super().check(system)
+        check_sortable(self.resampling, system.n)
+
+    def smooth(self) -> EnsembleFilter:
+        """Return this filter with an estimate that changes little when its normals do."""
+        return replace(self, resampling="sorted")
 
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""

@@ -57,7 +57,7 @@ def test_is_its_equations_written_in_numpy(resample_below):
         assert health == pytest.approx([smallest, 0, -1])
 
 
-@pytest.mark.parametrize("resampling", ["systematic", "multinomial"])
+@pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
 @pytest.mark.parametrize("resample_below", [0, 1 / 3, 1])
 def test_the_mean_of_the_likelihood_is_the_exact_one(resample_below, resampling):
     machine, steps, observed = SCALAR
@@ -66,7 +66,7 @@ def test_the_mean_of_the_likelihood_is_the_exact_one(resample_below, resampling)
     logs = np.array([run(filter_, machine, steps, observed, seed=s)[0].sum() for s in range(3000)])
     ratio = np.exp(logs - exact)
     assert logs.var() < 2
-    # 3.5 standard errors: one false alarm in 2000 seeds, six cases
+    # 3.5 standard errors: one false alarm in 2000 seeds, nine cases
     assert abs(ratio.mean() - 1) < 3.5 * ratio.std() / np.sqrt(ratio.size)
 
 
@@ -96,7 +96,8 @@ def test_threshold_must_be_a_fraction(resample_below):
 
 
 def test_unknown_resampling_lists_the_known_ones():
-    with pytest.raises(ModelError, match="must be one of 'systematic', 'multinomial', got 'none'"):
+    names = "'systematic', 'multinomial', 'sorted'"
+    with pytest.raises(ModelError, match=f"must be one of {names}, got 'none'"):
         BootstrapPF(10, resampling="none")
 
 
@@ -114,3 +115,39 @@ def test_stored_normals_serve_multinomial_resampling_too():
     by_seed, _ = run(filter_, machine, steps, observed, seed=7)
     by_normals, _ = run(filter_, machine, steps, observed, normals=stored)
     assert np.array_equal(by_seed, by_normals)
+
+
+def test_sorted_resampling_of_two_states_is_unbiased():
+    machine, steps, observed = OSCILLATOR
+    steps, observed = steps[:6], observed[:6]
+    filter_ = BootstrapPF(80, resample_below=1, resampling="sorted")
+    exact = kalman(machine, steps, observed).sum()
+    logs = np.array([run(filter_, machine, steps, observed, seed=s)[0].sum() for s in range(4000)])
+    ratio = np.exp(logs - exact)
+    assert 0.05 < logs.var() < 2
+    # 3.5 standard errors: one false alarm in 2000 seeds
+    assert abs(ratio.mean() - 1) < 3.5 * ratio.std() / np.sqrt(ratio.size)
+
+
+def moves(filter_, record, correlation, n_pairs):
+    """Variances of log L and of its difference to log L after the normals have moved."""
+    machine, steps, _ = record
+    stored = filter_.stored_normals(machine).function
+    at, logs = np.asarray(steps, np.int64), np.empty((n_pairs, 2))
+    for pair in range(n_pairs):
+        u, v = stored(at, 2 * pair), stored(at, 2 * pair + 1)
+        moved = correlation * u + np.sqrt(1 - correlation**2) * v
+        for i, z in enumerate((u, moved)):
+            logs[pair, i] = run(filter_, *record, normals=z)[0].sum()
+    return logs[:, 0].var(), np.diff(logs).var()
+
+
+@pytest.mark.parametrize(("record", "least"), [(SCALAR, 6), (OSCILLATOR, 1.5)])
+def test_sorted_resampling_is_smooth_in_the_normals(record, least):
+    """Variances of 200 differences: a ratio of two of them has a relative error of a seventh."""
+    sorted_, systematic = (
+        moves(BootstrapPF(200, resample_below=1, resampling=scheme), record, 0.9999, 200)
+        for scheme in ("sorted", "systematic")
+    )
+    assert least * sorted_[1] < systematic[1]
+    assert sorted_[0] == pytest.approx(systematic[0], rel=0.6)  # as noisy, but moving less

@@ -8,6 +8,7 @@ from pymc_statespace_filters.filters._random import RESAMPLING, fill_normals
 from pymc_statespace_filters.filters._resampling import (
     POINTS,
     choose_ancestors,
+    choose_in_order,
     copy_ancestors,
     multinomial,
     n_normals,
@@ -121,3 +122,16 @@ def test_columns_are_copied_from_their_ancestors():
     ancestors = np.array([0, 0, 3, 3, 5, 5])
     copy_ancestors(ancestors, X, np.empty_like(X))
     assert np.array_equal(X, original[:, ancestors])
+
+
+def test_on_a_walk_in_order_ancestors_are_those_of_the_sorted_particles():
+    rng = np.random.default_rng(8)
+    x, w = rng.standard_normal(40), rng.dirichlet(np.full(40, 0.3))
+    order = np.argsort(x)
+    points, out = np.empty(41), np.empty(40, dtype=np.int64)
+    systematic(normals_of("sorted", 40, 5, 0), points)
+    choose_in_order(w, order, points, np.empty(40), out)
+    cumulative = np.cumsum(w[order])
+    expected = order[np.searchsorted(cumulative, points[:40] * cumulative[-1], side="right")]
+    assert np.array_equal(out, expected)
+    assert np.all(np.diff(x[out]) >= 0)
