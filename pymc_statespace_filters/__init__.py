@@ -23,7 +23,7 @@ from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
 from pymc_statespace_filters.records import nearest_steps
-from pymc_statespace_filters.sampling import DRAM
+from pymc_statespace_filters.sampling import DRAM, suggest_particles
 from pymc_statespace_filters.simulation import simulate
 
 __all__ = [
@@ -54,4 +54,5 @@ __all__ = [
     "log_likelihood",
     "nearest_steps",
     "simulate",
+    "suggest_particles",
 ]

@@ -1,18 +1,20 @@
 """What samplers, evidence and diagnostics need to know of the state-space variables in a model."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import pymc as pm
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import COLLAPSED, FAILURES
+from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
+from pymc_statespace_filters.likelihood import check_kinds
 from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.random_variable import StateSpaceRV
 
@@ -25,6 +27,9 @@ __all__ = [
     "hold_noise",
     "move_noise",
     "noise_seeds",
+    "noisy_filters",
+    "resized",
+    "with_filter",
 ]
 
 
@@ -50,6 +55,18 @@ def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
             )
         seeds[name] = seed
     return seeds
+
+
+def noisy_filters(model: pm.Model) -> dict[str, Filter]:
+    """The filter of every variable whose likelihood is a random estimate."""
+    filters = {name: node.op.filter for name, node in _state_space_nodes(model).items()}
+    return {name: filter for name, filter in filters.items() if filter.noisy}
+
+
+def resized(filter: Filter, n_members: int) -> Filter:
+    """The same noisy filter with another number of members, the first of its settings."""
+    count: dict[str, Any] = {fields(filter)[0].name: n_members}
+    return replace(filter, **count)
 
 
 def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
@@ -137,6 +154,57 @@ def move_noise(
             noises.append((normals, moved, size))
     columns = zip(*noises, strict=True) if noises else ((), (), ())
     return clone_replace(list(graphs), replaced), MovedNoise(correlation, *columns)
+
+
+def with_filter(
+    graphs: Sequence[Variable], model: pm.Model, filters: Mapping[str, Filter]
+) -> list[Variable]:
+    """Graphs of a model's log-density in which some variables have another filter.
+
+    The mapping gives the new filters by the name of their variable. Data, parameters and seed stay:
+    a deterministic filter does not read the seed, and one that was put in the place of a
+    deterministic filter has that variable's constant seed.
+
+    Raises
+    ------
+    ModelError
+        If a name is not that of a StateSpace variable, its likelihood is not in the graphs, or the
+        filter cannot treat its system.
+    """
+    variables = _state_space_nodes(model)
+    for name, filter in filters.items():
+        if name not in variables:
+            raise ModelError(f"{name!r} is not a StateSpace variable: expected {list(variables)}")
+        check_kinds(variables[name].op.system, filter)
+    replaced: dict[Variable, Variable] = {}
+    found: set[str] = set()
+    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
+        if not isinstance(node.op, LogLikelihood):
+            continue
+        names = [name for name in variables if _is_likelihood_of(node, model, variables[name])]
+        found.update(names)
+        new = {filters.get(name, node.op.filter) for name in names}
+        if len(new) > 1:
+            raise ModelError(f"{', '.join(names)} cannot be told apart, they need one filter")
+        if names:
+            outputs = LogLikelihood(node.op.system, new.pop())(*node.inputs)
+            replaced |= dict(zip(node.outputs, outputs, strict=True))
+    if missing := [name for name in filters if name not in found]:
+        raise ModelError(f"the graphs hold no likelihood of {', '.join(missing)}")
+    return clone_replace(list(graphs), replaced)
+
+
+def _is_likelihood_of(node: Any, model: pm.Model, variable: Any) -> bool:
+    """Whether a likelihood is that of a variable: its system, filter, steps, data and seed."""
+    own = (variable.inputs[3], model.rvs_to_values[variable.outputs[1]], variable.inputs[-1])
+    theirs = (node.inputs[1], node.inputs[2], node.inputs[-1])
+    same_op = (node.op.system, node.op.filter) == (variable.op.system, variable.op.filter)
+    return same_op and all(map(_is_same, theirs, own))
+
+
+def _is_same(a: Variable, b: Variable) -> bool:
+    """Whether two inputs are one: PyMC merges equal constants."""
+    return a is b or (isinstance(a, Constant) and isinstance(b, Constant) and a.equals(b))
 
 
 def exactness(model: pm.Model) -> bool:

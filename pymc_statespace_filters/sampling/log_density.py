@@ -6,7 +6,7 @@ comes out of the same call, so that a failure has a reason and costs no second e
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pymc.model import Model
@@ -14,7 +14,7 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.inspection import health_outputs, hold_noise
+from pymc_statespace_filters.inspection import health_outputs, hold_noise, with_filter
 
 # Reason of a failure that no filter reports.
 NOT_A_NUMBER = -1
@@ -53,6 +53,8 @@ class LogDensity:
     holds_noise : bool
         Whether every evaluation is on the noise of the model's own seeds. Their normals are then
         made once, in `prepare`, and the seeds of a call are not read.
+    filters : mapping of str to filter, optional
+        Filters that stand in for those of the named StateSpace variables.
     compile_kwargs : dict, optional
         Passed to PyMC's compiler.
 
@@ -71,11 +73,12 @@ class LogDensity:
         compile_kwargs: dict | None = None,
         *,
         holds_noise: bool = False,
+        filters: Mapping[str, Any] | None = None,
     ):
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
-        logp = model.logp()
+        (logp,) = with_filter([model.logp()], model, filters or {})
         outputs = [logp, *health_outputs([logp])]
         noise_inputs = list(seed_inputs.values())
         self._make_normals = None

@@ -1,0 +1,166 @@
+"""suggest_particles on real models: the number it suggests does what it says."""
+
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy.optimize import minimize
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.sampling import particle_budget
+from pymc_statespace_filters.sampling.budget_search import Row
+from pymc_statespace_filters.sampling.held_variables import HeldVariables
+from pymc_statespace_filters.sampling.seed_spread import SeedSpread
+
+STEPS = np.arange(1, 61)
+LINEAR = psf.StateSpaceModel(
+    transition=lambda x, q, phi: [phi * x[0] + q[0]],
+    process_noise=lambda spread: [[spread**2]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.2]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+TRUTH = {"phi": 0.8, "spread": 0.7}
+DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=5)["observations"].to_numpy()
+
+
+def linear_model(filter):
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 0.5)
+        pm.HalfNormal("spread", 1.0)
+        psf.StateSpace("d", LINEAR, filter, steps=STEPS, observed=DATA)
+    return model
+
+
+def exact_mode():
+    """Parameters at the highest exact density on the unconstrained space."""
+    model = linear_model(psf.EKF())
+    point = model.initial_point()
+    held, logp = HeldVariables(model.value_vars, point), model.compile_logp()
+    best = minimize(lambda x: -logp(held.split(x)), held.join(point), method="Nelder-Mead").x
+    return {"phi": best[0], "spread": np.exp(best[1])}
+
+
+def measured_variance(filter, params, n_seeds=600):
+    seeds = np.arange(10_000, 10_000 + n_seeds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FilterWarning)  # some seeds collapse: part of the noise
+        terms = psf.log_likelihood(LINEAR, filter, params, DATA, steps=STEPS, seed=seeds)
+    return terms.sum(axis=-1).var(ddof=1)
+
+
+@pytest.mark.parametrize("first", [25, pytest.param(2000, marks=pytest.mark.slow)])
+def test_the_suggestion_is_in_the_target_at_the_exact_mode(first):
+    """Fresh seeds; the variance of the estimates has errors of some 10 % on either side."""
+    table = psf.suggest_particles(linear_model(psf.BootstrapPF(first)), random_seed=1)
+    suggested = table.attrs["n_particles"]
+    variance = measured_variance(psf.BootstrapPF(suggested), exact_mode())
+    assert 1.0 < variance < 3.3
+    assert first in table.index
+    assert list(table.index) == sorted(set(table.index))
+    assert table.index.name == "n_particles"
+    assert list(table.index[table["suggested"]]) == [suggested]
+    row = table.loc[suggested]
+    assert row["variance_low"] < variance < row["variance_high"] or (
+        abs(np.log(variance / row["variance_centre"])) < 0.5
+    )
+    assert row["variance_tail"] > 0.0
+    assert (table["seconds"] > 0.0).all()
+    assert (table["n_failed"] == 0).all()
+
+
+def test_one_of_two_noisy_variables_is_tuned():
+    def both(a, b):
+        with pm.Model() as model:
+            pm.Normal("phi", 0.5, 0.5)
+            pm.HalfNormal("spread", 1.0)
+            record = {"steps": STEPS[:20], "observed": DATA[:20]}
+            psf.StateSpace("a", LINEAR, psf.BootstrapPF(a), **record, seed=1)
+            psf.StateSpace("b", LINEAR, psf.BootstrapPF(b), **record, seed=2)
+        return model
+
+    tables = [
+        psf.suggest_particles(both(50, b), var_name="a", random_seed=3).drop(columns="seconds")
+        for b in (4, 4)
+    ]
+    # The four particles of b would alone scatter by far more than the target.
+    assert tables[0].loc[tables[0].attrs["n_particles"], "variance_centre"] < 3.3
+    assert tables[0].equals(tables[1])
+    with pytest.raises(ModelError, match=r"several variables are noisy, .* one of 'a', 'b'"):
+        psf.suggest_particles(both(50, 4))
+
+
+def test_models_without_noise_have_nothing_to_tune():
+    with pytest.raises(ModelError, match=r"there is no number of particles to tune"):
+        psf.suggest_particles(linear_model(psf.EKF()))
+    with pm.Model() as model:
+        pm.Normal("x")
+    with pytest.raises(ModelError, match=r"no StateSpace variable with a noisy likelihood"):
+        psf.suggest_particles(model)
+
+
+@pytest.mark.parametrize(
+    "target", [(3.3, 1.0), (0.0, 1.0), (1.0,), 2.0, (1, 2, 3), "ab", (1, None)]
+)
+def test_bad_targets(target):
+    with pytest.raises(ModelError, match=r"target=.*: expected two positive numbers"):
+        psf.suggest_particles(linear_model(psf.BootstrapPF(20)), target=target)
+
+
+def test_other_bad_arguments():
+    model = linear_model(psf.BootstrapPF(20))
+    with pytest.raises(ModelError, match=r"var_name='phi': expected .* noisy filter, 'd'"):
+        psf.suggest_particles(model, var_name="phi")
+    with pytest.raises(ModelError, match=r"model must be a pymc.Model, got 'd'"):
+        psf.suggest_particles("d")
+    with pytest.raises(ModelError, match=r"random_seed must be .* got 'x'"):
+        psf.suggest_particles(model, random_seed="x")
+    with pm.Model() as fixed:
+        psf.StateSpace("d", LINEAR, psf.EnKF(20), params=TRUTH, steps=STEPS, observed=DATA)
+    with pytest.raises(ModelError, match=r"at least one free variable"):
+        psf.suggest_particles(fixed)
+
+
+def test_a_reading_is_a_warning_and_the_table_is_there(monkeypatch):
+    noisy = SeedSpread(100, -1.0, 40.0, 30.0, 50.0, 0)
+    rows = [Row(20, noisy, np.nan, 3, 1e-3), Row(200, noisy, np.nan, 1, 1e-2)]
+    monkeypatch.setattr(particle_budget._Bench, "points", lambda self: (None, []))
+    monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: rows)
+    with pytest.warns(FilterWarning, match=r"d: the variance .* does not come down to 3.3"):
+        table = psf.suggest_particles(linear_model(psf.BootstrapPF(20)))
+    assert table.attrs == {"n_particles": 200}
+    assert list(table["suggested"]) == [False, True]
+    assert list(table["n_failed"]) == [3, 1]
+
+
+@pytest.mark.slow
+def test_a_variance_that_stays_warns_and_leaves_a_table():
+    """A precise sensor far from where the particles start: one of them decides at once."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, phi: [phi * x[0] + q[0]],
+        process_noise=[[1e-4]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[1e-8]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 0.5)
+        psf.StateSpace("d", system, psf.BootstrapPF(10), steps=[1, 2, 3], observed=[3.0, -2.0, 4.0])
+    with pytest.warns(FilterWarning, match=r"d: the variance .* does not come down to 3.3"):
+        table = psf.suggest_particles(model, random_seed=1)
+    assert table.attrs["n_particles"] == table.index[-1]
+    assert table["variance_centre"].iloc[-1] > 3.3
+
+
+@pytest.mark.slow
+def test_ensemble_filters_are_tuned_too():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FilterWarning)
+        for filter in (psf.EnKF(40), psf.PFEnKF(40)):
+            table = psf.suggest_particles(linear_model(filter), random_seed=2)
+            assert 40 in table.index
+            assert np.isfinite(table["variance_centre"]).all()
