@@ -78,7 +78,9 @@ class LogDensity:
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
-        (logp,) = with_filter([model.logp()], model, filters or {})
+        logp = model.logp()
+        if filters:
+            (logp,) = with_filter([logp], model, filters)
         outputs = [logp, *health_outputs([logp])]
         noise_inputs = list(seed_inputs.values())
         self._make_normals = None
