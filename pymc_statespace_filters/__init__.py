@@ -23,7 +23,7 @@ from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
 from pymc_statespace_filters.records import nearest_steps
-from pymc_statespace_filters.sampling import DRAM, suggest_particles
+from pymc_statespace_filters.sampling import DRAM, sample_dram, suggest_particles
 from pymc_statespace_filters.simulation import simulate
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "hysteresis",
     "log_likelihood",
     "nearest_steps",
+    "sample_dram",
     "simulate",
     "suggest_particles",
 ]

@@ -29,6 +29,7 @@ __all__ = [
     "noise_seeds",
     "noisy_filters",
     "resized",
+    "state_space_names",
     "with_filter",
 ]
 
@@ -39,6 +40,11 @@ def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
         for rv in model.basic_RVs
         if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
     }
+
+
+def state_space_names(model: pm.Model) -> list[str]:
+    """The names of the StateSpace variables."""
+    return list(_state_space_nodes(model))
 
 
 def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:

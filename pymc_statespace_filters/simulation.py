@@ -8,13 +8,8 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.lowering import (
-    Compiled,
-    ensemble_machine,
-    jit,
-    key_of,
-    observation_sampler,
-)
+from pymc_statespace_filters.lowering import Compiled, ensemble_machine, jit, observation_sampler
+from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import check_inputs, check_system, check_t0, steps_of

@@ -10,15 +10,8 @@ from pymc_statespace_filters.filters._failures import OUT_OF_MEMORY
 from pymc_statespace_filters.filters._noise import STORE_NORMALS, NoiseSizes, n_stored
 from pymc_statespace_filters.filters._random import padded
 from pymc_statespace_filters.filters._system import N_TABLE
-from pymc_statespace_filters.lowering import (
-    Compiled,
-    Entry,
-    Machine,
-    address_of,
-    ensemble_machine,
-    key_of,
-    machine_entries,
-)
+from pymc_statespace_filters.lowering import Compiled, Machine, ensemble_machine, machine_entries
+from pymc_statespace_filters.machine_code import Entry, address_of, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 

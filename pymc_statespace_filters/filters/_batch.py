@@ -26,9 +26,9 @@ from pymc_statespace_filters.lowering import (
     NotUnrollableError,
     covariance_check,
     jit,
-    key_of,
     lane_functions,
 )
+from pymc_statespace_filters.machine_code import key_of
 
 
 def compile_batch(recursion: Recursion) -> Compiled:

@@ -15,7 +15,7 @@ from pymc_statespace_filters.filters._noise import (
 )
 from pymc_statespace_filters.filters._random import FILL_NORMALS
 from pymc_statespace_filters.filters._system import initialise, propagate, read_system
-from pymc_statespace_filters.lowering import COUNTS, NUMBERS, Entry, digest
+from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, digest
 
 _ARGUMENTS = (
     COUNTS, types.float64,  # table of the system and its time step

@@ -18,7 +18,7 @@ from pymc_statespace_filters.filters._random import (
     PROCESS,
     RESAMPLING,
 )
-from pymc_statespace_filters.lowering import COUNTS, Entry, digest
+from pymc_statespace_filters.machine_code import COUNTS, Entry, digest
 
 _fill = FILL_NORMALS.external
 _NUMBER_BYTES = 8

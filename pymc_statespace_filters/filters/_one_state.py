@@ -7,7 +7,7 @@ import numpy as np
 
 from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._system import NOTHING, call_members
-from pymc_statespace_filters.lowering import call_address
+from pymc_statespace_filters.machine_code import call_address
 
 
 class OneStateSystem(NamedTuple):

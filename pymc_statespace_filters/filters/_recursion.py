@@ -22,9 +22,9 @@ from pymc_statespace_filters.lowering import (
     VectorFunction,
     covariance_check,
     jit,
-    key_of,
     vector_functions,
 )
+from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 

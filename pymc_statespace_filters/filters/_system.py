@@ -6,7 +6,7 @@ import numpy as np
 from numba import carray
 
 from pymc_statespace_filters.filters._compile import pasted
-from pymc_statespace_filters.lowering import call_address
+from pymc_statespace_filters.machine_code import call_address
 
 N_TABLE = 10
 """Numbers in the table of a system before its free states."""

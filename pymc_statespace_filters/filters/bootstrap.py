@@ -22,7 +22,7 @@ from pymc_statespace_filters.filters._resampling import (
 )
 from pymc_statespace_filters.filters._system import log_density
 from pymc_statespace_filters.filters._weights import effective_number, normalise
-from pymc_statespace_filters.lowering import Entry
+from pymc_statespace_filters.machine_code import Entry
 from pymc_statespace_filters.model import StateSpaceModel
 
 

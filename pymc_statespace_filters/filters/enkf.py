@@ -26,7 +26,7 @@ from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals
 from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, normalise
-from pymc_statespace_filters.lowering import Entry
+from pymc_statespace_filters.machine_code import Entry
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0

@@ -37,19 +37,14 @@ from pymc_statespace_filters.filters._point_mass import (
     see,
 )
 from pymc_statespace_filters.lowering import (
-    COUNTS,
-    NUMBERS,
     Compiled,
-    Entry,
     OneState,
-    address_of,
-    digest,
     has_additive_process_noise,
     has_smooth_transition,
-    key_of,
     one_state,
     one_state_entries,
 )
+from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, address_of, digest, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 _LENGTHENING = 1.6

@@ -37,7 +37,8 @@ from pymc_statespace_filters.filters._resampling import (
 from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, log_sum, normalise
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.lowering import Entry, Machine
+from pymc_statespace_filters.lowering import Machine
+from pymc_statespace_filters.machine_code import Entry
 from pymc_statespace_filters.model import StateSpaceModel
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance

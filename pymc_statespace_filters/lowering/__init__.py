@@ -5,9 +5,7 @@ from pymc_statespace_filters.lowering.compiled import (
     Compiled,
     Graph,
     VectorFunction,
-    digest,
     jit,
-    key_of,
 )
 from pymc_statespace_filters.lowering.draws import observation_sampler
 from pymc_statespace_filters.lowering.ensemble import (
@@ -15,13 +13,6 @@ from pymc_statespace_filters.lowering.ensemble import (
     covariance_check,
     ensemble_machine,
     semidefinite_cholesky,
-)
-from pymc_statespace_filters.lowering.entries import (
-    COUNTS,
-    NUMBERS,
-    Entry,
-    address_of,
-    call_address,
 )
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.lowering.graphs import (
@@ -47,12 +38,9 @@ from pymc_statespace_filters.lowering.one_state import (
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError
 
 __all__ = [
-    "COUNTS",
     "LANES",
     "LANES_AT_ONCE",
-    "NUMBERS",
     "Compiled",
-    "Entry",
     "Graph",
     "Machine",
     "MachineEntries",
@@ -60,18 +48,14 @@ __all__ = [
     "OneState",
     "OneStateEntries",
     "VectorFunction",
-    "address_of",
     "call",
-    "call_address",
     "covariance_check",
-    "digest",
     "ensemble_machine",
     "has_additive_process_noise",
     "has_smooth_transition",
     "is_linear",
     "jacobian_of",
     "jit",
-    "key_of",
     "lane_functions",
     "log_normal",
     "machine_entries",

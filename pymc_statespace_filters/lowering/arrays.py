@@ -16,12 +16,11 @@ from pymc_statespace_filters.lowering.compiled import (
     Compiled,
     Graph,
     VectorFunction,
-    digest,
     function_of,
-    key_of,
 )
 from pymc_statespace_filters.lowering.loops import use_loops
 from pymc_statespace_filters.lowering.vocabulary import FOR_ONE
+from pymc_statespace_filters.machine_code import digest, key_of
 
 # How the code reads a whole input.
 _WHOLE = {

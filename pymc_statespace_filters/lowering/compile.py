@@ -21,13 +21,13 @@ from pymc_statespace_filters.lowering.compiled import (
     Compiled,
     Graph,
     VectorFunction,
-    digest,
     function_of,
 )
 from pymc_statespace_filters.lowering.scalars import Arena, Value
 from pymc_statespace_filters.lowering.source import Writer, depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError, unroll
 from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.machine_code import digest
 
 # Up to here the arrays' code takes as long to make and is up to eighty times slower: rings of 8
 # states with a gradient and of 16 without, dense systems of 10. Beyond, nobody would wait for it.

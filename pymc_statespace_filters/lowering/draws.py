@@ -6,9 +6,10 @@ import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 
 from pymc_statespace_filters.lowering.arrays import array_code
-from pymc_statespace_filters.lowering.compiled import Compiled, jit, key_of
+from pymc_statespace_filters.lowering.compiled import Compiled, jit
 from pymc_statespace_filters.lowering.ensemble import ensemble_machine
 from pymc_statespace_filters.lowering.graphs import SYMBOLS, symbols_of
+from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 

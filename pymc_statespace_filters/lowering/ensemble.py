@@ -12,18 +12,11 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.lowering.compile import member_function, vector_functions
-from pymc_statespace_filters.lowering.compiled import (
-    Compiled,
-    Graph,
-    VectorFunction,
-    digest,
-    jit,
-    key_of,
-)
-from pymc_statespace_filters.lowering.entries import NUMBERS, Entry
+from pymc_statespace_filters.lowering.compiled import Compiled, Graph, VectorFunction, jit
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.lowering.graphs import call, observation_moments, symbols_of
 from pymc_statespace_filters.lowering.noise import merged_noise
+from pymc_statespace_filters.machine_code import NUMBERS, Entry, digest, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 

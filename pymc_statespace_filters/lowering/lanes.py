@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from pymc_statespace_filters.lowering.compile import build, sorted_by_number, unrolled
-from pymc_statespace_filters.lowering.compiled import Compiled, VectorFunction, key_of
+from pymc_statespace_filters.lowering.compiled import Compiled, VectorFunction
 from pymc_statespace_filters.lowering.scalars import FLOAT, Expression, Value
 from pymc_statespace_filters.lowering.source import Writer, depends_on
 from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.machine_code import key_of
 
 LANES = 16  # at most
 LANES_AT_ONCE = 8  # their number is a multiple of this

@@ -5,10 +5,9 @@ from typing import NamedTuple
 
 from numba import carray, types
 
-from pymc_statespace_filters.lowering.compiled import key_of
 from pymc_statespace_filters.lowering.ensemble import Machine
-from pymc_statespace_filters.lowering.entries import NUMBERS, Entry
 from pymc_statespace_filters.lowering.one_state import OneState
+from pymc_statespace_filters.machine_code import NUMBERS, Entry, key_of
 
 # c, inputs, k, t, what comes to all members (Z and its columns, or d), X, out, number of members
 _MEMBERS = (

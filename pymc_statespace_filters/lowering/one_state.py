@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.lowering.compile import member_function, unrolled, vector_functions
-from pymc_statespace_filters.lowering.compiled import Graph, VectorFunction, key_of
+from pymc_statespace_filters.lowering.compiled import Graph, VectorFunction
 from pymc_statespace_filters.lowering.ensemble import covariance_check
 from pymc_statespace_filters.lowering.gaussian import log_normal, without_missing
 from pymc_statespace_filters.lowering.graphs import (
@@ -21,6 +21,7 @@ from pymc_statespace_filters.lowering.graphs import (
 from pymc_statespace_filters.lowering.noise import is_free_of
 from pymc_statespace_filters.lowering.source import depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError
+from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 _KINKED = (

@@ -19,7 +19,8 @@ from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import Filter
-from pymc_statespace_filters.lowering import Compiled, jit, key_of
+from pymc_statespace_filters.lowering import Compiled, jit
+from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 HEALTH_SIZE = 3
@@ -186,6 +187,7 @@ def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     lines = [*checks, f"return run({', '.join(handed)})"]
     source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
     namespace = {
+        "__name__": __name__,
         "np": np,
         "run": compiled.function,
         "check": check_record(op.system),

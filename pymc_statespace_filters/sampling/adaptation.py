@@ -145,6 +145,68 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
     return AdaptationState(cov, np.linalg.cholesky(cov), cov, 1.0, 0, 0, cov, none, none, none)
 
 
+def packed_size(dim: int) -> int:
+    """Numbers that a state of dimension d is packed into."""
+    return 3 + 4 * dim**2 + 3 * (3 + dim + dim**2)
+
+
+@njit(cache=True, error_model="numpy")
+def pack(state: AdaptationState, packed: np.ndarray) -> None:
+    """Write a state into a vector of `packed_size` numbers: plain data, to be stored."""
+    packed[0], packed[1], packed[2] = state.scale, state.n_blocks, state.n_stalls
+    at = 3
+    for matrix in (state.cov, state.chol, state.base, state.first_cov):
+        at = _put(matrix, packed, at)
+    for moments in (state.block, state.recent, state.older):
+        packed[at], packed[at + 1], packed[at + 2] = moments.n, moments.moved, moments.first
+        at = _put(moments.mean, packed, at + 3)
+        at = _put(moments.scatter, packed, at)
+
+
+@njit(cache=True, error_model="numpy")
+def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
+    """Read a state from its vector."""
+    square, n_moments = dim * dim, 3 + dim + dim * dim
+    at = 3 + 4 * square
+    return AdaptationState(
+        _matrix(packed, 3, dim),
+        _matrix(packed, 3 + square, dim),
+        _matrix(packed, 3 + 2 * square, dim),
+        packed[0],
+        int(packed[1]),
+        int(packed[2]),
+        _matrix(packed, 3 + 3 * square, dim),
+        _moments(packed, at, dim),
+        _moments(packed, at + n_moments, dim),
+        _moments(packed, at + 2 * n_moments, dim),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _put(values: np.ndarray, packed: np.ndarray, at: int) -> int:
+    for value in values.flat:
+        packed[at] = value
+        at += 1
+    return at
+
+
+@njit(cache=True, error_model="numpy")
+def _matrix(packed: np.ndarray, at: int, dim: int) -> np.ndarray:
+    matrix = np.empty((dim, dim))
+    for i in range(dim):
+        for j in range(dim):
+            matrix[i, j] = packed[at + i * dim + j]
+    return matrix
+
+
+@njit(cache=True, error_model="numpy")
+def _moments(packed: np.ndarray, at: int, dim: int) -> Moments:
+    mean = packed[at + 3 : at + 3 + dim].copy()
+    return Moments(
+        packed[at], packed[at + 1], packed[at + 2], mean, _matrix(packed, at + 3 + dim, dim)
+    )
+
+
 @njit(cache=True, error_model="numpy")
 def adapt_by_blocks(
     settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int

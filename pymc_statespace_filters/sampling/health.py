@@ -2,10 +2,19 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
-from pymc_statespace_filters.inspection import FAILURES
-from pymc_statespace_filters.sampling.log_density import NOT_A_NUMBER
+from pymc_statespace_filters.inspection import COLLAPSED, FAILURES
+from pymc_statespace_filters.sampling.chain import (
+    FAILURE,
+    N_EFFECTIVE,
+    N_EVALUATIONS,
+    N_FAILED,
+    NOT_A_NUMBER,
+    STAGE,
+    Draws,
+)
 
 # Share of evaluations after warm-up that may fail in silence: a chain that brushes the edge of the
 # region where its filter works is normal.
@@ -40,20 +49,38 @@ class Record(NamedTuple):
     failures: tuple[tuple[int, int], ...] = ()
     collapsed: int = 0
 
-    def include(self, moved: bool, codes: tuple[int, ...], collapsed: bool = False) -> "Record":
-        """Take in an iteration: whether it moved, each evaluation's failure code (0: none)."""
+    def include(self, draws: Draws, row: int) -> "Record":
+        """Take in an iteration."""
+        counts = draws.counts[row].tolist()
         failures = self.failures
-        if any(codes):
-            counts = dict(failures)
-            for code in filter(None, codes):
-                counts[code] = counts.get(code, 0) + 1
-            failures = tuple(counts.items())
+        if counts[N_FAILED]:
+            by_code = dict(failures)
+            code = counts[FAILURE]
+            by_code[code] = by_code.get(code, 0) + counts[N_FAILED]
+            failures = tuple(by_code.items())
         return Record(
             self.iterations + 1,
-            self.moved + moved,
-            self.evaluations + len(codes),
+            self.moved + (counts[STAGE] > 0),
+            self.evaluations + counts[N_EVALUATIONS],
             failures,
-            self.collapsed + collapsed,
+            self.collapsed + (float(draws.numbers[row, N_EFFECTIVE]) < COLLAPSED),
+        )
+
+    @classmethod
+    def of(cls, draws: Draws, begin: int, end: int) -> "Record":
+        """Count what was noted down of the iterations from ``begin`` to before ``end``."""
+        counts = draws.counts[begin:end]
+        codes = counts[:, FAILURE]
+        failures = tuple(
+            (int(code), int(counts[codes == code, N_FAILED].sum()))
+            for code in np.unique(codes[counts[:, N_FAILED] > 0])
+        )
+        return cls(
+            len(counts),
+            int(np.count_nonzero(counts[:, STAGE])),
+            int(counts[:, N_EVALUATIONS].sum()),
+            failures,
+            int(np.count_nonzero(draws.numbers[begin:end, N_EFFECTIVE] < COLLAPSED)),
         )
 
     @property

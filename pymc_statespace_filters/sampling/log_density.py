@@ -1,34 +1,43 @@
 """A PyMC model's log-density as one call of machine code.
 
 The value variables that a sampler moves are joined into one vector; the variables that it does not
-move and the noise seeds of estimated likelihoods are arguments beside it. The health of the filters
+move and the noise of estimated likelihoods are arguments beside it. The health of the filters
 comes out of the same call, so that a failure has a reason and costs no second evaluation.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import ArrayLike
 from pymc.model import Model
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
+from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.inspection import health_outputs, hold_noise, with_filter
-
-# Reason of a failure that no filter reports.
-NOT_A_NUMBER = -1
+from pymc_statespace_filters.inspection import (
+    health_outputs,
+    hold_noise,
+    move_noise,
+    state_space_names,
+    with_filter,
+)
+from pymc_statespace_filters.machine_code import NativeFunction
+from pymc_statespace_filters.sampling.chain import RAISED, Density, evaluate
 
 
 class Evaluation(NamedTuple):
-    """What one call gives.
+    """What one evaluation gives.
 
     Attributes
     ----------
     log_density : float
         Never NaN nor plus infinity; a failed evaluation is minus infinity.
     failure : int
-        0, or the code of the reason: a key of ``inspection.FAILURES``, or ``NOT_A_NUMBER``.
+        0, or the code of the reason: a key of ``inspection.FAILURES``, or ``chain.NOT_A_NUMBER``.
     n_effective : float
         Smallest effective number of particles in any filter, infinity without noisy filters.
     """
@@ -39,7 +48,7 @@ class Evaluation(NamedTuple):
 
 
 class LogDensity:
-    """Log-density of a model on its unconstrained space, seeds explicit.
+    """Log-density of a model on its unconstrained space, noise explicit.
 
     Parameters
     ----------
@@ -47,16 +56,19 @@ class LogDensity:
     held : sequence of TensorVariable
         Continuous value variables that become one vector, in this order.
     point : mapping of str to ndarray
-        Any point of the model; only shapes are read.
+        Any point of the model; of the variables in the vector only shapes are read.
     seeds : mapping of str to shared variable
         The noise seeds, by the name of their StateSpace variable.
+    compile_kwargs : dict, optional
+        Passed to PyMC's compiler.
     holds_noise : bool
         Whether every evaluation is on the noise of the model's own seeds. Their normals are then
         made once, in `prepare`, and the seeds of a call are not read.
-    filters : mapping of str to filter, optional
-        Filters that stand in for those of the named StateSpace variables.
-    compile_kwargs : dict, optional
-        Passed to PyMC's compiler.
+    correlation : float, optional
+        If given, the noise of an evaluation is that of the one before, moved: its normals are
+        ``correlation`` times theirs plus fresh ones, of the same variance.
+    graph : TensorVariable, optional
+        The log-density if it is not the model's own, see `screening_density`.
 
     Attributes
     ----------
@@ -73,76 +85,174 @@ class LogDensity:
         compile_kwargs: dict | None = None,
         *,
         holds_noise: bool = False,
-        filters: Mapping[str, Any] | None = None,
+        correlation: float | None = None,
+        graph: TensorVariable | None = None,
     ):
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
+        self.correlation = correlation
+        density = model.logp() if graph is None else graph
+        outputs = [density, *health_outputs([density])]
+        self._n_healths = len(outputs) - 1
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
-        logp = model.logp()
-        if filters:
-            (logp,) = with_filter([logp], model, filters)
-        outputs = [logp, *health_outputs([logp])]
-        noise_inputs = list(seed_inputs.values())
-        self._make_normals = None
+        noise_inputs: list[Variable] = []
+        noise: list[Variable] = []
         if holds_noise and seeds:
             outputs, normals = hold_noise(outputs, seeds)
-            noise_inputs, seed_inputs = list(normals), {}
-            self._make_normals = compile_pymc([], list(normals.values()))
+            noise_inputs, noise, seed_inputs = list(normals), list(normals.values()), {}
+        elif correlation is not None and seeds:
+            graphs, moved = move_noise(outputs, seeds)
+            outputs = [*graphs, *moved.moved]
+            noise_inputs, noise = [moved.correlation, *moved.normals], list(moved.sizes)
+        # Belongs to the data: the stored normals, or how many there are.
+        self._make_noise: Any = compile_pymc([], noise) if noise else list
         outputs, joined = join_nonshared_inputs(point, outputs, held, shared_inputs=seed_inputs)
-        inputs = [joined, *not_held, *noise_inputs]
-        self._n_inputs = len(inputs)
+        inputs = [joined, *not_held, *noise_inputs, *seed_inputs.values()]
         self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
-        self._call: Callable[..., Sequence[np.ndarray]] | None = None
-        self._normals: Sequence[np.ndarray] | None = None
+        self._n_seeds = len(seeds)
+        self._reads_seeds = bool(seed_inputs)
+        self._start = np.concatenate([np.ravel(point[v.name]) for v in held], dtype=np.float64)
+        self._others = [np.array(point[name]) for name in self.others]
+        self._native: NativeFunction | None = None
+        self._normals: list[np.ndarray] = []
 
     def __getstate__(self) -> dict:
         """Leave the machine code behind: another process takes its own."""
-        return self.__dict__ | {"_call": None, "_normals": None}
+        return self.__dict__ | {"_native": None, "_normals": []}
 
-    def prepare(self) -> Callable[..., Sequence[np.ndarray]]:
+    @property
+    def _moves_noise(self) -> bool:
+        return self.correlation is not None and self._reads_seeds
+
+    @property
+    def n_carried(self) -> int:
+        """How many normals a chain carries along; known once prepared."""
+        return sum(normals.size for normals in self._normals) if self._moves_noise else 0
+
+    def prepare(self) -> NativeFunction:
         """Take hold of the machine code and of the data as they are now."""
-        function = self._function
-        call = function
-        if hasattr(function.vm, "jit_fn"):  # else it is a mode without numba
-            machine_code = function.vm.jit_fn
-            data = [cell.storage[0] for cell in function.input_storage[self._n_inputs :]]
+        noise = self._make_noise()
+        self._normals = [np.zeros(int(size)) for size in noise] if self._moves_noise else noise
+        seeds = np.zeros(self._n_seeds, dtype=np.int64)
+        inputs = self._inputs(self._start, self._others, np.zeros(()), self._normals, seeds)
+        self._native = NativeFunction(self._function, inputs)
+        return self._native
 
-            def call(*args: np.ndarray) -> Sequence[np.ndarray]:
-                return machine_code(*args, *data)
+    def bind(self) -> "BoundDensity":
+        """Make the log-density callable for one thread, with arrays of its own."""
+        native = self._native or self.prepare()
+        position, others = self._start.copy(), [value.copy() for value in self._others]
+        seeds = np.zeros(self._n_seeds, dtype=np.int64)
+        correlation, carried = np.zeros(()), np.zeros(self.n_carried)
+        normals = self._normals
+        if self._moves_noise:
+            ends = np.cumsum([values.size for values in normals])
+            normals = np.split(carried, ends[:-1])
+        inputs = self._inputs(position, others, correlation, normals, seeds)
+        call, kept = native.bind(inputs)
+        density = Density(call, position, seeds, self._n_healths)
+        return BoundDensity(density, others, correlation, carried, native, inputs, kept)
 
-        self._call = call
-        if self._make_normals is not None:
-            self._normals = self._make_normals()
-        return call
+    def _inputs(
+        self,
+        position: np.ndarray,
+        others: Sequence[np.ndarray],
+        correlation: np.ndarray,
+        normals: Sequence[np.ndarray],
+        seeds: np.ndarray,
+    ) -> list[np.ndarray]:
+        """Arguments of the compiled function, views where it reads a part."""
+        moved = [correlation] if self._moves_noise else []
+        each_seed = [seeds[i : i + 1].reshape(()) for i in range(seeds.size)]
+        return [position, *others, *moved, *normals, *(each_seed if self._reads_seeds else [])]
+
+
+@dataclass(frozen=True)
+class BoundDensity:
+    """A log-density with the arrays that its machine code reads and writes.
+
+    Attributes
+    ----------
+    density : chain.Density
+        For machine code.
+    others : list of ndarray
+        Values of the variables that are not in the vector.
+    correlation : ndarray, shape ()
+        Of the noise of an evaluation with the noise in ``carried``; 0 draws it afresh.
+    carried : ndarray, shape (n_carried,)
+        The normals that are moved.
+    native : NativeFunction
+    inputs : list of ndarray
+        What it is called with.
+    kept : object
+        What must live as long as the call.
+    """
+
+    density: Density
+    others: list[np.ndarray]
+    correlation: np.ndarray
+    carried: np.ndarray
+    native: NativeFunction
+    inputs: list[np.ndarray]
+    kept: Any
 
     def __call__(
-        self, position: np.ndarray, others: Sequence[np.ndarray], seeds: Sequence[np.ndarray]
+        self, position: np.ndarray, others: Sequence[np.ndarray], seeds: ArrayLike
     ) -> Evaluation:
-        """Evaluate once.
+        """Evaluate once, from Python.
 
         Parameters
         ----------
         position : ndarray, shape (d,)
             The joined vector.
         others : sequence of ndarray
-            Values of the variables named in ``others``.
-        seeds : sequence of ndarray of int64, shape ()
+            Values of the variables that are not in it.
+        seeds : array_like of int64, shape (noisy,)
             One for each noise seed; not read where the noise is held.
 
         Returns
         -------
         Evaluation
+
+        Raises
+        ------
+        Exception
+            What the model raises.
         """
-        call = self._call or self.prepare()
-        noise = seeds if self._normals is None else self._normals
-        value, *healths = call(position, *others, *noise)
-        log_density = float(value)
-        n_effective = np.inf
-        for health in healths:
-            n_effective = min(n_effective, float(health[0]))
-            if health[1] != 0.0:
-                return Evaluation(-np.inf, int(health[1]), n_effective)
-        if not log_density < np.inf:
-            return Evaluation(-np.inf, NOT_A_NUMBER, n_effective)
-        return Evaluation(log_density, 0, n_effective)
+        self.density.position[:] = position
+        self.density.seeds[:] = seeds
+        for mine, value in zip(self.others, others, strict=True):
+            mine[...] = value
+        result = Evaluation(*evaluate(self.density))
+        if result.failure == RAISED:
+            self.raise_error()
+        return result
+
+    def raise_error(self) -> None:
+        """Evaluate again in Python, to raise what the machine code met."""
+        self.native(*self.inputs)
+
+
+def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:
+    """Graph of a cheap log-density: another filter's likelihood, tempered.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    screen : filter
+        Takes the place of the filter of every StateSpace variable.
+    power : float
+        By which the likelihoods of these variables enter. Priors and other terms enter whole.
+
+    Returns
+    -------
+    TensorVariable
+    """
+    names = state_space_names(model)
+    variables = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
+    total = sum(
+        pt.sum(term) * (power if name in names else 1.0)
+        for name, term in zip(variables, model.logp(sum=False), strict=True)
+    )
+    return with_filter([total], model, dict.fromkeys(names, screen))[0]

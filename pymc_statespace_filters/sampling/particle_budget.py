@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from pymc.model import Model
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.inspection import noise_seeds, noisy_filters, resized
+from pymc_statespace_filters.inspection import noise_seeds, noisy_filters, resized, with_filter
 from pymc_statespace_filters.sampling.budget_search import Row, choose, search
 from pymc_statespace_filters.sampling.held_variables import HeldVariables, continuous_value_vars
-from pymc_statespace_filters.sampling.log_density import LogDensity
+from pymc_statespace_filters.sampling.log_density import BoundDensity, LogDensity
+from pymc_statespace_filters.sampling.pilot import SETTINGS as PILOT_SETTINGS
 from pymc_statespace_filters.sampling.pilot import Pilot, run_pilot
 from pymc_statespace_filters.sampling.randomness import draw_seeds
 from pymc_statespace_filters.sampling.seed_spread import (
@@ -22,7 +24,7 @@ from pymc_statespace_filters.sampling.seed_spread import (
     acceptance_share,
     seed_spread,
 )
-from pymc_statespace_filters.sampling.starts import Starts
+from pymc_statespace_filters.sampling.target import Target
 
 # Evaluations at a point: a first look, the centre, and each point of the tail.
 _GLANCE, _CENTRE, _TAIL = 25, 100, 30
@@ -180,17 +182,16 @@ class _Bench:
         self._held = HeldVariables(continuous_value_vars(None, model), self._point)
         if not self._held.dim:
             raise ModelError("model must have at least one free variable, it has none")
-        self._densities: dict[int, LogDensity] = {}
+        self._densities: dict[int, BoundDensity] = {}
 
     def points(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """Run the pilot and give the posterior's centre and its tail points, shape (d,) each."""
-        starts = Starts(self._model, self._held, self._point)
         n = min(max(self.filter.size(), _PILOT_LEAST), _PILOT_MOST)
-        pilot = self._pilot(n, starts, self._held.join(self._point))
+        pilot = self._pilot(n, self._held.join(self._point))
         centre, variance = self._best(n, pilot)
         if variance > TOO_NOISY:  # the pilot saw noise more than the posterior
             n = round(n * min(variance, _PILOT_GROWTH))
-            pilot = self._pilot(n, starts, centre)
+            pilot = self._pilot(n, centre)
             centre, _ = self._best(n, pilot)
         tail = [int(np.argmin(np.abs(pilot.shares - share))) for share in _TAIL_SHARES]
         return centre, [pilot.positions[i] for i in dict.fromkeys(tail)]
@@ -210,26 +211,21 @@ class _Bench:
         spread = self.spread(n_particles, position, n_seeds)
         return spread, (time.process_time() - begun) / n_seeds
 
-    def _density(self, n_particles: int) -> LogDensity:
+    def _density(self, n_particles: int) -> BoundDensity:
         if n_particles not in self._densities:
-            self._densities[n_particles] = self._compiled(n_particles, holds_noise=False)
+            variables, graph = self._held.variables, self._graph(n_particles)
+            density = LogDensity(self._model, variables, self._point, self._seeds, graph=graph)
+            self._densities[n_particles] = density.bind()
             self.spread(n_particles, self._held.join(self._point), 1)  # the first call compiles
         return self._densities[n_particles]
 
-    def _compiled(self, n_particles: int, *, holds_noise: bool) -> LogDensity:
-        return LogDensity(
-            self._model,
-            self._held.variables,
-            self._point,
-            self._seeds,
-            holds_noise=holds_noise,
-            filters={self.name: resized(self.filter, n_particles)},
-        )
+    def _graph(self, n_particles: int) -> TensorVariable:
+        filters = {self.name: resized(self.filter, n_particles)}
+        return with_filter([self._model.logp()], self._model, filters)[0]
 
-    def _pilot(self, n_particles: int, starts: Starts, start: np.ndarray) -> Pilot:
-        density = self._compiled(n_particles, holds_noise=True)
-        density.prepare()
-        return run_pilot(density, self._held, starts, start, self._rng)
+    def _pilot(self, n_particles: int, start: np.ndarray) -> Pilot:
+        target = Target(self._model, None, PILOT_SETTINGS, graph=self._graph(n_particles))
+        return run_pilot(target, start, self._rng)
 
     def _best(self, n_particles: int, pilot: Pilot) -> tuple[np.ndarray, float]:
         """Compare the highest draws anew: held noise favours the points where it came out high."""

@@ -6,27 +6,19 @@ is the posterior of that one estimate, which is near enough to say where the cen
 are.
 """
 
+from threading import Event
 from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.adaptation import start_adaptation
-from pymc_statespace_filters.sampling.held_variables import HeldVariables
-from pymc_statespace_filters.sampling.log_density import LogDensity
-from pymc_statespace_filters.sampling.randomness import take
+from pymc_statespace_filters.sampling.chain import LOG_DENSITY
+from pymc_statespace_filters.sampling.runs import ChainRun, Plan
 from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.starts import Starts, best_start
-from pymc_statespace_filters.sampling.transition import EvaluatedPoint, delayed_rejection_move
+from pymc_statespace_filters.sampling.target import Target
 
 N_CHAINS, N_TUNE, N_DRAWS = 2, 300, 200
 
-_SETTINGS = DRAMSettings(
-    stages=(2, 1),
-    stage_scale=0.2,
-    adaptation="chain",
-    adapt_every=50,
-    refresh_noise=False,
-)
+SETTINGS = DRAMSettings(adapt_every=50, refresh_noise=False)
 
 
 class Pilot(NamedTuple):
@@ -43,21 +35,13 @@ class Pilot(NamedTuple):
     shares: np.ndarray
 
 
-def run_pilot(
-    log_density: LogDensity,
-    held: HeldVariables,
-    starts: Starts,
-    start: np.ndarray,
-    rng: np.random.Generator,
-) -> Pilot:
+def run_pilot(target: Target, start: np.ndarray, rng: np.random.Generator) -> Pilot:
     """Sample the posterior on held noise, in two chains of DRAM.
 
     Parameters
     ----------
-    log_density : LogDensity
-        With ``holds_noise=True``, and no variable besides the joined vector.
-    held : HeldVariables
-    starts : Starts
+    target : Target
+        With `SETTINGS`.
     start : ndarray, shape (d,)
         Where the chains start, if it is not the model's own starting point.
     rng : numpy.random.Generator
@@ -67,13 +51,23 @@ def run_pilot(
     Pilot
         A chain that has not come near the best point of the other is left out.
     """
-
-    def evaluate(position: np.ndarray, seeds: tuple[np.ndarray, ...] = ()) -> EvaluatedPoint:
-        return EvaluatedPoint(position, (), seeds, *log_density(position, (), seeds))
-
-    chains = [_chain(evaluate, held, starts, start, rng) for _ in range(N_CHAINS)]
+    target.prepare()
+    entropy = rng.integers(2**32, size=4).tolist()
+    plan = Plan(
+        N_TUNE,
+        N_DRAWS,
+        False,
+        [lambda rng: target.starts.candidates(start, rng)] * N_CHAINS,
+        np.random.SeedSequence(entropy).spawn(N_CHAINS),
+    )
+    chains = []
+    for i in range(N_CHAINS):
+        run = ChainRun(target, plan, i, None)
+        run.run(Event())
+        draws = run.running.draws
+        chains.append((draws.positions[N_TUNE:], draws.numbers[N_TUNE:, LOG_DENSITY]))
     best = max(densities.max() for _, densities in chains)
-    near = [chain for chain in chains if np.median(chain[1]) > best - held.dim - _FAR]
+    near = [chain for chain in chains if np.median(chain[1]) > best - target.held.dim - _FAR]
     positions = np.concatenate([positions for positions, _ in near or chains])
     densities = np.concatenate([densities for _, densities in near or chains])
     _, at, counts = np.unique(densities, return_index=True, return_counts=True)
@@ -84,30 +78,3 @@ def run_pilot(
 # A chain whose median lies this many nats, and one for each dimension, below the best point has not
 # arrived: the median of a Gaussian posterior lies d / 2 below.
 _FAR = 10.0
-
-
-def _chain(evaluate, held, starts, start, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Draws (N_DRAWS, d) and their log-densities (N_DRAWS,) of one chain."""
-    current, _ = best_start(starts.candidates(start, rng), evaluate)
-    adaptation, batch = start_adaptation(starts.covariance()), None
-    positions, densities = np.empty((N_DRAWS, held.dim)), np.empty(N_DRAWS)
-    for i in range(-N_TUNE, N_DRAWS):
-        batch, share = take(batch, rng, max(_SETTINGS.stages), held.dim, 0)
-        n_stages = _SETTINGS.stages[0 if i < 0 else 1]
-        move = delayed_rejection_move(
-            evaluate,
-            current,
-            adaptation.chol,
-            _SETTINGS.stage_scale,
-            share.normals,
-            share.log_uniforms,
-            [()] * n_stages,
-        )
-        current = move.point
-        if i < 0:
-            adaptation = _SETTINGS.adapt(
-                _SETTINGS.adaptation_settings, adaptation, current.position, move.stage
-            )
-        else:
-            positions[i], densities[i] = current.position, current.log_density
-    return positions, densities

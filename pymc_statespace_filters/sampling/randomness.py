@@ -1,81 +1,44 @@
 """Random numbers of a chain, drawn for many iterations at a time.
 
-One call of a generator costs microseconds whether it returns one number or a thousand. A batch is
-plain data, so a chain's state can be stored and taken up again in the middle of one.
+One call of a generator costs microseconds whether it returns one number or a thousand. A block of
+numbers is a function of the chain's key and the block's index, so that a chain can be taken up
+again anywhere and does not depend on who runs it.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
-ITERATIONS = 64
+from pymc_statespace_filters.sampling.chain import Random
+
+BLOCK = 256
 
 
-class Batch(NamedTuple):
-    """Random numbers of ``ITERATIONS`` iterations.
-
-    Attributes
-    ----------
-    normals : ndarray, shape (iterations, stages, d)
-        Standard normals, for the proposals.
-    log_uniforms : ndarray, shape (iterations, stages)
-        Logs of uniforms, for acceptance.
-    seeds : ndarray of int64, shape (iterations, stages, noisy)
-        Seeds of the likelihoods' own noise.
-    used : int
-        Iterations already spent.
-    """
-
-    normals: np.ndarray
-    log_uniforms: np.ndarray
-    seeds: np.ndarray
-    used: int
-
-
-class Share(NamedTuple):
-    """Random numbers of one iteration, one row a stage.
-
-    Attributes
-    ----------
-    normals : ndarray, shape (stages, d)
-    log_uniforms : ndarray, shape (stages,)
-    seeds : ndarray of int64, shape (stages, noisy)
-    """
-
-    normals: np.ndarray
-    log_uniforms: np.ndarray
-    seeds: np.ndarray
-
-
-def take(
-    batch: Batch | None, rng: np.random.Generator, n_stages: int, dim: int, n_noisy: int
-) -> tuple[Batch, Share]:
-    """Take one iteration's share of a batch, drawing the next batch where one is spent.
+def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> Random:
+    """Draw the random numbers of iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``.
 
     Parameters
     ----------
-    batch : Batch or None
-        None before the first iteration.
-    rng : numpy.random.Generator
+    key : ndarray of uint64, shape (2,)
+        Belongs to the chain.
+    index : int
     n_stages, dim, n_noisy : int
         Most stages of an iteration, dimension d, noisy variables.
 
     Returns
     -------
-    Batch
-        The same with one iteration more spent.
-    Share
+    chain.Random
     """
-    if batch is None or batch.used == ITERATIONS:
-        batch = Batch(
-            rng.standard_normal((ITERATIONS, n_stages, dim)),
-            -rng.standard_exponential((ITERATIONS, n_stages)),
-            draw_seeds(rng, (ITERATIONS, n_stages, n_noisy)),
-            0,
-        )
-    now = batch.used
-    share = Share(batch.normals[now], batch.log_uniforms[now], batch.seeds[now])
-    return batch._replace(used=now + 1), share
+    # Each index begins 2^128 numbers after the one before it.
+    rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
+    return Random(
+        rng.standard_normal((BLOCK, n_stages, dim)),
+        -rng.standard_exponential((BLOCK, n_stages + 1)),
+        draw_seeds(rng, (BLOCK, n_stages, n_noisy)),
+    )
+
+
+def draw_key(rng: np.random.Generator) -> np.ndarray:
+    """Draw the key of a chain."""
+    return rng.integers(0, np.iinfo(np.uint64).max, size=2, dtype=np.uint64, endpoint=True)
 
 
 def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

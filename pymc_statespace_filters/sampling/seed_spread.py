@@ -71,7 +71,7 @@ def seed_spread(
     Parameters
     ----------
     log_density : callable
-        ``(position, others, seeds) -> Evaluation``, such as `LogDensity`.
+        ``(position, others, seeds) -> Evaluation``, such as `BoundDensity`.
     position : ndarray, shape (d,)
     others : sequence of ndarray
     seeds : ndarray of int64, shape (R, noisy)

@@ -2,23 +2,15 @@
 
 import math
 import numbers
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self, TypeGuard
 
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.adaptation import (
-    AdaptationSettings,
-    AdaptationState,
-    adapt_by_blocks,
-    adapt_continuously,
-)
 
-ADAPTATIONS: dict[str, Callable[..., AdaptationState]] = {
-    "chain": adapt_by_blocks,
-    "continuous": adapt_continuously,
-}
+ADAPTATIONS = ("chain", "continuous")
 
 
 @dataclass(frozen=True)
@@ -32,20 +24,47 @@ class DRAMSettings:
     stage_scale : float
         Standard deviation of each stage relative to the one before.
     adaptation : str
-        A key of ``ADAPTATIONS``.
+        One of ``ADAPTATIONS``.
     adapt_every : int
         Iterations in a block of warm-up.
     refresh_noise : bool
         Whether every proposal has noise of its own.
+    correlation : float or None
+        Of the noise of a proposal with that of the current point, if not drawn afresh.
+    screen : filter or None
+        Whose likelihood stands in for that of the model until a move has been made on it.
+    screen_power : float
+        By which that likelihood enters.
     """
 
-    stages: tuple[int, int]
-    stage_scale: float
-    adaptation: str
-    adapt_every: int
-    refresh_noise: bool
+    stages: Any = (2, 1)
+    stage_scale: float = 0.2
+    adaptation: str = "chain"
+    adapt_every: int = 100
+    refresh_noise: bool = True
+    correlation: float | None = None
+    screen: Any = None
+    screen_power: float = 1.0
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> Self:
+        """Make settings of arguments by name, as a user gave them.
+
+        Raises
+        ------
+        TypeError
+            If there is no such setting.
+        """
+        names = [field.name for field in fields(cls)]
+        if unknown := [name for name in arguments if name not in names]:
+            raise TypeError(
+                f"unexpected keyword argument {unknown[0]!r}: the settings of DRAM are "
+                f"proposal_cov, {', '.join(names)}"
+            )
+        return cls(**arguments)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "stages", stage_pair(self.stages))
         scale = self.stage_scale
         if not _is_real(scale) or not 0.0 < scale < math.inf:
             raise ModelError(f"stage_scale={scale!r}: expected a positive number")
@@ -54,20 +73,33 @@ class DRAMSettings:
                 f"adaptation={self.adaptation!r}: expected one of "
                 f"{', '.join(map(repr, ADAPTATIONS))}"
             )
-        if not _is_count(self.adapt_every) or self.adapt_every < 4:
+        if not is_count(self.adapt_every) or self.adapt_every < 4:
             raise ModelError(f"adapt_every={self.adapt_every!r}: expected an integer, at least 4")
         if not isinstance(self.refresh_noise, bool | np.bool_):
             raise ModelError(f"refresh_noise={self.refresh_noise!r}: expected True or False")
+        power = self.screen_power
+        if not _is_real(power) or not 0.0 < power <= 1.0:
+            raise ModelError(f"screen_power={power!r}: expected a number above 0, at most 1")
+        if self.correlation is not None:
+            self._check_correlation(self.correlation)
 
-    @property
-    def adapt(self) -> Callable[..., AdaptationState]:
-        """The adaptation's function."""
-        return ADAPTATIONS[self.adaptation]
-
-    @property
-    def adaptation_settings(self) -> AdaptationSettings:
-        """What that function reads."""
-        return AdaptationSettings(int(self.adapt_every))
+    def _check_correlation(self, correlation: float) -> None:
+        given = f"correlation={correlation!r}"
+        if not _is_real(correlation) or not 0.0 < correlation < 1.0:
+            raise ModelError(f"{given}: expected a number between 0 and 1, or None")
+        if self.stages != (1, 1):
+            raise ModelError(
+                f"{given} needs stages=1, got stages={self.stages}: the noise of a second proposal "
+                "would depend on that of the first, and the densities of the noise would not "
+                "cancel in the probability of accepting it"
+            )
+        if not self.refresh_noise:
+            raise ModelError(f"{given} moves the noise, which refresh_noise=False holds")
+        if self.screen is not None and self.screen.noisy:
+            raise ModelError(
+                f"{given} needs a screen without noise, got screen={self.screen!r}: two estimates "
+                "with noise of their own would not be compared at the same noise"
+            )
 
 
 def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
@@ -112,11 +144,11 @@ def stage_pair(stages: object) -> tuple[int, int]:
     ModelError
         If it is neither, or a number is below 1.
     """
-    pair = (stages, stages) if _is_count(stages) else stages
+    pair = (stages, stages) if is_count(stages) else stages
     if (
         not isinstance(pair, tuple | list)
         or len(pair) != 2
-        or not all(_is_count(k) and k >= 1 for k in pair)
+        or not all(is_count(k) and k >= 1 for k in pair)
     ):
         raise ModelError(
             f"stages={stages!r}: expected an integer, at least 1, or a pair of them "
@@ -129,7 +161,8 @@ def _is_symmetric(cov: np.ndarray) -> bool:
     return np.allclose(cov, cov.T, rtol=1e-8, atol=1e-12 * np.abs(cov).max(initial=0.0))
 
 
-def _is_count(value: object) -> bool:
+def is_count(value: object) -> TypeGuard[int]:
+    """Whether a value is an integer, and not True or False."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 

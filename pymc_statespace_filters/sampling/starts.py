@@ -6,6 +6,7 @@ the one thing known about the units of the variables before a chain has moved.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pymc.initial_point import make_initial_point_fn
@@ -14,11 +15,36 @@ from pymc.model import Model
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.health import reason
 from pymc_statespace_filters.sampling.held_variables import HeldVariables
-from pymc_statespace_filters.sampling.transition import EvaluatedPoint
 
 N_DRAWS = 200
 # Possible prior draws of which a chain starts at the best.
 N_COMPARED = 10
+
+
+class EvaluatedPoint(NamedTuple):
+    """A point with its estimate.
+
+    Attributes
+    ----------
+    position : ndarray, shape (d,)
+        On the unconstrained space.
+    seeds : ndarray of int64, shape (noisy,)
+        The noise behind the estimate.
+    log_density : float
+    failure : int
+        0, or the code of the reason why the log-density is minus infinity.
+    n_effective : float
+        Smallest effective number of particles behind the estimate; infinity if it has no noise.
+    log_screen : float
+        Log-density of the screen, 0 without one.
+    """
+
+    position: np.ndarray
+    seeds: np.ndarray
+    log_density: float
+    failure: int
+    n_effective: float = np.inf
+    log_screen: float = 0.0
 
 
 class Starts:

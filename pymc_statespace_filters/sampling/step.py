@@ -1,10 +1,12 @@
 """DRAM, delayed rejection adaptive Metropolis, as a PyMC step method.
 
-The mathematics is in ``delayed_rejection`` and ``adaptation``; this page is the glue to PyMC.
+The mathematics is in ``delayed_rejection`` and ``adaptation``, an iteration in ``chain``; this page
+is the glue to PyMC.
 """
 
 from collections.abc import Sequence
 from dataclasses import field
+from typing import Any
 
 import numpy as np
 from pymc.model import Model, modelcontext
@@ -13,20 +15,13 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.inspection import COLLAPSED, exactness, noise_seeds
 from pymc_statespace_filters.sampling import progress, statistics
-from pymc_statespace_filters.sampling.adaptation import AdaptationState, start_adaptation
+from pymc_statespace_filters.sampling.chain import Random, State
 from pymc_statespace_filters.sampling.health import Record, closing_warning
-from pymc_statespace_filters.sampling.held_variables import (
-    HeldVariables,
-    check_noise_is_held,
-    continuous_value_vars,
-)
-from pymc_statespace_filters.sampling.log_density import LogDensity
-from pymc_statespace_filters.sampling.randomness import Batch, draw_seeds, take
-from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov, stage_pair
-from pymc_statespace_filters.sampling.starts import Starts, best_start
-from pymc_statespace_filters.sampling.transition import EvaluatedPoint, Move, delayed_rejection_move
+from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key
+from pymc_statespace_filters.sampling.running import RunningChain
+from pymc_statespace_filters.sampling.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target import Target
 
 
 @dataclass_state
@@ -34,9 +29,9 @@ class DRAMState(StepMethodState):
     """What PyMC stores of a chain: with it, the chain goes on as if never interrupted."""
 
     tune: bool
-    _current: EvaluatedPoint | None
-    _adaptation: AdaptationState
-    _batch: Batch | None
+    _state: State | None
+    _key: np.ndarray
+    _iteration: int
     _record: Record
     _n_draws: int
     _disperse: bool
@@ -143,9 +138,11 @@ class DRAM(BlockedStep):
     _make_progressbar_update_functions = staticmethod(progress.update_functions)
 
     # Of the chain now running, as in DRAMState.
-    _current: EvaluatedPoint | None
-    _adaptation: AdaptationState
-    _batch: Batch | None
+    _has_started: bool
+    _chain: RunningChain | None
+    _block: tuple[int, Random] | None
+    _key: np.ndarray
+    _iteration: int
     _record: Record
     _n_draws: int
     _disperse: bool
@@ -162,6 +159,9 @@ class DRAM(BlockedStep):
         adapt_every: int = 100,
         proposal_cov: np.ndarray | None = None,
         refresh_noise: bool = True,
+        screen: Any = None,
+        screen_power: float = 1.0,
+        correlation: float | None = None,
         model: Model | None = None,
         initial_point: dict[str, np.ndarray] | None = None,
         compile_kwargs: dict | None = None,
@@ -170,36 +170,30 @@ class DRAM(BlockedStep):
     ):
         model = modelcontext(model)
         self.settings = DRAMSettings(
-            stage_pair(stages), stage_scale, adaptation, adapt_every, refresh_noise
+            stages,
+            stage_scale,
+            adaptation,
+            adapt_every,
+            refresh_noise,
+            correlation,
+            screen,
+            screen_power,
         )
-        self.vars = continuous_value_vars(vars, model)
+        self._target = Target(model, vars, self.settings, proposal_cov, compile_kwargs)
+        self.vars = list(self._target.held.variables)
         self.blocked = blocked
         self.rng = get_random_generator(rng)
-
-        seeds = noise_seeds(model)
-        check_noise_is_held(model, self.vars, seeds)
-        self._exact = exactness(model) and (refresh_noise or not seeds)
-        self._seed_names = tuple(f"{name}_seed" for name in seeds)
-        self._seed_variables = tuple(seeds.values())
-        default = model.initial_point(random_seed=0)
-        self._log_density = LogDensity(
-            model, self.vars, default, seeds, compile_kwargs, holds_noise=not refresh_noise
-        )
-        self._held = HeldVariables(self.vars, default)
-        self._starts = Starts(model, self._held, default)
-        dim = self._held.dim
-        if proposal_cov is None:
-            self._first_cov = self._starts.covariance()
-        else:
-            self._first_cov = checked_proposal_cov(proposal_cov, dim)
-        self.stats_dtypes = [statistics.dtypes(dim, self._seed_names)]
-        self.stats_dtypes_shapes = statistics.dtypes_shapes(dim, self._seed_names)
+        self.stats_dtypes = [statistics.dtypes(self._target)]
+        self.stats_dtypes_shapes = statistics.dtypes_shapes(self._target)
         self._reset(tune=0, draws=0)
+
+    def __getstate__(self) -> dict:
+        """Leave the machine code behind: another process takes its own."""
+        return self.__dict__ | {"_chain": None, "_block": None, "_has_started": False}
 
     def setup_chain(self, rng: RandomGenerator, tune: int, draws: int) -> None:
         """Begin a chain afresh, as PyMC asks for once per chain."""
         super().setup_chain(rng, tune, draws)
-        self._log_density.prepare()
         self._reset(tune, draws)
 
     def stop_tuning(self) -> None:
@@ -209,96 +203,73 @@ class DRAM(BlockedStep):
 
     def step(self, point: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[dict]]:
         """Make one iteration from a point of the model."""
-        current, codes = self._stand_at(point)
-        move = self._move(current)
-        codes += move.failures
-        self._current = move.point
-        collapsed = move.point.n_effective < COLLAPSED
-        self._record = self._record.include(move.stage > 0, codes, collapsed)
+        running, codes = self._stand_at(point)
+        index, first = divmod(self._iteration, BLOCK)
+        if self._block is None or self._block[0] != index:
+            self._block = index, self._target.random(self._key, index)
+        running.advance(self.tune, self._block[1], first, 0, 1)
+        self._iteration += 1
+        running.add_evaluations(codes)
+        self._record = self._record.include(running.draws, 0)
         is_last = not self.tune and self._record.iterations == self._n_draws
-        stats = statistics.of_draw(
-            move,
-            codes,
-            seed_names=self._seed_names,
-            exact=self._exact,
-            accept_rate=self._record.accept_rate,
-            adaptation=self._adaptation,
-            warning=closing_warning(self._record) if is_last else None,
-        )
-        if self.tune:
-            self._adaptation = self.settings.adapt(
-                self.settings.adaptation_settings, self._adaptation, move.point.position, move.stage
-            )
-        if move.stage > 0 or self._point is None:
-            self._point = point | self._held.split(move.point.position)
+        stats = statistics.of_draws(self._target, running.draws, 0)
+        stats["accept_rate"] = self._record.accept_rate
+        stats[statistics.WARNING] = closing_warning(self._record) if is_last else None
+        if stats["accepted"] or self._point is None:
+            self._point = point | self._target.held.split(running.state.position.copy())
         return self._point, [stats]
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0
-        self._current = None
-        self._point = None
-        self._adaptation = start_adaptation(self._first_cov)
-        self._batch = None
+        self._chain = None
+        self._has_started = False
+        self._key = draw_key(self.rng)
+        self._iteration = 0
         self._record = Record()
         self._n_draws = draws
-        self._held_seeds = tuple(np.array(s.get_value()) for s in self._seed_variables)
         self._disperse = tune > 0
-
-    def _stand_at(self, point: dict[str, np.ndarray]) -> tuple[EvaluatedPoint, tuple[int, ...]]:
-        """Give the current point with its estimate, and the failure codes of what that took."""
-        current = self._current
-        if current is not None and point is self._point:
-            return current, ()
         self._point = None
-        position = self._held.join(point)
-        others = tuple(np.array(point[name]) for name in self._log_density.others)
-        if current is None or not np.array_equal(position, current.position):
-            return self._start(position, others)
-        if all(map(np.array_equal, others, current.others)):
-            return current, ()
-        # The noisy parts depend on none of the others: the same seeds give the same estimate.
-        again = self._evaluate(position, others, current.seeds)
-        return again, (again.failure,)
+        self._block = None
 
-    def _start(
-        self, position: np.ndarray, others: tuple[np.ndarray, ...]
-    ) -> tuple[EvaluatedPoint, tuple[int, ...]]:
-        """Evaluate a first point, dispersed unless somebody chose it."""
-        candidates = self._starts.candidates(position, self.rng) if self._disperse else [position]
-        self._disperse = False
+    def _stand_at(self, point: dict[str, np.ndarray]) -> tuple[RunningChain, tuple[int, ...]]:
+        """Bring the chain to a point; it and the failure codes of the evaluations that took."""
+        running = self._running
+        if self._has_started and point is self._point:
+            return running, ()
+        self._point = None
+        target = self._target
+        position = target.held.join(point)
+        others = [np.array(point[name]) for name in target.density.others]
+        if not self._has_started or not np.array_equal(position, running.state.position):
+            start = [position]
+            if self._disperse:
+                start = target.starts.candidates(position, self.rng)
+            self._disperse = False
+            codes = running.start(start, others, self.rng)
+            self._has_started = True
+            return running, codes
+        if all(map(np.array_equal, others, running.others)):
+            return running, ()
+        # The noisy parts depend on none of the others: the same noise gives the same estimate.
+        return running, (running.evaluate_again(others),)
 
-        def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
-            seeds = draw_seeds(self.rng, (len(self._seed_names),))
-            return self._evaluate(candidate, others, self._noise(seeds))
+    @property
+    def _running(self) -> RunningChain:
+        """The chain's machinery, with the data as they are when it is first asked for."""
+        if self._chain is None:
+            self._target.prepare()
+            self._chain = RunningChain(self._target, 1, 1)
+        return self._chain
 
-        return best_start(candidates, evaluate_afresh)
+    @property
+    def _state(self) -> State | None:
+        """A copy of where the chain stands; None before its first point."""
+        if not self._has_started:
+            return None
+        return State(*(array.copy() for array in self._running.state))
 
-    def _noise(self, fresh: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Turn drawn seeds into arguments, or put the held ones in their place."""
-        if self.settings.refresh_noise:
-            return tuple(np.asarray(seed) for seed in fresh)
-        return self._held_seeds
-
-    def _evaluate(
-        self,
-        position: np.ndarray,
-        others: tuple[np.ndarray, ...],
-        seeds: tuple[np.ndarray, ...],
-    ) -> EvaluatedPoint:
-        return EvaluatedPoint(position, others, seeds, *self._log_density(position, others, seeds))
-
-    def _move(self, current: EvaluatedPoint) -> Move:
-        settings = self.settings
-        self._batch, share = take(
-            self._batch, self.rng, max(settings.stages), self._held.dim, len(self._seed_names)
-        )
-        n_stages = settings.stages[0 if self.tune else 1]
-        return delayed_rejection_move(
-            lambda position, seeds: self._evaluate(position, current.others, seeds),
-            current,
-            self._adaptation.chol,
-            settings.stage_scale,
-            share.normals,
-            share.log_uniforms,
-            [self._noise(seeds) for seeds in share.seeds[:n_stages]],
-        )
+    @_state.setter
+    def _state(self, state: State | None) -> None:
+        self._has_started = state is not None
+        if state is not None:
+            self._running.adopt(state)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.lowering.compiled import FAST_MATH
 from pymc_statespace_filters.lowering.instructions import fma, polynomial
 from pymc_statespace_filters.lowering.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.machine_code import FAST_MATH
 
 N = 40_000
 LARGEST, SMALLEST = np.finfo(float).max, 5e-324

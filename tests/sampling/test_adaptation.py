@@ -1,6 +1,9 @@
 """Adaptation: what a covariance learns from a chain, on exact Gaussian targets."""
 
+from threading import Event
+
 import numpy as np
+import pymc as pm
 import pytest
 
 from pymc_statespace_filters.sampling.adaptation import (
@@ -8,9 +11,14 @@ from pymc_statespace_filters.sampling.adaptation import (
     AdaptationSettings,
     adapt_by_blocks,
     adapt_continuously,
+    pack,
+    packed_size,
     start_adaptation,
+    unpack,
 )
-from pymc_statespace_filters.sampling.transition import EvaluatedPoint, delayed_rejection_move
+from pymc_statespace_filters.sampling.runs import ChainRun, Plan
+from pymc_statespace_filters.sampling.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target import Target
 
 BOTH = pytest.mark.parametrize("adapt", [adapt_by_blocks, adapt_continuously])
 SETTINGS = AdaptationSettings(adapt_every=100)
@@ -23,24 +31,18 @@ def feed(adapt, state, positions, stages):
 
 
 def warm_up(adapt, cov, start, first_cov, n, *, seed, stages=2):
-    """The chain that the step method runs, on N(0, cov)."""
-    rng = np.random.default_rng(seed)
-    precision = np.linalg.inv(cov)
-    state = start_adaptation(first_cov)
-
-    def evaluate(position, seeds):
-        return EvaluatedPoint(position, (), seeds, -0.5 * position @ precision @ position, 0)
-
-    point = evaluate(start, ())
-    for _ in range(n):
-        normals = rng.standard_normal((stages, len(start)))
-        log_uniforms = -rng.standard_exponential(stages)
-        move = delayed_rejection_move(
-            evaluate, point, state.chol, 0.2, normals, log_uniforms, [()] * stages
-        )
-        point = move.point
-        state = adapt(SETTINGS, state, point.position, move.stage)
-    return state
+    """What a chain on N(0, cov) has learnt after n iterations of warm-up."""
+    with pm.Model() as model:
+        x = pm.Flat("x", shape=len(start))
+        pm.Potential("log_density", -0.5 * x @ np.linalg.inv(cov) @ x)
+    scheme = "chain" if adapt is adapt_by_blocks else "continuous"
+    settings = DRAMSettings(stages=stages, adaptation=scheme)
+    target = Target(model, None, settings, first_cov)
+    target.prepare()
+    starts, seeds = [lambda rng: [start]], [np.random.SeedSequence(seed)]
+    run = ChainRun(target, Plan(n, 0, False, starts, seeds), 0, None)
+    run.run(Event())
+    return unpack(run.running.state.adaptation, len(start))
 
 
 def correlated_target(dim, *, smallest_sd, largest_sd, correlation, seed):
@@ -157,3 +159,18 @@ def test_warm_up_of_2000_learns_a_hard_target_from_a_bad_start(adapt, too_wide):
         ratio = np.linalg.eigvals(np.linalg.solve(cov, state.cov * dim / 2.38**2)).real
         assert 0.5 < np.sqrt(ratio.min())
         assert np.sqrt(ratio.max()) < 2.0
+
+
+def test_a_packed_state_is_the_same_state():
+    rng = np.random.default_rng(3)
+    state = feed(adapt_by_blocks, start_adaptation(np.eye(3)), rng.normal(size=(750, 3)), [1] * 750)
+    packed = np.full(packed_size(3), np.nan)
+    pack(state, packed)
+    again = unpack(packed, 3)
+    for mine, theirs in zip(_flat(state), _flat(again), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert len({float(np.sum(part)) for part in _flat(state)}) > 10  # parts that can be told apart
+
+
+def _flat(state):
+    return [part for value in state for part in (value if isinstance(value, tuple) else [value])]

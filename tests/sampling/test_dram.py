@@ -11,7 +11,6 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.starts import N_COMPARED
 
 
 def sample(step, draws=1000, tune=1000, chains=2, cores=1, random_seed=1, **kwargs):
@@ -114,33 +113,6 @@ def test_proposals_are_frozen_after_tuning():
     stages = idata["warmup_sample_stats"]["stage"].to_numpy()
     assert set(np.unique(stages)) == {0, 1, 2}
     assert set(np.unique(idata["sample_stats"]["stage"].to_numpy())) == {0, 1}
-
-
-class Counted:
-    """A log-density that counts its calls."""
-
-    def __init__(self, log_density):
-        self.others, self.prepare = log_density.others, log_density.prepare
-        self._log_density, self.calls = log_density, 0
-
-    def __call__(self, *args):
-        self.calls += 1
-        return self._log_density(*args)
-
-
-def test_one_evaluation_for_each_proposal():
-    with simple_model():
-        step = DRAM(stages=(3, 2))
-        step._log_density = Counted(step._log_density)
-        idata = sample(step, draws=200, tune=200, chains=1, discard_tuned_samples=False)
-    proposals = 0
-    for group, n_stages in (("warmup_sample_stats", 3), ("sample_stats", 2)):
-        stage = idata[group]["stage"].to_numpy()
-        proposals += np.where(stage > 0, stage, n_stages).sum()
-    stats = idata["sample_stats"]["n_evaluations"].sum()
-    stats += idata["warmup_sample_stats"]["n_evaluations"].sum()
-    # A start from the prior is the best of a few.
-    assert step._log_density.calls == proposals + N_COMPARED == stats
 
 
 def test_same_seed_same_draws_in_sequence_and_in_processes():

@@ -7,17 +7,18 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from tests.sampling.noisy_toy import exact_posterior, noisy_model
+from pymc_statespace_filters.sampling.starts import N_COMPARED
+from tests.sampling.noisy_toy import Recorder, exact_posterior, noisy_model
 
 
 @pytest.fixture
 def toy(monkeypatch):
     """A function that makes the noisy model and lets DRAM know its seed."""
 
-    def make(noise_sd):
-        model, seed = noisy_model(noise_sd)
+    def make(noise_sd, *, records=False):
+        model, seed = noisy_model(noise_sd, records=records)
         monkeypatch.setattr(
-            "pymc_statespace_filters.sampling.step.noise_seeds", lambda model: {"d": seed}
+            "pymc_statespace_filters.sampling.target.noise_seeds", lambda model: {"d": seed}
         )
         return model
 
@@ -41,7 +42,7 @@ class Redrawing(DRAM):
     """The common mistake: the current point's likelihood is estimated anew."""
 
     def _stand_at(self, point):
-        self._current = None
+        self._has_started = False
         return super()._stand_at(point)
 
 
@@ -100,7 +101,7 @@ def test_held_noise_is_the_models(toy):
     with toy(noise_sd=1.3):
         step = DRAM(refresh_noise=False)
         idata = sample(step, draws=8000)
-        step._seed_variables[0].set_value(np.array(21))
+        step._target._seed_variables[0].set_value(np.array(21))
         again = sample(step, draws=10)
     assert np.all(idata["sample_stats"]["d_seed"] == 20)
     assert np.all(again["sample_stats"]["d_seed"] == 21)
@@ -135,18 +136,22 @@ def test_another_variables_move_keeps_the_noise(toy):
     assert abs(draws.std() - np.hypot(sd, 1.0)) < 4.0 * az.mcse(draws, method="sd")
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_every_proposal_of_every_stage_has_noise_of_its_own(toy):
-    with toy(1.3):
-        step = DRAM(stages=3)
-        seen: list[int] = []
-        evaluate = step._evaluate
-        step._evaluate = lambda position, others, seeds: (
-            seen.append(int(seeds[0])) or evaluate(position, others, seeds)
-        )
-        pm.sample(
+def test_every_evaluation_is_of_another_proposal_with_noise_of_its_own(toy):
+    """Of every stage; and none is made for nothing."""
+    Recorder.seen.clear()
+    with toy(noise_sd=1.3, records=True):
+        step = DRAM(stages=(3, 2), compile_kwargs={"mode": "FAST_COMPILE"})
+        idata = pm.sample(
             50, tune=50, chains=1, step=step, random_seed=1, progressbar=False, quiet=True,
-            compute_convergence_checks=False,
+            compute_convergence_checks=False, discard_tuned_samples=False,
         )  # fmt: skip
-    assert len(seen) > 150
-    assert len(set(seen)) == len(seen)
+    proposals = evaluations = 0
+    for group, n_stages in (("warmup_sample_stats", 3), ("sample_stats", 2)):
+        stage = idata[group]["stage"].to_numpy()
+        proposals += np.where(stage > 0, stage, n_stages).sum()
+        evaluations += idata[group]["n_evaluations"].to_numpy().sum()
+    # A start from the prior is the best of a few.
+    assert evaluations == proposals + N_COMPARED
+    # One more learns the shapes, before the chain begins.
+    assert len(Recorder.seen) == evaluations + 1
+    assert len(set(Recorder.seen)) == len(Recorder.seen)

@@ -102,7 +102,7 @@ def test_the_same_test_finds_redrawn_estimates():
 def test_the_filter_runs_once_in_an_evaluation():
     with linear_model(FEW):
         step = DRAM()
-    nodes = step._log_density._function.maker.fgraph.apply_nodes
+    nodes = step._target.density._function.maker.fgraph.apply_nodes
     assert sum(isinstance(node.op, LogLikelihood) for node in nodes) == 1
 
 
@@ -181,6 +181,6 @@ def test_held_noise_is_made_once_and_gives_what_its_seed_gives(filter):
         seeds["d"].set_value(np.array(seed))
         by_normals.prepare()
         for position in (np.array([0.4, -0.3]), np.array([0.1, 0.2])):
-            values.append(by_normals(position, (), [np.array(99)]))
-            assert values[-1] == by_seed(position, (), [np.array(seed)])
+            values.append(by_normals.bind()(position, (), [99]))
+            assert values[-1] == by_seed.bind()(position, (), [seed])
     assert len(set(values)) == 4

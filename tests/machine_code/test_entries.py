@@ -10,7 +10,7 @@ import numpy as np
 from numba import carray, njit, types
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.lowering import NUMBERS, Entry, address_of, call_address, entries
+from pymc_statespace_filters.machine_code import NUMBERS, Entry, address_of, call_address, entries
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
 ROOT = Path(__file__).parents[2]
@@ -99,7 +99,7 @@ def test_the_point_mass_filter_is_compiled_once_for_all_systems_and_tolerances()
 
 PROCESS = """
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.lowering import entries
+from pymc_statespace_filters.machine_code import entries
 from tests.small_systems import FORCE, FORCED_DATA, FORCED, STEPS
 value = psf.log_likelihood(
     FORCED, psf.EnKF(10), {"a": 0.6}, FORCED_DATA, steps=STEPS, inputs=FORCE

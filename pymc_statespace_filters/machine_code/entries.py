@@ -22,7 +22,7 @@ from numba.extending import intrinsic
 from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
-from pymc_statespace_filters.lowering.compiled import FAST_MATH
+from pymc_statespace_filters.machine_code.keys import FAST_MATH
 
 NUMBERS = types.CPointer(types.float64)
 COUNTS = types.CPointer(types.int64)
@@ -43,6 +43,14 @@ class _CacheByKey(FunctionCache):
 _compiled: dict[str, Any] = {}
 
 
+def kept(function: Any, key: str) -> Any:
+    """Keep a compiled function on PyTensor's disk cache, under a key that identifies its code."""
+    if config.numba__cache:
+        CACHED_SRC_FUNCTIONS[function.py_func] = key
+        function._cache = _CacheByKey(function.py_func)
+    return function
+
+
 class Entry:
     """A function that is compiled when `compile` is first called, and called by its ``symbol``.
 
@@ -55,7 +63,7 @@ class Entry:
     name : str
         Part of the symbol, for the reader of a profile.
     key : str or None
-        Identifies the code, see ``compiled.digest``; None if it cannot be kept on disk.
+        Identifies the code, see ``keys.digest``; None if it cannot be kept on disk.
     needs : sequence of Entry
         What the function calls by symbol.
     """
@@ -88,6 +96,11 @@ class Entry:
         compiled.compile()
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled
+
+    @property
+    def address(self) -> int:
+        """Where the compiled code lies."""
+        return _compiled[self.symbol].address
 
     @property
     def external(self) -> types.ExternalFunction:

@@ -1,0 +1,334 @@
+"""A chain in machine code: propose, evaluate, accept, adapt, note down, again and again.
+
+The step method of PyMC makes one iteration at a time with it, ``sample_dram`` as many as there are.
+
+With a noisy likelihood every proposal of every stage has noise of its own, and the estimate of the
+current point stays as it is. The densities of the noise then cancel in Eq. 3.32, so that the chain
+is exact for prior times expected likelihood, whatever the number of stages.
+
+With a screen the whole delayed-rejection move runs on a cheap density c. It is a kernel reversible
+for c, so that its end point z is a proposal from the current point y that is accepted with
+probability min(1, pi(z) c(y) / (pi(y) c(z))) (surrogate transition, Liu 2001, section 9.4.3). Only
+then the expensive density pi is evaluated, once, with fresh noise.
+
+References
+----------
+C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
+computations. Annals of Statistics 37, 697-725.
+J. S. Liu (2001). Monte Carlo Strategies in Scientific Computing. Springer.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pymc_statespace_filters.machine_code import Call, digest, kept, make_call
+from pymc_statespace_filters.sampling.adaptation import (
+    AdaptationSettings,
+    adapt_by_blocks,
+    adapt_continuously,
+    pack,
+    unpack,
+)
+from pymc_statespace_filters.sampling.delayed_rejection import gaussian_log_acceptance
+
+HEALTH_SIZE = 3
+# Reasons of a failure that no filter reports: a value that is no density, an exception.
+NOT_A_NUMBER, RAISED = -1, -2
+
+# Columns of a chain's numbers, and of the numbers and counts of its draws.
+LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN = range(3)
+ACCEPTANCE, SCALING = 2, 3
+N_NUMBERS = 4
+STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED = range(6)
+N_COUNTS = 6
+# Cells by which a running chain and whoever waits for it talk.
+PAUSE, DONE = range(2)
+
+
+class Density(NamedTuple):
+    """A log-density that machine code can call.
+
+    Attributes
+    ----------
+    call : Call
+        Its results are the log-density, the health of each filter, and the noise it used if the
+        chain carries that.
+    position : ndarray, shape (d,)
+        What the call reads.
+    seeds : ndarray of int64, shape (noisy,)
+        What the call reads too.
+    n_healths : int
+    """
+
+    call: Call
+    position: np.ndarray
+    seeds: np.ndarray
+    n_healths: int
+
+
+class Settings(NamedTuple):
+    """What does not change within a phase of a chain, warm-up or sampling."""
+
+    n_stages: int
+    stage_scale: float
+    screened: bool
+    adapts: bool
+    continuous: bool
+    adapt_every: int
+
+
+class State(NamedTuple):
+    """Where a chain stands: plain arrays, changed in place.
+
+    Attributes
+    ----------
+    position : ndarray, shape (d,)
+        On the unconstrained space.
+    seeds : ndarray of int64, shape (noisy,)
+        The noise behind the estimate.
+    numbers : ndarray, shape (3,)
+        Log-density as it was estimated when the chain came here; smallest effective number of
+        particles behind it (infinity without noise); log-density of the screen.
+    adaptation : ndarray
+        What was learnt, see `adaptation.pack`.
+    carried : ndarray
+        The noise itself, where the chain moves it instead of drawing it anew.
+    """
+
+    position: np.ndarray
+    seeds: np.ndarray
+    numbers: np.ndarray
+    adaptation: np.ndarray
+    carried: np.ndarray
+
+
+class Random(NamedTuple):
+    """Random numbers of consecutive iterations: the first axis.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (iterations, stages, d)
+        Standard normals, for the proposals.
+    log_uniforms : ndarray, shape (iterations, stages + 1)
+        Logs of uniforms for acceptance: by stage, and of a screened move.
+    seeds : ndarray of int64, shape (iterations, stages, noisy)
+        Seeds of the likelihoods' own noise.
+    """
+
+    normals: np.ndarray
+    log_uniforms: np.ndarray
+    seeds: np.ndarray
+
+
+class Draws(NamedTuple):
+    """What is noted down of each iteration: the first axis.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n, d)
+    numbers : ndarray, shape (n, 4)
+        Columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING.
+    counts : ndarray of int64, shape (n, 6)
+        Columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS, N_FAILED, FAILURE
+        (the last one's code), N_SCREENED, N_SCREEN_FAILED.
+    seeds : ndarray of int64, shape (n, noisy)
+    covs : ndarray, shape (n_covs, d, d)
+        Covariance of the first stage's proposals, of the first few iterations, or of none.
+    """
+
+    positions: np.ndarray
+    numbers: np.ndarray
+    counts: np.ndarray
+    seeds: np.ndarray
+    covs: np.ndarray
+
+
+class _Value(NamedTuple):
+    log_density: float
+    failure: int
+    n_effective: float
+
+
+class _Move(NamedTuple):
+    """Outcome of delayed rejection; the new point, if any, is in the density's own arrays."""
+
+    stage: int
+    value: _Value
+    acceptance: float
+    n_evaluations: int
+    n_failed: int
+    failure: int
+
+
+_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# For a function with one caller, which else would be optimised twice.
+_pasted = njit(error_model="numpy", nogil=True, inline="always")
+
+
+@_internal
+def _copy(source, target):
+    # An assignment of slices would compile several seconds of messages about their shapes.
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@njit(error_model="numpy", nogil=True)
+def evaluate(density):
+    """Evaluate at the density's own position and seeds.
+
+    The log-density is never NaN nor plus infinity: an evaluation that failed is minus infinity with
+    the code of its reason.
+    """
+    if not make_call(density.call):
+        return _Value(-np.inf, RAISED, 0.0)
+    out, n_effective = density.call.out, np.inf
+    for i in range(density.n_healths):
+        at = 2 + HEALTH_SIZE * i
+        n_effective = min(n_effective, out[at])
+        if out[at + 1] != 0.0:
+            return _Value(-np.inf, int(out[at + 1]), n_effective)
+    if not out[1] < np.inf:
+        return _Value(-np.inf, NOT_A_NUMBER, n_effective)
+    return _Value(out[1], 0, n_effective)
+
+
+@_internal
+def _delayed_rejection(density, log_density, position, chol, settings, random, k):
+    """Propose stage by stage until one is accepted or all are spent (thesis, Eqs. 3.30-3.32)."""
+    dim = position.size
+    log_pi = np.empty(settings.n_stages + 1)
+    log_pi[0] = log_density
+    offsets = np.zeros((settings.n_stages + 1, dim))
+    acceptance, scale, n_failed, failure = 0.0, 1.0, 0, 0
+    value = _Value(log_density, 0, np.inf)
+    for stage in range(1, settings.n_stages + 1):
+        for i in range(dim):
+            offsets[stage, i] = random.normals[k, stage - 1, i] * scale
+        for i in range(dim):
+            moved = position[i]
+            for j in range(i + 1):
+                moved += chol[i, j] * offsets[stage, j]
+            density.position[i] = moved
+        _copy(random.seeds[k, stage - 1], density.seeds)
+        value = evaluate(density)
+        if value.failure != 0:
+            n_failed, failure = n_failed + 1, value.failure
+            if failure == RAISED:
+                break
+        log_pi[stage] = value.log_density
+        log_alpha = gaussian_log_acceptance(log_pi, offsets, settings.stage_scale, stage)
+        if stage == 1:
+            acceptance = np.exp(log_alpha)
+        if random.log_uniforms[k, stage - 1] < log_alpha:
+            return _Move(stage, value, acceptance, stage, n_failed, failure)
+        scale *= settings.stage_scale
+    return _Move(0, value, acceptance, settings.n_stages, n_failed, failure)
+
+
+@_internal
+def _stand(state, density, value, log_screen):
+    """Move to where a density was evaluated, and keep the estimate."""
+    _copy(density.position, state.position)
+    _copy(density.seeds, state.seeds)
+    state.numbers[LOG_DENSITY] = value.log_density
+    state.numbers[N_EFFECTIVE] = value.n_effective
+    state.numbers[LOG_SCREEN] = log_screen
+    first = density.call.out.size - state.carried.size
+    _copy(density.call.out[first:], state.carried)
+
+
+@_pasted
+def _move(settings, target, state, chol, random, k, counts):
+    """One iteration without a screen; the probability of accepting its first proposal."""
+    log_density = state.numbers[LOG_DENSITY]
+    move = _delayed_rejection(target, log_density, state.position, chol, settings, random, k)
+    if move.stage > 0:
+        _stand(state, target, move.value, 0.0)
+    counts[STAGE], counts[N_EVALUATIONS] = move.stage, move.n_evaluations
+    counts[N_FAILED], counts[FAILURE] = move.n_failed, move.failure
+    counts[N_SCREENED], counts[N_SCREEN_FAILED] = 0, 0
+    return move.acceptance
+
+
+@_pasted
+def _screened_move(settings, target, screen, state, chol, random, k, counts):
+    """One iteration whose moves a screen makes; the probability of accepting what it proposed."""
+    log_screen = state.numbers[LOG_SCREEN]
+    move = _delayed_rejection(screen, log_screen, state.position, chol, settings, random, k)
+    counts[STAGE], counts[N_EVALUATIONS] = 0, 0
+    counts[N_FAILED], counts[FAILURE] = 0, RAISED if move.failure == RAISED else 0
+    counts[N_SCREENED], counts[N_SCREEN_FAILED] = move.n_evaluations, move.n_failed
+    if move.stage == 0:
+        return 0.0
+    _copy(screen.position, target.position)
+    _copy(random.seeds[k, 0], target.seeds)
+    value = evaluate(target)
+    counts[N_EVALUATIONS], counts[FAILURE] = 1, value.failure
+    if value.failure != 0:
+        counts[N_FAILED] = 1
+        return 0.0
+    there, here = (
+        value.log_density - move.value.log_density,
+        state.numbers[LOG_DENSITY] - log_screen,
+    )
+    log_alpha = min(0.0, there - here)
+    if random.log_uniforms[k, settings.n_stages] < log_alpha:
+        _stand(state, target, value, move.value.log_density)
+        counts[STAGE] = move.stage
+    return np.exp(log_alpha)
+
+
+@_pasted
+def _adapt(settings, learnt, position, stage):
+    if settings.continuous:
+        return adapt_continuously(AdaptationSettings(settings.adapt_every), learnt, position, stage)
+    return adapt_by_blocks(AdaptationSettings(settings.adapt_every), learnt, position, stage)
+
+
+@_internal
+def _scaling(chol):
+    """Geometric mean of the standard deviations along the axes of the proposal."""
+    total = 0.0
+    for i in range(chol.shape[0]):
+        total += np.log(chol[i, i])
+    return np.exp(total / chol.shape[0])
+
+
+def _advance(settings, target, screen, state, random, first, draws, row, n, talk):
+    learnt = unpack(state.adaptation, state.position.size)
+    scaling = _scaling(learnt.chol)
+    done = 0
+    while done < n and talk[PAUSE] == 0:
+        at, k = row + done, first + done
+        counts, numbers = draws.counts[at], draws.numbers[at]
+        if settings.screened:
+            acceptance = _screened_move(
+                settings, target, screen, state, learnt.chol, random, k, counts
+            )
+        else:
+            acceptance = _move(settings, target, state, learnt.chol, random, k, counts)
+        if counts[FAILURE] == RAISED:
+            break
+        _copy(state.position, draws.positions[at])
+        _copy(state.seeds, draws.seeds[at])
+        numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]
+        numbers[N_EFFECTIVE] = state.numbers[N_EFFECTIVE]
+        numbers[ACCEPTANCE], numbers[SCALING] = acceptance, scaling
+        if at < draws.covs.shape[0]:
+            for i in range(state.position.size):
+                _copy(learnt.cov[i], draws.covs[at, i])
+        if settings.adapts:
+            learnt = _adapt(settings, learnt, state.position, counts[STAGE])
+            scaling = _scaling(learnt.chol)
+        done += 1
+        talk[DONE] += 1
+    pack(learnt, state.adaptation)
+    return done
+
+
+_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py")
+_KEY = digest("chain", *(Path(__file__).with_name(name).read_text() for name in _SOURCES))
+advance = kept(njit(_advance, error_model="numpy", nogil=True), _KEY)

@@ -1,0 +1,193 @@
+"""One chain while it runs: where it stands, and the arrays that its machine code works on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pymc_statespace_filters.sampling import chain
+from pymc_statespace_filters.sampling.adaptation import pack, packed_size, start_adaptation
+from pymc_statespace_filters.sampling.chain import Draws, Random, Settings, State, advance
+from pymc_statespace_filters.sampling.randomness import draw_seeds
+from pymc_statespace_filters.sampling.starts import EvaluatedPoint, best_start
+from pymc_statespace_filters.sampling.target import Target
+
+
+class RunningChain:
+    """A chain of a target.
+
+    Parameters
+    ----------
+    target : Target
+        Prepared.
+    n_rows : int
+        Iterations of which the draws are kept.
+    n_covs : int
+        Of how many of these, the first, the proposal covariance is kept.
+
+    Attributes
+    ----------
+    state : State
+    draws : Draws
+    talk : ndarray of int64, shape (2,)
+        See `chain.PAUSE` and `chain.DONE`.
+    """
+
+    def __init__(self, target: Target, n_rows: int, n_covs: int):
+        self._target = target
+        self._density = target.density.bind()
+        self._screen = None if target.screen is None else target.screen.bind()
+        dim, n_noisy = target.held.dim, len(target.seed_names)
+        adaptation = np.empty(packed_size(dim))
+        pack(start_adaptation(target.first_cov), adaptation)
+        self.state = State(
+            np.empty(dim),
+            np.zeros(n_noisy, dtype=np.int64),
+            np.zeros(3),
+            adaptation,
+            self._density.carried,
+        )
+        self.draws = Draws(
+            np.empty((n_rows, dim)),
+            np.empty((n_rows, chain.N_NUMBERS)),
+            np.zeros((n_rows, chain.N_COUNTS), dtype=np.int64),
+            np.empty((n_rows, n_noisy), dtype=np.int64),
+            np.empty((n_covs, dim, dim)),
+        )
+        self.talk = np.zeros(2, dtype=np.int64)
+
+    def start(
+        self,
+        candidates: Sequence[np.ndarray],
+        others: Sequence[np.ndarray],
+        rng: np.random.Generator,
+    ) -> tuple[int, ...]:
+        """Stand at the best of the candidates, each with noise of its own.
+
+        Parameters
+        ----------
+        candidates : sequence of ndarray, shape (d,)
+            The last one is where the chain was told to start.
+        others : sequence of ndarray
+            Values of the variables that other step methods move.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        tuple of int
+            For each evaluation made, 0 or the code of its failure.
+        """
+        self._density.correlation[...] = 0.0
+
+        def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
+            return self._evaluate(
+                candidate, others, self.noise(draw_seeds(rng, self.state.seeds.shape))
+            )
+
+        start, codes = best_start(candidates, evaluate_afresh)
+        if self.state.carried.size:  # the noise of the start, which others have overwritten
+            self._evaluate(start.position, others, start.seeds)
+        self._stand(start)
+        return codes
+
+    def evaluate_again(self, others: Sequence[np.ndarray]) -> int:
+        """Evaluate the current point with its noise where only others moved; its failure's code."""
+        self._density.correlation[...] = 1.0
+        again = self._evaluate(self.state.position.copy(), others, self.state.seeds.copy())
+        self._stand(again)
+        return again.failure
+
+    def adopt(self, state: State) -> None:
+        """Go on from a state: a copy of it, as the machine code reads arrays of its own."""
+        for mine, given in zip(self.state, state, strict=True):
+            if mine is not given:
+                mine[...] = given
+
+    def snapshot(self, begin: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Draws from an iteration on, and the state, as plain arrays for a checkpoint."""
+        rows = slice(begin, int(self.talk[chain.DONE]))
+        draws = {name: array[rows] for name, array in self.draws._asdict().items()}
+        return draws, self.state._asdict()
+
+    def restore(self, draws: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> None:
+        """Go on from all the snapshots of a checkpoint together."""
+        for name, array in self.draws._asdict().items():
+            array[: len(draws[name])] = draws[name]
+        self.adopt(State(**state))
+        self.talk[chain.DONE] = len(draws["positions"])
+        self._move_noise()
+
+    def add_evaluations(self, codes: Sequence[int]) -> None:
+        """Count evaluations made in Python, by the codes of their failures, to the first draw."""
+        if codes:
+            counts = self.draws.counts[0]
+            failed = [code for code in codes if code]
+            counts[chain.N_EVALUATIONS] += len(codes)
+            counts[chain.N_FAILED] += len(failed)
+            if failed and not counts[chain.FAILURE]:
+                counts[chain.FAILURE] = failed[-1]
+
+    @property
+    def others(self) -> list[np.ndarray]:
+        """Values of the variables that other step methods move, as they were last."""
+        return self._density.others
+
+    def noise(self, fresh: np.ndarray) -> np.ndarray:
+        """Seeds of an evaluation: those drawn, or the held ones in their place."""
+        return fresh if self._target.settings.refresh_noise else self._target.held_seeds
+
+    def advance(self, tune: bool, random: Random, first: int, row: int, n: int) -> int:
+        """Make up to n iterations with random numbers from ``first``, noted down from ``row``.
+
+        Returns
+        -------
+        int
+            How many were made: fewer if somebody asked for a pause.
+
+        Raises
+        ------
+        Exception
+            What the model raised.
+        """
+        settings = self._target.settings
+        phase = Settings(
+            settings.stages[0 if tune else 1],
+            float(settings.stage_scale),
+            self._screen is not None,
+            tune,
+            settings.adaptation == "continuous",
+            int(settings.adapt_every),
+        )
+        target = self._density.density
+        screen = target if self._screen is None else self._screen.density
+        done = advance(
+            phase, target, screen, self.state, random, first, self.draws, row, n, self.talk
+        )
+        if done < n and not self.talk[chain.PAUSE]:
+            for density in filter(None, (self._screen, self._density)):
+                density.raise_error()
+            raise RuntimeError("the model's log-density raised an error, but not when asked again")
+        return done
+
+    def _evaluate(
+        self, position: np.ndarray, others: Sequence[np.ndarray], seeds: np.ndarray
+    ) -> EvaluatedPoint:
+        log_screen = 0.0
+        if self._screen is not None:
+            log_screen, failure, _ = self._screen(position, others, seeds)
+            if log_screen == -np.inf:
+                return EvaluatedPoint(position, seeds, -np.inf, failure)
+        return EvaluatedPoint(position, seeds, *self._density(position, others, seeds), log_screen)
+
+    def _stand(self, point: EvaluatedPoint) -> None:
+        """Take a point just evaluated as the current one, and its noise."""
+        state = self.state
+        state.position[:], state.seeds[:] = point.position, point.seeds
+        state.numbers[:] = point.log_density, point.n_effective, point.log_screen
+        if state.carried.size:
+            state.carried[:] = self._density.density.call.out[-state.carried.size :]
+        self._move_noise()
+
+    def _move_noise(self) -> None:
+        """From now on, move the noise by as much as the settings say."""
+        if self._target.settings.correlation is not None:
+            self._density.correlation[...] = self._target.settings.correlation

@@ -1,0 +1,112 @@
+"""What all chains of a run share: the log-densities, and where chains start."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pymc.model import Model
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.inspection import exactness, noise_seeds, state_space_names
+from pymc_statespace_filters.sampling.chain import Random
+from pymc_statespace_filters.sampling.held_variables import (
+    HeldVariables,
+    check_noise_is_held,
+    continuous_value_vars,
+)
+from pymc_statespace_filters.sampling.log_density import LogDensity, screening_density
+from pymc_statespace_filters.sampling.randomness import random_block
+from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov
+from pymc_statespace_filters.sampling.starts import Starts
+
+
+class Target:
+    """A model as the sampler sees it.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    vars : sequence of TensorVariable, optional
+        Continuous variables to sample. Default: all.
+    settings : DRAMSettings
+    proposal_cov : array_like, shape (d, d), optional
+    compile_kwargs : dict, optional
+        Passed to PyMC's compiler.
+    graph : TensorVariable, optional
+        The log-density if it is not the model's own.
+
+    Attributes
+    ----------
+    held : HeldVariables
+    starts : Starts
+    density : LogDensity
+    screen : LogDensity or None
+    first_cov : ndarray, shape (d, d)
+        Covariance of the first proposals.
+    exact : bool
+        Whether the chains target the posterior itself, without the bias of a filter's noise.
+    seed_names : tuple of str
+        Of the noise seeds that are noted down.
+
+    Raises
+    ------
+    ModelError
+        If a variable is discrete, a noisy StateSpace depends on others than ``vars``, or
+        ``proposal_cov`` or the screen does not fit.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        vars: Sequence[TensorVariable] | None,
+        settings: DRAMSettings,
+        proposal_cov: np.ndarray | None = None,
+        compile_kwargs: dict | None = None,
+        *,
+        graph: TensorVariable | None = None,
+    ):
+        self.settings = settings
+        variables = continuous_value_vars(vars, model)
+        seeds = noise_seeds(model)
+        check_noise_is_held(model, variables, seeds)
+        self.exact = exactness(model) and (settings.refresh_noise or not seeds)
+        self.seed_names = tuple(f"{name}_seed" for name in seeds)
+        self._seed_variables = tuple(seeds.values())
+        default = model.initial_point(random_seed=0)
+        self.held = HeldVariables(variables, default)
+        self.starts = Starts(model, self.held, default)
+        if proposal_cov is None:
+            self.first_cov = self.starts.covariance()
+        else:
+            self.first_cov = checked_proposal_cov(proposal_cov, self.held.dim)
+
+        shared = (model, variables, default, seeds, compile_kwargs)
+        self.density = LogDensity(
+            *shared,
+            holds_noise=not settings.refresh_noise,
+            correlation=settings.correlation,
+            graph=graph,
+        )
+        self.screen = None
+        if settings.screen is not None:
+            if not state_space_names(model):
+                raise ModelError(
+                    f"screen={settings.screen!r}: the model has no StateSpace variable"
+                )
+            graph = screening_density(model, settings.screen, settings.screen_power)
+            self.screen = LogDensity(*shared, holds_noise=True, graph=graph)
+
+    def prepare(self) -> None:
+        """Take hold of machine code, and of data and held seeds as they are now."""
+        self.held_seeds = np.array([s.get_value() for s in self._seed_variables], dtype=np.int64)
+        self.density.prepare()
+        if self.screen is not None:
+            self.screen.prepare()
+
+    def random(self, key: np.ndarray, index: int) -> Random:
+        """Draw a block of random numbers for a chain with this key."""
+        shape = max(self.settings.stages), self.held.dim, len(self.seed_names)
+        block = random_block(key, index, *shape)
+        if not self.settings.refresh_noise:
+            block.seeds[...] = self.held_seeds
+        return block
