@@ -148,7 +148,7 @@ def move_noise(
         if isinstance(node.op, LogLikelihood) and node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
-            filter: Any = noisy.smooth()  # type: ignore[union-attr]
+            filter: Any = noisy.smooth(system)  # type: ignore[union-attr]
             filter.check(system)
             normals = pt.dvector(f"{names[seed]}_normals")
             fresh = StoredNoise(system, filter)(steps, seed)

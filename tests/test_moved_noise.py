@@ -51,15 +51,18 @@ def moving(model):
 
 
 FILTERS = [
-    (psf.BootstrapPF(40), psf.BootstrapPF(40, resampling="sorted")),
+    (psf.BootstrapPF(40), psf.BootstrapPF(40, resampling="sorted", resample_below=1)),
     (psf.EnKF(40), psf.EnKF(40)),
 ]
 
 
 def test_the_smooth_version_keeps_all_other_settings():
-    nudged = psf.PFEnKF(70, resample_below=1, likelihood="weights")
-    filters = [*FILTERS, (nudged, replace(nudged, resampling="sorted"))]
-    assert all(filter.smooth() == smooth == smooth.smooth() for filter, smooth in filters)
+    nudged = psf.PFEnKF(70, resample_below=0.5, likelihood="weights")
+    always = replace(nudged, resampling="sorted", resample_below=1)
+    for filter, smooth in [*FILTERS, (nudged, always)]:
+        assert filter.smooth(system()) == smooth == smooth.smooth(system())
+    # An order of two states is not exact: the threshold stays.
+    assert nudged.smooth(system(2)) == replace(nudged, resampling="sorted")
 
 
 @pytest.mark.parametrize(("filter", "smooth"), FILTERS, ids=lambda f: type(f).__name__)

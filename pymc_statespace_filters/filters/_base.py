@@ -58,7 +58,7 @@ class EnsembleFilter:
         """Return the filter that treats this system: itself, unless nothing is to be nudged."""
         return self
 
-    def smooth(self) -> "EnsembleFilter":
+    def smooth(self, system: StateSpaceModel) -> "EnsembleFilter":
         """Return this filter with an estimate that changes little when its normals do."""
         return self
 

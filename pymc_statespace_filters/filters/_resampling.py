@@ -11,7 +11,8 @@ here N.
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,6 +100,17 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
     copy_ancestors(ancestors, X, buffer)
     for i in range(N):
         log_w[i] = -math.log(N)
+
+
+def smooth_resampling(filter: Any, n_states: int) -> Any:
+    """Give a particle filter's version whose estimate moves little when its normals do.
+
+    Whether to resample is a jump of its own, which is avoided by resampling at every observation
+    where the order of the particles is exact. Along a curve through several dimensions it is not,
+    and resampling less often is better.
+    """
+    always = {"resample_below": 1.0} if n_states == 1 else {}
+    return replace(filter, resampling="sorted", **always)
 
 
 def n_normals(scheme: str, n_particles: int) -> int:

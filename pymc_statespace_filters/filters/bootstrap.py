@@ -1,7 +1,7 @@
 """Bootstrap particle filter (thesis, section 4.4, Eqs. 4.27-4.28, 4.43-4.44): the unbiased one."""
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from pymc_statespace_filters.filters._resampling import (
     n_normals,
     resample_if_few,
     resampler,
+    smooth_resampling,
 )
 from pymc_statespace_filters.filters._system import log_density
 from pymc_statespace_filters.filters._weights import effective_number, normalise
@@ -120,9 +121,9 @@ class BootstrapPF(EnsembleFilter):
         super().check(system)
         check_sortable(self.resampling, system.n)
 
-    def smooth(self) -> EnsembleFilter:
+    def smooth(self, system: StateSpaceModel) -> EnsembleFilter:
         """Return this filter with an estimate that changes little when its normals do."""
-        return replace(self, resampling="sorted")
+        return smooth_resampling(self, system.n)
 
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""

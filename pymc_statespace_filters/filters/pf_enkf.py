@@ -1,7 +1,7 @@
 """Particle filter with an ensemble Kalman proposal (thesis, section 4.4, Eqs. 4.29-4.44)."""
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ from pymc_statespace_filters.filters._resampling import (
     n_normals,
     resample_if_few,
     resampler,
+    smooth_resampling,
 )
 from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, log_sum, normalise
@@ -288,9 +289,9 @@ class PFEnKF(EnsembleFilter):
         super().check(system)
         check_sortable(self.resampling, system.n)
 
-    def smooth(self) -> EnsembleFilter:
+    def smooth(self, system: StateSpaceModel) -> EnsembleFilter:
         """Return this filter with an estimate that changes little when its normals do."""
-        return replace(self, resampling="sorted")
+        return smooth_resampling(self, system.n)
 
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""

@@ -94,7 +94,7 @@ class Target:
                     f"screen={settings.screen!r}: the model has no StateSpace variable"
                 )
             graph = screening_density(model, settings.screen, settings.screen_power)
-            self.screen = LogDensity(*shared, holds_noise=True, graph=graph)
+            self.screen = LogDensity(*shared, holds_noise=settings.screen.noisy, graph=graph)
 
     def prepare(self) -> None:
         """Take hold of machine code, and of data and held seeds as they are now."""
