@@ -104,7 +104,8 @@ def test_every_noisy_variable_has_normals_of_its_own():
     assert sorted(v.name for v in noise.normals) == ["d_normals", "f_normals"]
     nodes = [v.owner.op for v in pytensor.graph.traversal.ancestors([logp]) if v.owner is not None]
     filters = {op.filter for op in nodes if isinstance(op, LogLikelihood)}
-    assert filters == {psf.EnKF(40), psf.BootstrapPF(20, resampling="sorted"), psf.EKF()}
+    smooth = psf.BootstrapPF(20, resampling="sorted", resample_below=1)
+    assert filters == {psf.EnKF(40), smooth, psf.EKF()}
     sizes = pytensor.function([], noise.sizes)()
     first = moving(one_variable(psf.EnKF(40)))
     assert first(0.0, 0.0, np.zeros(int(sizes[0])), 1)[3] == sizes[0]

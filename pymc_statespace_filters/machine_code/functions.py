@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, njit, typeof, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from pymc_statespace_filters.machine_code.entries import COUNTS, NUMBERS, Entry, call_address
@@ -104,9 +105,12 @@ class NativeFunction:
             return Call(np.array([address], dtype=np.int64), out), (callback, inputs)
         arrays = [*inputs, *self._data]
         kinds = types.Tuple([typeof(array) for array in arrays])
-        compiled = self._function.vm.jit_fn.overloads[(kinds,)]
+        overloads = self._function.vm.jit_fn.overloads
+        # PyTensor's functions take a tuple if they are kept on disk, else single arguments.
+        signature = (kinds,) if (kinds,) in overloads else kinds.types
+        compiled = overloads[signature]
         addresses = [
-            _adapter(kinds, compiled.fndesc.restype),
+            _adapter(kinds, signature, compiled.fndesc.restype),
             compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name),
             *(array.ctypes.data for array in arrays),
         ]
@@ -130,10 +134,10 @@ def _contiguous(value: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _adapter(arguments: types.BaseTuple, results: types.BaseTuple) -> int:
+def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTuple) -> int:
     """Compile, for these types, what turns a table of addresses into a call; give its address."""
     namespace: dict[str, Any] = {"__name__": __name__, "carray": carray, "pointer": _pointer}
-    namespace["invoke"] = _invoker(results)
+    namespace["invoke"] = _invoker(signature, results)
     arrays, n_table = "", _N_ADDRESSES + len(arguments)
     for i, kind in enumerate(arguments):
         namespace[f"dtype_{i}"] = np.dtype(str(kind.dtype))
@@ -156,7 +160,7 @@ def _adapter(arguments: types.BaseTuple, results: types.BaseTuple) -> int:
             lines += [f"numbers[n] = results[{i}].item()", "n += 1"]
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
-    key = digest("adapter", source, str(arguments), str(results))
+    key = digest("adapter", source, str(signature), str(results))
     entry = Entry(namespace["adapter"], (COUNTS, NUMBERS), "adapter", key)
     entry.compile()
     return entry.address
@@ -172,21 +176,25 @@ def _pointer(typing_context, address):
     return types.voidptr(types.int64), generate
 
 
-def _invoker(results: types.BaseTuple) -> Any:
+def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
     """Call the numba function at an address: whether it raised, and its results."""
 
     @intrinsic
     def invoke(typing_context, address, arguments):
-        def generate(context, builder, signature, values):
+        def generate(context, builder, _, values):
+            given = [values[1]]
+            if signature != (arguments,):
+                given = list(cgutils.unpack_tuple(builder, values[1]))
             convention = context.call_conv
-            kind = convention.get_function_type(results, (arguments,))
+            kind = convention.get_function_type(results, signature)
             function = builder.inttoptr(values[0], kind.as_pointer())
             # Results of a function that raised are null arrays, which may be released.
             status, returned = convention.call_function(
-                builder, function, results, (arguments,), [values[1]]
+                builder, function, results, signature, given
             )
-            return context.make_tuple(builder, signature.return_type, (status.is_error, returned))
+            return context.make_tuple(builder, outcome, (status.is_error, returned))
 
-        return types.Tuple((types.boolean, results))(types.int64, arguments), generate
+        outcome = types.Tuple((types.boolean, results))
+        return outcome(types.int64, arguments), generate
 
     return invoke
