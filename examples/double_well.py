@@ -14,7 +14,6 @@ the simulated one with ``--csv``.
 """
 
 import argparse
-import os
 from pathlib import Path
 
 import arviz as az
@@ -109,12 +108,10 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
     for name, coefficients in RIVALS.items():
         model = rival(coefficients, filters(args.particles)[args.filter], steps, values)
         with model:
-            idata = pm.sample(
+            idata = psf.sample_dram(
                 args.draws,
                 tune=args.tune,
                 chains=args.chains,
-                cores=min(args.chains, os.cpu_count() or 1),
-                step=psf.DRAM(),
                 random_seed=args.seed,
                 progressbar=args.progressbar,
             )

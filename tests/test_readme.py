@@ -19,7 +19,7 @@ def run_code_of(page: str) -> dict:
 def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
     names = run_code_of("README.md")
     assert np.isfinite(names["evidence"].log_evidence)
-    assert dict(names["idata"]["posterior"].sizes) == {"chain": 2, "draw": 2000}
+    assert dict(names["idata"]["posterior"].sizes) == {"chain": 4, "draw": 2000}
     last_line = capsys.readouterr().out.splitlines()[-1]
     assert last_line.split()[1] == "+-"
 

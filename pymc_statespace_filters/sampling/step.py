@@ -70,6 +70,19 @@ class DRAM(BlockedStep):
         prior times expected likelihood: the exact posterior if the estimate is unbiased. False
         holds the model's seed: common random numbers, a deterministic target that carries that
         seed's error. Without a noisy likelihood it makes no difference.
+    screen : filter, optional
+        A cheap filter for the same systems. Moves are made on its likelihood, delayed rejection and
+        all; only where one ends the model's own is evaluated, and decides (surrogate transition).
+        A filter with noise is used on the noise of the model's seed. The chain is right
+        for any screen that is possible wherever the posterior is.
+    screen_power : float, default 1.0
+        In (0, 1]: tempers the likelihood of the screen, which else vetoes good points where it is
+        wrong by many nats.
+    correlation : float, optional
+        In (0, 1): each proposal has the noise of the current point, moved by an autoregression, in
+        place of noise of its own (Deligiannidis et al. 2018). Particle filters then resample in
+        the order of the states. Needs ``stages=1`` and no noisy screen: with a second proposal the
+        densities of the noise would not cancel.
     model : pymc.Model, optional
         Default: the model of the ``with`` block.
     initial_point, compile_kwargs, rng, blocked
@@ -97,12 +110,14 @@ class DRAM(BlockedStep):
     ``accept``
         probability of accepting the first stage's proposal
     ``lp``
-        log-density on the unconstrained space, as estimated when the point was proposed
+        log-density on the unconstrained space, as estimated when the chain came to the point
     ``d_seed``
         for each noisy variable "d", the noise seed behind that estimate
     ``proposal_cov``, ``scaling``
         covariance of the first stage's proposals, shape (d, d); and the geometric mean of its
         standard deviations
+    ``n_screened``, ``n_screen_failed``
+        with a screen: its evaluations, and how many failed
     ``n_evaluations``, ``n_failed``, ``failure``
         evaluations of the model; how many failed, so that the point counts as impossible; and the
         last one's reason, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity
@@ -112,6 +127,8 @@ class DRAM(BlockedStep):
 
     References
     ----------
+    G. Deligiannidis, A. Doucet and M. K. Pitt (2018). The correlated pseudo-marginal method.
+    Journal of the Royal Statistical Society B 80, 839-870.
     H. Haario, M. Laine, A. Mira and E. Saksman (2006). DRAM: efficient adaptive MCMC. Statistics
     and Computing 16, 339-354.
     C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
