@@ -29,6 +29,7 @@ __all__ = [
     "noise_seeds",
     "noisy_filters",
     "resized",
+    "smooth_filters",
     "state_space_names",
     "with_filter",
 ]
@@ -211,6 +212,15 @@ def _is_likelihood_of(node: Any, model: pm.Model, variable: Any) -> bool:
 def _is_same(a: Variable, b: Variable) -> bool:
     """Whether two inputs are one: PyMC merges equal constants."""
     return a is b or (isinstance(a, Constant) and isinstance(b, Constant) and a.equals(b))
+
+
+def smooth_filters(model: pm.Model) -> dict[str, Filter]:
+    """Every noisy variable's filter in the version that `move_noise` puts in its place."""
+    return {
+        name: node.op.filter.smooth(node.op.system)
+        for name, node in _state_space_nodes(model).items()
+        if node.op.filter.noisy
+    }
 
 
 def exactness(model: pm.Model) -> bool:

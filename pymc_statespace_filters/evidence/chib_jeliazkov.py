@@ -43,7 +43,12 @@ from pymc_statespace_filters.evidence._proposal import (
 )
 from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
 from pymc_statespace_filters.evidence.diagnostics import warn_if_doubtful
-from pymc_statespace_filters.evidence.posterior import ModelDensity, Posterior, posterior_of
+from pymc_statespace_filters.evidence.posterior import (
+    ModelDensity,
+    Posterior,
+    noise_was_moved,
+    posterior_of,
+)
 from pymc_statespace_filters.evidence.result import Evidence, store_evidence
 
 MIN_PROPOSALS = 100
@@ -118,7 +123,7 @@ def chib_jeliazkov(
     >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
     True
     """
-    density = ModelDensity(pm.modelcontext(model))
+    density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
     n_draws = posterior.log_density.size
     if n_proposals is None:

@@ -16,7 +16,7 @@ from pymc.model.transform_values import unconstrain_values
 from pymc.pytensorf import compile, join_nonshared_inputs
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.inspection import noise_seeds
+from pymc_statespace_filters.inspection import noise_seeds, smooth_filters, with_filter
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats
@@ -60,13 +60,19 @@ class Posterior:
 class ModelDensity:
     """The compiled log-density of a model over one flat vector, noise seeds as arguments.
 
+    Parameters
+    ----------
+    model : pymc.Model
+    moved : bool
+        Whether the draws' noise was moved along the chain, by the smooth versions of the filters.
+
     Attributes
     ----------
     seed_names : tuple of str
         The noisy state-space variables, in the order of the columns of a seed array.
     """
 
-    def __init__(self, model: pm.Model) -> None:
+    def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
         if model.discrete_value_vars:
             names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
             raise ModelError(
@@ -76,11 +82,15 @@ class ModelDensity:
         if not model.free_RVs:
             raise ModelError("model must have at least one free variable, it has none")
         self.model = model
+        self.moved = moved
         shared = noise_seeds(model)
         self.seed_names = tuple(shared)
         self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
         seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
-        self._log_density = self._compiled(model.logp(), seeds)
+        log_density = model.logp()
+        if moved:
+            (log_density,) = with_filter([log_density], model, smooth_filters(model))
+        self._log_density = self._compiled(log_density, seeds)
         self._log_prior = self._compiled(model.logp(vars=model.free_RVs), {})
 
     def _compiled(self, output: pt.TensorVariable, seeds: dict) -> Callable:
@@ -100,6 +110,11 @@ class ModelDensity:
     def log_prior(self, x: Array) -> Array:
         """Log-density of the free variables alone, Jacobians included; x is (m, k)."""
         return np.array([self._log_prior(point) for point in x], dtype=np.float64)
+
+
+def noise_was_moved(idata: xr.DataTree) -> bool:
+    """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
+    return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
 
 
 def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> Array:
@@ -186,8 +201,8 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     seeds = _stored_seeds(stats, density, draws.shape[:2])
     log_density = _stored_log_density(stats, density, draws, seeds)
 
-    held = bool((seeds == seeds[:1, :1]).all())
-    if not held and (seeds == seeds[:, :1]).all():
+    held = not density.moved and bool((seeds == seeds[:1, :1]).all())
+    if not (held or density.moved) and (seeds == seeds[:, :1]).all():
         raise ModelError(
             "idata must hold chains of one noise seed if the seed was held; its "
             f"{len(seeds)} chains kept {len(np.unique(seeds[:, 0], axis=0))} different ones: give "
@@ -237,6 +252,8 @@ def _stored_log_density(
         return log_density.reshape(draws.shape[:2])
 
     stored = stats[names[0]].transpose("chain", "draw").values.astype(np.float64)
+    if density.moved:  # there is nothing to compare with
+        return stored
     checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
     recomputed = density.log_density(flat_draws[checked], flat_seeds[checked])
     expected = stored.ravel()[checked]

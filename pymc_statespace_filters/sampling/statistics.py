@@ -49,7 +49,9 @@ def dtypes(target: Target) -> dict[str, Any]:
     }
     if target.seed_names:
         types["n_effective"] = np.float64
-    if target.settings.correlation is None:  # else no seed alone gives the estimate again
+    if target.moves_noise:  # no seed alone gives the estimate again
+        types["correlation"] = np.float64
+    else:
         types |= dict.fromkeys(target.seed_names, np.int64)
     if target.screen is not None:
         types |= dict.fromkeys(_SCREEN_COUNTS, np.int64)
@@ -86,7 +88,9 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
         stats["proposal_cov"] = draws.covs[rows].copy()
     if target.seed_names:
         stats["n_effective"] = numbers[..., N_EFFECTIVE]
-    if target.settings.correlation is None:
+    if target.moves_noise:
+        stats["correlation"] = np.full(counts.shape[:-1], target.settings.correlation)
+    else:
         seeds = draws.seeds[rows]
         stats |= {name: seeds[..., i] for i, name in enumerate(target.seed_names)}
     if target.screen is not None:

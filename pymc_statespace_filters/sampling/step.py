@@ -112,7 +112,8 @@ class DRAM(BlockedStep):
     ``lp``
         log-density on the unconstrained space, as estimated when the chain came to the point
     ``d_seed``
-        for each noisy variable "d", the noise seed behind that estimate
+        for each noisy variable "d", the noise seed behind that estimate; if the noise is moved
+        there is none, and ``correlation`` says by how much
     ``proposal_cov``, ``scaling``
         covariance of the first stage's proposals, shape (d, d); and the geometric mean of its
         standard deviations

@@ -96,6 +96,11 @@ class Target:
             graph = screening_density(model, settings.screen, settings.screen_power)
             self.screen = LogDensity(*shared, holds_noise=settings.screen.noisy, graph=graph)
 
+    @property
+    def moves_noise(self) -> bool:
+        """Whether a chain carries its noise along."""
+        return self.settings.correlation is not None and bool(self.seed_names)
+
     def prepare(self) -> None:
         """Take hold of machine code, and of data and held seeds as they are now."""
         self.held_seeds = np.array([s.get_value() for s in self._seed_variables], dtype=np.int64)
