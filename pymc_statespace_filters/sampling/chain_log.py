@@ -3,7 +3,10 @@
 A record is self-contained: a head (mark, length of the body, length of the list of contents), the
 body (that list as JSON, then the numbers of each array), and a checksum. The checksum covers the
 head, the body and the checksum of the record before, the first one that of the run: a record that
-is torn, altered, out of order or of another chain is not taken for a good one, nor is what follows.
+is torn, altered, out of order or of another chain is not taken for a good one, nor what follows.
+
+Only the last state is ever needed. Where those before it fill the file (a chain that carries its
+noise has large ones), the log is written anew as a single record, which takes its place at once.
 """
 
 import json
@@ -26,6 +29,8 @@ _HEAD = struct.Struct("<8sQQ")
 _MARK = b"psfchain"
 _CHECKSUM_SIZE = 4
 _FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+# So many bytes of overtaken states, and as many as the draws have, may lie about in a log.
+_SPARE = 2**28
 _NUMBERS = "biuf"  # the kinds of numpy numbers whose bytes are all there is to them
 
 
@@ -67,6 +72,8 @@ class ChainLog:
         self._origin = _checksum(origin)
         self._file: BinaryIO | None = None
         self._tip = _Tip(0, self._origin)
+        self._overtaken = 0
+        self._in_draws = 0
 
     def read(self) -> Stored | None:
         """Read all good records, and cut off what follows them.
@@ -81,14 +88,23 @@ class ChainLog:
         CheckpointWarning
             If something was cut off; it names the file and what is lost.
         """
+        stored = self._read()
+        if stored is not None and self._is_loose():
+            self._compact(stored)
+        return stored
+
+    def _read(self) -> Stored | None:
         file = self._open()
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         tip = _Tip(0, self._origin)
         parts: list[dict[str, np.ndarray]] = []
         state: dict[str, np.ndarray] = {}
+        self._overtaken = self._in_draws = 0
         for body, contents, checksum in _good_records(file, size, self._origin):
             parts.append(_arrays(body, contents["draws"]))
+            self._overtaken += _n_bytes(state)
+            self._in_draws += _n_bytes(parts[-1])
             state = _arrays(body, contents["state"])
             tip = _Tip(file.tell(), checksum)
         self._tip = tip
@@ -120,26 +136,19 @@ class ChainLog:
         """
         if self._file is None:
             self.read()
-        file = self._open()
-        new_draws, new_state = _plain(draws), _plain(state)
-        contents = json.dumps({"draws": _contents(new_draws), "state": _contents(new_state)})
-        arrays = [*new_draws.values(), *new_state.values()]
-        pieces: list[Any] = [
-            contents.encode(),
-            *(array.reshape(-1).view(np.uint8).data for array in arrays),
-        ]
-        head = _HEAD.pack(_MARK, sum(map(len, pieces)), len(pieces[0]))
-        checksum = _checksum(self._tip.checksum, head, *pieces)
+        file, is_first = self._open(), self._tip.end == 0
+        pieces = _record(draws, state, self._tip.checksum)
         try:
             file.seek(self._tip.end)
-            file.writelines([head, *pieces, checksum])
-            file.flush()
-            os.fsync(file.fileno())
-            tip = _Tip(file.tell(), checksum)
+            tip = _written(file, pieces)
         except BaseException:
             self._take_back(file)
             raise
         self._tip = tip
+        self._overtaken += 0 if is_first else _n_bytes(state)
+        self._in_draws += _n_bytes(draws)
+        if self._is_loose():
+            self.read()
 
     def close(self) -> None:
         """Close the file; the log may be used again."""
@@ -150,11 +159,28 @@ class ChainLog:
     def _open(self) -> BinaryIO:
         if self._file is None:
             existed = self.path.exists()
+            self._fresh_path().unlink(missing_ok=True)  # of a process killed before the exchange
             # Not "a": what a failed write has left behind must be written over.
             self._file = os.fdopen(os.open(self.path, _FLAGS, 0o666), "r+b")
             if not existed:
                 sync_folder(self.path.parent)
         return self._file
+
+    def _is_loose(self) -> bool:
+        return self._overtaken > _SPARE + self._in_draws
+
+    def _compact(self, stored: Stored) -> None:
+        """Put a file of one record in the place of the log."""
+        fresh = self._fresh_path()
+        with os.fdopen(os.open(fresh, _FLAGS | os.O_TRUNC, 0o666), "r+b") as file:
+            self._tip = _written(file, _record(*stored, self._origin))
+        self.close()
+        os.replace(fresh, self.path)
+        sync_folder(self.path.parent)
+        self._overtaken = 0
+
+    def _fresh_path(self) -> Path:
+        return self.path.with_name(f"{self.path.name}.new")
 
     def _take_back(self, file: BinaryIO) -> None:
         """Cut off a half-written record, and what the file object would still write on closing."""
@@ -205,6 +231,28 @@ def _good_records(
             return
         yield body, _located(json.loads(body[:contents_size]), contents_size), checksum
         last = checksum
+
+
+def _record(draws: Arrays, state: Arrays, last: bytes) -> list[Any]:
+    """The pieces of a record that follows on a checksum; the last of them is its own."""
+    new_draws, new_state = _plain(draws), _plain(state)
+    contents = json.dumps({"draws": _contents(new_draws), "state": _contents(new_state)})
+    arrays = [*new_draws.values(), *new_state.values()]
+    body = [contents.encode(), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
+    head = _HEAD.pack(_MARK, sum(map(len, body)), len(body[0]))
+    return [head, *body, _checksum(last, head, *body)]
+
+
+def _written(file: BinaryIO, pieces: list[Any]) -> _Tip:
+    """Write a record where the file stands; when this returns, it is on the disk."""
+    file.writelines(pieces)
+    file.flush()
+    os.fsync(file.fileno())
+    return _Tip(file.tell(), pieces[-1])
+
+
+def _n_bytes(arrays: Arrays) -> int:
+    return sum(np.asarray(array).nbytes for array in arrays.values())
 
 
 def _plain(arrays: Arrays) -> dict[str, np.ndarray]:

@@ -127,6 +127,21 @@ def test_a_record_costs_its_own_length_alone(tmp_path):
     assert len(set(np.diff(lengths, prepend=0))) == 1
 
 
+def test_overtaken_states_do_not_fill_the_disk(tmp_path, monkeypatch):
+    """A chain that carries its noise has a state of megabytes, each few seconds."""
+    monkeypatch.setattr(chain_log, "_SPARE", 100_000)
+    path = tmp_path / "log"
+    with closing(ChainLog(path, b"a run")) as log:
+        for i in range(60):
+            log.append(draws_of(10 * i, 10), {"noise": np.full(1250, float(i))})
+            assert path.stat().st_size < 150_000
+        draws, state = log.read()
+    same(draws, draws_of(0, 600))
+    np.testing.assert_array_equal(state["noise"], 59.0)
+    same(read_log(path).draws, draws)
+    assert [p.name for p in tmp_path.iterdir()] == ["log"]
+
+
 def test_every_truncation_gives_the_records_before_it(tmp_path):
     path, lengths = write_log(tmp_path / "log", [2, 1, 1])
     whole, counts = path.read_bytes(), [0, 2, 3, 4]
@@ -380,8 +395,9 @@ import numpy as np
 for name in ("pymc_statespace_filters", "pymc_statespace_filters.sampling"):
     sys.modules[name] = types.ModuleType(name)
     sys.modules[name].__path__ = [name.replace(".", "/")]
-from pymc_statespace_filters.sampling import checkpoint
+from pymc_statespace_filters.sampling import chain_log, checkpoint
 
+chain_log._SPARE = int(sys.argv[2])
 calls, fatal = 0, 0
 
 def count():
@@ -403,6 +419,10 @@ class TornFile:
         self.file = file
     def __getattr__(self, name):
         return getattr(self.file, name)
+    def __enter__(self):
+        return self
+    def __exit__(self, *error):
+        self.file.close()
     def writelines(self, pieces):
         for piece in pieces:
             piece = bytes(piece)
@@ -455,8 +475,9 @@ for at in range(1, n_calls + 1):
     folder = root / str(at)
     calls = 0
     assert killed(folder, at)
-    while killed(folder, 37):
-        pass
+    again = 37
+    while killed(folder, again):  # each time a little later, or it might never come further
+        again += 7
     assert (folder / "chain-0.log").read_bytes() == whole
     assert sorted(p.name for p in folder.iterdir()) == ["chain-0.log", "run.json"]
 print(n_calls)
@@ -464,8 +485,9 @@ print(n_calls)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no kill -9")
-def test_a_run_killed_at_any_call_ends_as_if_it_had_not_been(tmp_path):
-    with in_another_process(KILLED_RUNS, str(tmp_path)) as process:
+@pytest.mark.parametrize("spare", [10_000, -40], ids=["growing", "compacted"])
+def test_a_run_killed_at_any_call_ends_as_if_it_had_not_been(tmp_path, spare):
+    with in_another_process(KILLED_RUNS, str(tmp_path), str(spare)) as process:
         output, errors = process.communicate()
     assert process.returncode == 0, errors
     assert int(output) > 60  # so many places to die
