@@ -1,7 +1,6 @@
 """Adaptation of a Gaussian random walk: what the proposal covariance learns from the chain.
 
-Two schemes, chosen once and then called through the same signature
-``adapt(settings, state, position, stage) -> state``:
+Two schemes:
 
 ``"chain"``, the thesis's burn-in (Eqs. 3.27-3.29 and Fig. 4)
     The warm-up is a succession of blocks of ``adapt_every`` iterations, each proposing with
@@ -11,8 +10,8 @@ Two schemes, chosen once and then called through the same signature
     The same covariance renewed at every iteration, once a first block has shown that the chain
     moves.
 
-The functions are compiled and pure (settings and state are named tuples, the state is returned), so
-that PyMC's step method and whole compiled chains call the same code. Adaptation must stop before
+The state is a few small arrays, views of one vector. Machine code changes them in place with
+`learn`; `adapt_by_blocks` and `adapt_continuously` are its pure forms. Adaptation must stop before
 draws are kept: whoever drives it simply stops calling.
 
 Differences from the sources
@@ -43,6 +42,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 # Share of a block's iterations that must move at all, by any stage, to teach a covariance.
 LEAST_MOVED = 0.02
@@ -57,6 +57,14 @@ MOST_STALLS = 6
 PRIOR_MOVES = 0.2
 # The multiple of the identity, relative to the mean variance.
 JITTER = 1e-8
+
+# Cells of the numbers of a state, and of the counts of moments.
+SCALE, N_BLOCKS, N_STALLS = range(3)
+N, MOVED, FIRST = range(3)
+
+_compiled = njit(cache=True, error_model="numpy")
+# For functions that compiled functions alone call: what Python needs takes as long to compile.
+_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class AdaptationSettings(NamedTuple):
@@ -76,7 +84,7 @@ class Moments(NamedTuple):
 
     Attributes
     ----------
-    n, moved, first : float
+    counts : ndarray, shape (3,)
         Iterations; how many moved; and how many of these by the first stage.
     mean : ndarray, shape (d,)
         Mean of the positions.
@@ -84,11 +92,14 @@ class Moments(NamedTuple):
         Sum of the outer products of the deviations from the mean.
     """
 
-    n: float
-    moved: float
-    first: float
+    counts: np.ndarray
     mean: np.ndarray
     scatter: np.ndarray
+
+    @property
+    def n(self) -> float:
+        """Iterations."""
+        return float(self.counts[N])
 
 
 class AdaptationState(NamedTuple):
@@ -96,19 +107,16 @@ class AdaptationState(NamedTuple):
 
     Attributes
     ----------
+    numbers : ndarray, shape (3,)
+        Cell SCALE: factor, at most 1, by which low acceptance holds the standard deviations of the
+        proposals below ``2.38 / sqrt(d)`` times those of the draws. N_BLOCKS: complete blocks that
+        taught a covariance. N_STALLS: blocks in a row that moved next to nowhere.
     cov : ndarray, shape (d, d)
         Proposal covariance of the first stage, all factors included.
     chol : ndarray, shape (d, d)
         Its lower Cholesky factor.
     base : ndarray, shape (d, d)
         The proposal covariance when the block began.
-    scale : float
-        Factor, at most 1, by which low acceptance holds the standard deviations of the proposals
-        below ``2.38 / sqrt(d)`` times those of the draws.
-    n_blocks : int
-        Complete blocks that taught a covariance.
-    n_stalls : int
-        Blocks in a row that moved next to nowhere.
     first_cov : ndarray, shape (d, d)
         The proposal covariance that the chain began with.
     block, recent, older : Moments
@@ -116,16 +124,19 @@ class AdaptationState(NamedTuple):
         those between the power of two before that and it.
     """
 
+    numbers: np.ndarray
     cov: np.ndarray
     chol: np.ndarray
     base: np.ndarray
-    scale: float
-    n_blocks: int
-    n_stalls: int
     first_cov: np.ndarray
     block: Moments
     recent: Moments
     older: Moments
+
+    @property
+    def scale(self) -> float:
+        """The cell SCALE."""
+        return float(self.numbers[SCALE])
 
 
 def start_adaptation(cov: np.ndarray) -> AdaptationState:
@@ -140,9 +151,12 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
     -------
     AdaptationState
     """
-    cov = np.ascontiguousarray(cov, dtype=np.float64)
-    none = _no_moments(cov.shape[0])
-    return AdaptationState(cov, np.linalg.cholesky(cov), cov, 1.0, 0, 0, cov, none, none, none)
+    dim = len(cov)
+    state = unpack(np.zeros(packed_size(dim)), dim)
+    state.numbers[SCALE] = 1.0
+    state.cov[...] = state.base[...] = state.first_cov[...] = cov
+    state.chol[...] = np.linalg.cholesky(cov)
+    return state
 
 
 def packed_size(dim: int) -> int:
@@ -150,31 +164,16 @@ def packed_size(dim: int) -> int:
     return 3 + 4 * dim**2 + 3 * (3 + dim + dim**2)
 
 
-@njit(cache=True, error_model="numpy")
-def pack(state: AdaptationState, packed: np.ndarray) -> None:
-    """Write a state into a vector of `packed_size` numbers: plain data, to be stored."""
-    packed[0], packed[1], packed[2] = state.scale, state.n_blocks, state.n_stalls
-    at = 3
-    for matrix in (state.cov, state.chol, state.base, state.first_cov):
-        at = _put(matrix, packed, at)
-    for moments in (state.block, state.recent, state.older):
-        packed[at], packed[at + 1], packed[at + 2] = moments.n, moments.moved, moments.first
-        at = _put(moments.mean, packed, at + 3)
-        at = _put(moments.scatter, packed, at)
-
-
-@njit(cache=True, error_model="numpy")
+@register_jitable
 def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
-    """Read a state from its vector."""
+    """See a vector of `packed_size` numbers as a state: views, which change with it."""
     square, n_moments = dim * dim, 3 + dim + dim * dim
     at = 3 + 4 * square
     return AdaptationState(
+        packed[:3],
         _matrix(packed, 3, dim),
         _matrix(packed, 3 + square, dim),
         _matrix(packed, 3 + 2 * square, dim),
-        packed[0],
-        int(packed[1]),
-        int(packed[2]),
         _matrix(packed, 3 + 3 * square, dim),
         _moments(packed, at, dim),
         _moments(packed, at + n_moments, dim),
@@ -182,168 +181,213 @@ def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
     )
 
 
-@njit(cache=True, error_model="numpy")
-def _put(values: np.ndarray, packed: np.ndarray, at: int) -> int:
-    for value in values.flat:
-        packed[at] = value
-        at += 1
-    return at
+def pack(state: AdaptationState, packed: np.ndarray) -> None:
+    """Write a state into a vector of `packed_size` numbers: plain data, to be stored."""
+    for mine, given in zip(unpack(packed, len(state.cov)), state, strict=True):
+        if isinstance(given, Moments):
+            for my_part, part in zip(mine, given, strict=True):
+                my_part[...] = part
+        else:
+            mine[...] = given
 
 
-@njit(cache=True, error_model="numpy")
+@register_jitable
 def _matrix(packed: np.ndarray, at: int, dim: int) -> np.ndarray:
-    matrix = np.empty((dim, dim))
-    for i in range(dim):
-        for j in range(dim):
-            matrix[i, j] = packed[at + i * dim + j]
-    return matrix
+    return packed[at : at + dim * dim].reshape(dim, dim)
 
 
-@njit(cache=True, error_model="numpy")
+@register_jitable
 def _moments(packed: np.ndarray, at: int, dim: int) -> Moments:
-    mean = packed[at + 3 : at + 3 + dim].copy()
     return Moments(
-        packed[at], packed[at + 1], packed[at + 2], mean, _matrix(packed, at + 3 + dim, dim)
+        packed[at : at + 3],
+        packed[at + 3 : at + 3 + dim],
+        _matrix(packed, at + 3 + dim, dim),
     )
 
 
-@njit(cache=True, error_model="numpy")
-def adapt_by_blocks(
-    settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int
-) -> AdaptationState:
-    """Take in one iteration of warm-up under the scheme ``"chain"``.
+@_internal
+def learn(
+    settings: AdaptationSettings,
+    continuous: bool,
+    state: AdaptationState,
+    position: np.ndarray,
+    stage: int,
+) -> None:
+    """Take in one iteration of warm-up, under the scheme ``"continuous"`` or ``"chain"``, in place.
 
     Parameters
     ----------
     settings : AdaptationSettings
+    continuous : bool
     state : AdaptationState
     position : ndarray, shape (d,)
         Where the chain stands after the iteration.
     stage : int
         The stage whose proposal was accepted, 0 if none was.
-
-    Returns
-    -------
-    AdaptationState
     """
-    block = _include(state.block, position, stage)
-    if _has_stalled(settings, state.n_blocks, block):
-        return _stalled(state)
-    if block.n < settings.adapt_every:
-        return _with_block(state, block)
-    state = _close_block(state, block)
-    return _learn(state, _merge(state.older, state.recent))
+    block = state.block.counts
+    _include(state.block, 1.0, position)
+    block[MOVED] += 1.0 if stage > 0 else 0.0
+    block[FIRST] += 1.0 if stage == 1 else 0.0
+    if _has_stalled(settings, state.numbers, block):
+        _forget_block(state)
+    elif block[N] >= settings.adapt_every:
+        _close_block(state)
+        _learn_covariance(state)
+    elif continuous and state.numbers[N_BLOCKS] > 0.0:
+        _learn_covariance(state)
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
+def adapt_by_blocks(
+    settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int
+) -> AdaptationState:
+    """Give what `learn` makes of a state under ``"chain"``, and leave the state alone."""
+    state = _copy_of(state)
+    learn(settings, False, state, position, stage)
+    return state
+
+
+@_compiled
 def adapt_continuously(
     settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int
 ) -> AdaptationState:
-    """Take in one iteration of warm-up under the scheme ``"continuous"``.
+    """Give what `learn` makes of a state under ``"continuous"``, and leave the state alone."""
+    state = _copy_of(state)
+    learn(settings, True, state, position, stage)
+    return state
 
-    Parameters and the value returned are those of ``adapt_by_blocks``.
-    """
-    block = _include(state.block, position, stage)
-    if _has_stalled(settings, state.n_blocks, block):
-        return _stalled(state)
-    if block.n < settings.adapt_every:
-        state = _with_block(state, block)
-        if state.n_blocks == 0:
-            return state
-    else:
-        state = _close_block(state, block)
-    return _learn(state, _merge(_merge(state.older, state.recent), state.block))
+
+@_compiled
+def _copy_of(state: AdaptationState) -> AdaptationState:
+    return AdaptationState(
+        state.numbers.copy(),
+        state.cov.copy(),
+        state.chol.copy(),
+        state.base.copy(),
+        state.first_cov.copy(),
+        _copy_of_moments(state.block),
+        _copy_of_moments(state.recent),
+        _copy_of_moments(state.older),
+    )
 
 
 # The helpers below are written as loops, which compile several times faster than array expressions.
 
 
-@njit(cache=True, error_model="numpy")
-def _no_moments(dim: int) -> Moments:
-    return Moments(0.0, 0.0, 0.0, np.zeros(dim), np.zeros((dim, dim)))
+@_internal
+def _copy_of_moments(moments: Moments) -> Moments:
+    return Moments(moments.counts.copy(), moments.mean.copy(), moments.scatter.copy())
 
 
-@njit(cache=True, error_model="numpy")
-def _include(moments: Moments, position: np.ndarray, stage: int) -> Moments:
-    moved = 1.0 if stage > 0 else 0.0
-    first = 1.0 if stage == 1 else 0.0
-    return _merge(moments, Moments(1.0, moved, first, position, np.zeros_like(moments.scatter)))
+@_internal
+def _scale_into(target: np.ndarray, matrix: np.ndarray, factor: float) -> None:
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            target[i, j] = matrix[i, j] * factor
 
 
-@njit(cache=True, error_model="numpy")
-def _merge(a: Moments, b: Moments) -> Moments:
-    """Moments of two pieces together (Chan, Golub and LeVeque)."""
-    dim = a.mean.size
-    n = max(1.0, a.n + b.n)
-    mean, scatter = np.empty(dim), np.empty((dim, dim))
+@_internal
+def _include(moments: Moments, n: float, mean: np.ndarray) -> None:
+    """Count in a piece that does not scatter (Chan, Golub and LeVeque)."""
+    before, old = moments.counts[N], moments.mean
+    total = max(1.0, before + n)
+    for i in range(mean.size):
+        apart = mean[i] - old[i]
+        for j in range(mean.size):
+            moments.scatter[i, j] += apart * (mean[j] - old[j]) * before * n / total
+    for i in range(mean.size):
+        old[i] += (mean[i] - old[i]) * n / total
+    moments.counts[N] = before + n
+
+
+@_internal
+def _merge(moments: Moments, other: Moments) -> None:
+    """Make moments those of two pieces together."""
+    dim = other.mean.size
     for i in range(dim):
-        apart = b.mean[i] - a.mean[i]
-        mean[i] = a.mean[i] + apart * b.n / n
         for j in range(dim):
-            between = apart * (b.mean[j] - a.mean[j]) * a.n * b.n / n
-            scatter[i, j] = a.scatter[i, j] + b.scatter[i, j] + between
-    return Moments(a.n + b.n, a.moved + b.moved, a.first + b.first, mean, scatter)
+            moments.scatter[i, j] += other.scatter[i, j]
+    _include(moments, other.counts[N], other.mean)
+    moments.counts[MOVED] += other.counts[MOVED]
+    moments.counts[FIRST] += other.counts[FIRST]
 
 
-@njit(cache=True, error_model="numpy")
-def _has_stalled(settings: AdaptationSettings, n_blocks: int, block: Moments) -> bool:
-    if n_blocks == 0 and block.moved == 0.0 and 4 * block.n >= settings.adapt_every:
+@_internal
+def _clear(moments: Moments) -> None:
+    for i in range(3):
+        moments.counts[i] = 0.0
+    for i in range(moments.mean.size):
+        moments.mean[i] = 0.0
+        for j in range(moments.mean.size):
+            moments.scatter[i, j] = 0.0
+
+
+@_internal
+def _has_stalled(settings: AdaptationSettings, numbers: np.ndarray, block: np.ndarray) -> bool:
+    if numbers[N_BLOCKS] == 0.0 and block[MOVED] == 0.0 and 4 * block[N] >= settings.adapt_every:
         return True
-    full = block.n >= settings.adapt_every
-    return full and block.moved < LEAST_MOVED * block.n
+    full = block[N] >= settings.adapt_every
+    return full and block[MOVED] < LEAST_MOVED * block[N]
 
 
-@njit(cache=True, error_model="numpy")
-def _stalled(state: AdaptationState) -> AdaptationState:
+@_internal
+def _forget_block(state: AdaptationState) -> None:
     """Forget the stalled block, propose closer by; after too many stalls forget everything."""
-    none = _no_moments(state.cov.shape[0])
-    first = state.first_cov
-    if state.n_stalls == MOST_STALLS:
-        return AdaptationState(first, _cholesky(first), first, 1.0, 0, 0, first, none, none, none)
-    cov = _scaled(state.cov, STALLED**2)
-    return AdaptationState(
-        cov,
-        _scaled(state.chol, STALLED),
-        cov,
-        state.scale,
-        state.n_blocks,
-        state.n_stalls + 1,
-        first,
-        none,
-        state.recent,
-        state.older,
-    )
+    numbers = state.numbers
+    _clear(state.block)
+    if numbers[N_STALLS] < MOST_STALLS:
+        numbers[N_STALLS] += 1.0
+        _scale_into(state.cov, state.cov, STALLED**2)
+        _scale_into(state.chol, state.chol, STALLED)
+    else:
+        numbers[SCALE], numbers[N_BLOCKS], numbers[N_STALLS] = 1.0, 0.0, 0.0
+        _scale_into(state.cov, state.first_cov, 1.0)
+        _scale_into(state.chol, _cholesky(state.first_cov), 1.0)
+        _clear(state.recent)
+        _clear(state.older)
+    _scale_into(state.base, state.cov, 1.0)
 
 
-@njit(cache=True, error_model="numpy")
-def _with_block(state: AdaptationState, block: Moments) -> AdaptationState:
-    cov, chol, base, scale, n_blocks, n_stalls, first, _, recent, older = state
-    return AdaptationState(cov, chol, base, scale, n_blocks, n_stalls, first, block, recent, older)
-
-
-@njit(cache=True, error_model="numpy")
-def _close_block(state: AdaptationState, block: Moments) -> AdaptationState:
+@_internal
+def _close_block(state: AdaptationState) -> None:
     """File a complete block and let its acceptance move the scale."""
-    cov, chol, _, scale, n_blocks, _, first, _, recent, older = state
-    if block.first < LOW_ACCEPTANCE * block.n:
-        scale *= SHRINK
-    elif block.first > FAIR_ACCEPTANCE * block.n:
-        scale = 1.0
-    n_blocks += 1
-    none = _no_moments(cov.shape[0])
-    recent = _merge(recent, block)
+    numbers, block = state.numbers, state.block.counts
+    if block[FIRST] < LOW_ACCEPTANCE * block[N]:
+        numbers[SCALE] *= SHRINK
+    elif block[FIRST] > FAIR_ACCEPTANCE * block[N]:
+        numbers[SCALE] = 1.0
+    numbers[N_BLOCKS] += 1.0
+    numbers[N_STALLS] = 0.0
+    _scale_into(state.base, state.cov, 1.0)
+    _merge(state.recent, state.block)
+    _clear(state.block)
+    n_blocks = int(numbers[N_BLOCKS])
     if n_blocks & (n_blocks - 1) == 0:
-        older, recent = recent, none
-    return AdaptationState(cov, chol, cov, scale, n_blocks, 0, first, none, recent, older)
+        _replace(state.older, state.recent)
+        _clear(state.recent)
 
 
-@njit(cache=True, error_model="numpy")
-def _learn(state: AdaptationState, moments: Moments) -> AdaptationState:
+@_internal
+def _replace(moments: Moments, other: Moments) -> None:
+    for i in range(3):
+        moments.counts[i] = other.counts[i]
+    for i in range(other.mean.size):
+        moments.mean[i] = other.mean[i]
+    _scale_into(moments.scatter, other.scatter, 1.0)
+
+
+@_internal
+def _learn_covariance(state: AdaptationState) -> None:
     """Proposal covariance, thesis Eqs. 3.28-3.29, blended with the one in use before."""
-    _, _, base, scale, n_blocks, n_stalls, first, block, recent, older = state
+    moments = _copy_of_moments(state.older)
+    _merge(moments, state.recent)
+    if state.block.counts[N] > 0.0:
+        _merge(moments, state.block)
+    n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
     dim = base.shape[0]
-    weight = moments.moved / (moments.moved + PRIOR_MOVES * dim)
-    learnt = weight * (2.38 * scale) ** 2 / (dim * moments.n)
+    weight = moved / (moved + PRIOR_MOVES * dim)
+    learnt = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):
         for j in range(i + 1):
@@ -353,21 +397,12 @@ def _learn(state: AdaptationState, moments: Moments) -> AdaptationState:
     for i in range(dim):
         cov[i, i] += JITTER * mean_variance
     chol = _cholesky(cov)
-    if not 0.0 < chol[dim - 1, dim - 1] < np.inf:  # the draws have overflowed (or NaN)
-        return state
-    return AdaptationState(cov, chol, base, scale, n_blocks, n_stalls, first, block, recent, older)
+    if 0.0 < chol[dim - 1, dim - 1] < np.inf:  # else the draws have overflowed (or NaN)
+        _scale_into(state.cov, cov, 1.0)
+        _scale_into(state.chol, chol, 1.0)
 
 
-@njit(cache=True, error_model="numpy")
-def _scaled(matrix: np.ndarray, factor: float) -> np.ndarray:
-    scaled = np.empty_like(matrix)
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            scaled[i, j] = matrix[i, j] * factor
-    return scaled
-
-
-@njit(cache=True, error_model="numpy")
+@_internal
 def _cholesky(cov: np.ndarray) -> np.ndarray:
     """Lower Cholesky factor, NaN on and after the first column that has none."""
     dim = cov.shape[0]

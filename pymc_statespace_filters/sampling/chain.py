@@ -25,13 +25,7 @@ import numpy as np
 from numba import njit
 
 from pymc_statespace_filters.machine_code import Call, digest, kept, make_call
-from pymc_statespace_filters.sampling.adaptation import (
-    AdaptationSettings,
-    adapt_by_blocks,
-    adapt_continuously,
-    pack,
-    unpack,
-)
+from pymc_statespace_filters.sampling.adaptation import AdaptationSettings, learn, unpack
 from pymc_statespace_filters.sampling.delayed_rejection import gaussian_log_acceptance
 
 HEALTH_SIZE = 3
@@ -93,7 +87,7 @@ class State(NamedTuple):
         Log-density as it was estimated when the chain came here; smallest effective number of
         particles behind it (infinity without noise); log-density of the screen.
     adaptation : ndarray
-        What was learnt, see `adaptation.pack`.
+        What was learnt, see `adaptation.unpack`.
     carried : ndarray
         The noise itself, where the chain moves it instead of drawing it anew.
     """
@@ -175,7 +169,17 @@ def _copy(source, target):
         target[i] = source[i]
 
 
-@njit(error_model="numpy", nogil=True)
+_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py")
+_SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
+
+
+def _kept(function):
+    """Compile for Python, once for all processes."""
+    key = digest(function.__name__, _SOURCE)
+    return kept(njit(function, error_model="numpy", nogil=True), key)
+
+
+@_kept
 def evaluate(density):
     """Evaluate at the density's own position and seeds.
 
@@ -281,13 +285,6 @@ def _screened_move(settings, target, screen, state, chol, random, k, counts):
     return np.exp(log_alpha)
 
 
-@_pasted
-def _adapt(settings, learnt, position, stage):
-    if settings.continuous:
-        return adapt_continuously(AdaptationSettings(settings.adapt_every), learnt, position, stage)
-    return adapt_by_blocks(AdaptationSettings(settings.adapt_every), learnt, position, stage)
-
-
 @_internal
 def _scaling(chol):
     """Geometric mean of the standard deviations along the axes of the proposal."""
@@ -297,8 +294,15 @@ def _scaling(chol):
     return np.exp(total / chol.shape[0])
 
 
-def _advance(settings, target, screen, state, random, first, draws, row, n, talk):
+@_kept
+def advance(settings, target, screen, state, random, first, draws, row, n, talk):
+    """Make up to n iterations, with random numbers from ``first``, noted down from ``row``.
+
+    It returns how many it made, and leaves the state where the last one ended: fewer than n if
+    somebody asked for a pause, or if the model raised.
+    """
     learnt = unpack(state.adaptation, state.position.size)
+    adaptation = AdaptationSettings(settings.adapt_every)
     scaling = _scaling(learnt.chol)
     done = 0
     while done < n and talk[PAUSE] == 0:
@@ -321,14 +325,8 @@ def _advance(settings, target, screen, state, random, first, draws, row, n, talk
             for i in range(state.position.size):
                 _copy(learnt.cov[i], draws.covs[at, i])
         if settings.adapts:
-            learnt = _adapt(settings, learnt, state.position, counts[STAGE])
+            learn(adaptation, settings.continuous, learnt, state.position, counts[STAGE])
             scaling = _scaling(learnt.chol)
         done += 1
         talk[DONE] += 1
-    pack(learnt, state.adaptation)
     return done
-
-
-_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py")
-_KEY = digest("chain", *(Path(__file__).with_name(name).read_text() for name in _SOURCES))
-advance = kept(njit(_advance, error_model="numpy", nogil=True), _KEY)

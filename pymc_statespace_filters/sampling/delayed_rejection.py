@@ -126,6 +126,8 @@ def gaussian_log_acceptance(
     log_pi: np.ndarray, offsets: np.ndarray, stage_scale: float, stage: int
 ) -> float:
     """``log_acceptance`` with the proposals of ``gaussian_log_proposals``."""
+    if stage == 1:  # what nearly every iteration asks: the proposal is symmetric and cancels
+        return _log_ratio_to_one(log_pi[1], log_pi[0])
     return log_acceptance(log_pi, gaussian_log_proposals(offsets, stage_scale, stage), stage)
 
 

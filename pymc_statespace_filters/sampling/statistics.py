@@ -79,20 +79,18 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     dict
         Without ``accept_rate``, which depends on what came before, and the warning.
     """
-    numbers, counts = draws.numbers[rows], draws.counts[rows]
-    stats = {name: numbers[..., column] for name, column in _NUMBERS.items()}
-    stats |= {name: counts[..., column] for name, column in _COUNTS.items()}
+    stats = {name: draws.numbers[rows, column] for name, column in _NUMBERS.items()}
+    stats |= {name: draws.counts[rows, column] for name, column in _COUNTS.items()}
     stats["accepted"] = (stats["stage"] > 0) * 1.0
-    stats["exact"] = np.broadcast_to(np.bool_(target.exact), counts.shape[:-1])
+    stats["exact"] = np.full(stats["stage"].shape, target.exact)
     if draws.covs.size:
         stats["proposal_cov"] = draws.covs[rows].copy()
     if target.seed_names:
-        stats["n_effective"] = numbers[..., N_EFFECTIVE]
+        stats["n_effective"] = draws.numbers[rows, N_EFFECTIVE]
     if target.moves_noise:
-        stats["correlation"] = np.full(counts.shape[:-1], target.settings.correlation)
+        stats["correlation"] = np.full(stats["stage"].shape, target.settings.correlation)
     else:
-        seeds = draws.seeds[rows]
-        stats |= {name: seeds[..., i] for i, name in enumerate(target.seed_names)}
+        stats |= {name: draws.seeds[rows, i] for i, name in enumerate(target.seed_names)}
     if target.screen is not None:
-        stats |= {name: counts[..., column] for name, column in _SCREEN_COUNTS.items()}
+        stats |= {name: draws.counts[rows, column] for name, column in _SCREEN_COUNTS.items()}
     return stats
