@@ -17,6 +17,7 @@ from importlib.metadata import version
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 from benchmarks import cold, growth, likelihoods, report, sampling
+from benchmarks.chains import chains
 from benchmarks.cpp import compiler
 from benchmarks.measure import FOLDER, ROOT, Peers
 from benchmarks.systems import write_records
@@ -28,7 +29,7 @@ PARTS = {
     "bootstrap": likelihoods.bootstrap,
     "pf_enkf": likelihoods.pf_enkf,
     "grid": likelihoods.grid,
-    "sampling": lambda peers: sampling.sampling(),
+    "sampling": lambda peers: sampling.sampling() + chains(),
     "cold": lambda peers: cold.cold(),
     "particles": lambda peers: growth.with_particles(),
     "steps": lambda peers: growth.with_steps(),

@@ -8,6 +8,7 @@ import warnings
 import pymc_statespace_filters as psf
 from benchmarks import likelihoods, ours
 from benchmarks.__main__ import on_one_core
+from benchmarks.chains import microseconds_a_draw
 from benchmarks.report import number, seconds
 from benchmarks.timing import Timed, in_turn
 
@@ -42,6 +43,9 @@ def main() -> None:
         for who, t in times.items():
             base = "EKF by hand" if who.startswith("EKF") else "propagation by hand"
             print(f"  {who:26} {seconds(t):>9}  {number(t / times[base]):>6} x {base}")
+    print("\noverhead of a compiled chain")
+    for what, tune in (("a draw", False), ("an iteration of warm-up", True)):
+        print(f"  {what:26} {microseconds_a_draw(tune=tune, n=50_000):6.2f} µs")
 
 
 if __name__ == "__main__":

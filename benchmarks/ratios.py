@@ -84,6 +84,11 @@ def sampler_ratios(chains: list[Chains]) -> list[Ratio]:
                 us.ess_per_second / them.ess_per_second,
                 MORE,
             ),
+            (
+                f"ESS per second, tuning left out: {us.sampler} / {them.sampler}",
+                us.kept_ess_per_second / them.kept_ess_per_second,
+                MORE,
+            ),
         )
     ]
 

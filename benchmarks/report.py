@@ -7,6 +7,7 @@ import platform
 from pathlib import Path
 
 from benchmarks import figures
+from benchmarks.chains import ChainCost
 from benchmarks.cold import Cold
 from benchmarks.growth import Curve
 from benchmarks.measure import FOLDER, ROOT, Row
@@ -14,7 +15,13 @@ from benchmarks.ratios import ratios
 from benchmarks.sampling import Chains
 
 TARGET = ROOT / "docs" / "_static"
-KINDS = {"sampling": Chains, "cold": Cold, "particles": Curve, "steps": Curve, "states": Curve}
+KINDS = {
+    "sampling": lambda **row: (Chains if "sampler" in row else ChainCost)(**row),
+    "cold": Cold,
+    "particles": Curve,
+    "steps": Curve,
+    "states": Curve,
+}
 
 
 def write(parts: list[str]) -> str:
@@ -25,13 +32,15 @@ def write(parts: list[str]) -> str:
         for part, k in kept.items()
     }
     rows = [row for part in parts if part not in KINDS for row in found[part]]
-    sampling, cold, *curves = (found.get(part, []) for part in KINDS)
+    sampled, cold, *curves = (found.get(part, []) for part in KINDS)
+    sampling = [row for row in sampled if isinstance(row, Chains)]
     growth = [curve for part in curves for curve in part]
     sections = [
         machine(kept),
         ratio_table(ratios(rows, growth, sampling)),
         likelihood_tables(rows),
         sampling_table(sampling),
+        chain_table([row for row in sampled if isinstance(row, ChainCost)]),
         cold_table(cold),
     ]
     text = "\n".join(section for section in sections if section)
@@ -112,14 +121,30 @@ def sampling_table(chains: list[Chains]) -> str:
             f"{c.iterations_per_second:.0f}",
             f"{c.ess_per_second:.0f}",
             f"{c.ess_low:.0f} to {c.ess_high:.0f}",
+            *(f"{n:.0f}" if n == n else "" for n in (c.kept_per_second, c.kept_ess_per_second)),
             c.note,
         ]
         if c.iterations_per_second == c.iterations_per_second
-        else [c.sampler, "not run", "", "", c.note]
+        else [c.sampler, "not run", *[""] * 4, c.note]
         for c in chains
     ]
-    head = ["sampler", "draws per second", "smallest ESS per second", "over the seeds", ""]
+    head = [
+        "sampler",
+        "draws per second",
+        "smallest ESS per second",
+        "over the seeds",
+        "draws, tuning left out",
+        "ESS, tuning left out",
+        "",
+    ]
     return "\n## Sampling\n\n" + table(head, lines)
+
+
+def chain_table(rows: list[ChainCost]) -> str:
+    if not rows:
+        return ""
+    lines = [[row.what, row.figure, row.note] for row in rows]
+    return "\n### Compiled chains\n\n" + table(["", "", ""], lines)
 
 
 def cold_table(rows: list[Cold]) -> str:

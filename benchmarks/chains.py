@@ -1,0 +1,192 @@
+"""What a compiled chain costs besides its likelihood, what threads gain, what checkpoints cost.
+
+The overhead is taken on a model whose density costs next to nothing, four normals: the time of
+chains, from the random numbers to the DataTree, less that of the same number of evaluations by
+machine code. What threads and checkpoints do is wall time, of runs in turn.
+"""
+
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from statistics import median
+
+import numpy as np
+import pymc as pm
+from numba import njit
+
+import pymc_statespace_filters as psf
+from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, simulated
+from pymc_statespace_filters.sampling.chain import evaluate
+from pymc_statespace_filters.sampling.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target import Target
+
+ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class ChainCost:
+    """One line: what was measured, the figure with its unit, how."""
+
+    what: str
+    figure: str
+    note: str
+
+    def as_json(self) -> dict:
+        return asdict(self)
+
+
+@njit(nogil=True)
+def evaluations(density, n):
+    total = 0.0
+    for i in range(n):
+        density.position[0] = 1e-9 * i
+        total += evaluate(density).log_density
+    return total
+
+
+def four_normals() -> pm.Model:
+    with pm.Model() as model:
+        pm.Normal("x", 0, 1, shape=4)
+    return model
+
+
+def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
+    """Of a chain of one stage, warm-up or draws, all that its evaluations do not take."""
+    model = four_normals()
+    run = partial(
+        psf.sample_dram, chains=1, cores=1, stages=1, random_seed=1, progressbar=False, model=model
+    )
+    target = Target(model, None, DRAMSettings())
+    target.prepare()
+    bound = target.density.bind()
+    long = {"tune": n, "draws": 1} if tune else {"tune": 1, "draws": n}
+    nothing = {"tune": 1, "draws": 1}
+
+    def taken(work: Callable[[], object]) -> float:
+        start = time.process_time()
+        work()
+        return time.process_time() - start
+
+    run(**nothing), evaluations(bound.density, 1)
+    rounds = [
+        taken(lambda: run(**long))
+        - taken(lambda: run(**nothing))
+        - taken(lambda: evaluations(bound.density, n))
+        for _ in range(ROUNDS)
+    ]
+    return 1e6 * median(rounds) / n
+
+
+def well(filter, steps) -> pm.Model:
+    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH, steps)
+    with pm.Model() as model:
+        pm.Normal("alpha", 0, 10)
+        pm.Normal("beta", 0, 10)
+        pm.HalfNormal("sigma", 1)
+        pm.HalfNormal("gamma", 1)
+        psf.StateSpace("d", DOUBLE_WELL, filter, steps=steps, observed=observed)
+    return model
+
+
+def walls(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Median wall seconds of each, in turn, once warm."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for name in runs:
+        runs[name]()
+    for _ in range(ROUNDS):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            times[name].append(time.perf_counter() - start)
+    return {name: median(seconds) for name, seconds in times.items()}
+
+
+def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
+    """Two chains in two threads, against the same one after the other."""
+    run = partial(
+        psf.sample_dram,
+        tune=0,
+        chains=2,
+        model=model,
+        initvals=DOUBLE_WELL_TRUTH,
+        random_seed=1,
+        progressbar=False,
+    )
+    taken = walls(
+        {
+            "before": lambda: run(1, cores=1),
+            "one": lambda: run(draws, cores=1),
+            "two": lambda: run(draws, cores=2),
+        }
+    )
+    gain = (taken["one"] - taken["before"]) / (taken["two"] - taken["before"])
+    each = (taken["one"] - taken["before"]) / (2 * draws)
+    return ChainCost(
+        f"two threads / one, {what}", f"{gain:.2f} x", f"draws of {1e6 * each:.0f} µs, wall time"
+    )
+
+
+def checkpoints(seconds: float = 16.0) -> ChainCost:
+    """Chains of some seconds with a checkpoint every five, and without."""
+    model = well(psf.EKF(), np.arange(0, 2001, 20))
+    run = partial(
+        psf.sample_dram,
+        tune=0,
+        chains=2,
+        cores=2,
+        model=model,
+        initvals=DOUBLE_WELL_TRUTH,
+        random_seed=1,
+        progressbar=False,
+    )
+    start = time.perf_counter()
+    run(20_000)
+    draws = int(20_000 * seconds / (time.perf_counter() - start))
+
+    def kept() -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.process_time()
+            run(draws, checkpoint=os.path.join(folder, "run"))
+            return time.process_time() - start
+
+    def not_kept() -> float:
+        start = time.process_time()
+        run(draws)
+        return time.process_time() - start
+
+    ratios = [kept() / not_kept() for _ in range(3)]
+    return ChainCost(
+        "checkpoint every 5 s / none",
+        f"{100 * (median(ratios) - 1):+.1f} %",
+        f"CPU time of two chains of {draws} draws by EKF; range "
+        f"{100 * (min(ratios) - 1):+.1f} to {100 * (max(ratios) - 1):+.1f} %",
+    )
+
+
+def chains() -> list[ChainCost]:
+    logging.getLogger("pymc").setLevel(logging.ERROR)  # of far too short chains
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    four = "one chain, four parameters, one stage; from the random numbers to the DataTree"
+    found = [
+        ChainCost("overhead of a draw", f"{microseconds_a_draw(tune=False):.2f} µs", four),
+        ChainCost(
+            "overhead of an iteration of warm-up", f"{microseconds_a_draw(tune=True):.2f} µs", ""
+        ),
+    ]
+    if cores is None or (os.cpu_count() or 1) < 2:
+        return found
+    # Everything else is measured on one core.
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    try:
+        found += [
+            threads("EKF, 20,000 steps", well(psf.EKF(), np.arange(0, 20001, 20)), 8000),
+            threads("EnKF(100)", well(psf.EnKF(100), np.arange(0, 2001, 20)), 1500),
+            checkpoints(),
+        ]
+    finally:
+        os.sched_setaffinity(0, cores)
+    return found
