@@ -25,6 +25,7 @@ __all__ = [
     "exactness",
     "health_outputs",
     "hold_noise",
+    "is_filter",
     "move_noise",
     "noise_seeds",
     "noisy_filters",
@@ -68,6 +69,11 @@ def noisy_filters(model: pm.Model) -> dict[str, Filter]:
     """The filter of every variable whose likelihood is a random estimate."""
     filters = {name: node.op.filter for name, node in _state_space_nodes(model).items()}
     return {name: filter for name, filter in filters.items() if filter.noisy}
+
+
+def is_filter(value: object) -> bool:
+    """Whether a value is the settings of a filter."""
+    return isinstance(value, Filter.__value__)
 
 
 def resized(filter: Filter, n_members: int) -> Filter:

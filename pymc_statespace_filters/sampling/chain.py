@@ -6,16 +6,13 @@ With a noisy likelihood every proposal of every stage has noise of its own, and 
 current point stays as it is. The densities of the noise then cancel in Eq. 3.32, so that the chain
 is exact for prior times expected likelihood, whatever the number of stages.
 
-With a screen the whole delayed-rejection move runs on a cheap density c. It is a kernel reversible
-for c, so that its end point z is a proposal from the current point y that is accepted with
-probability min(1, pi(z) c(y) / (pi(y) c(z))) (surrogate transition, Liu 2001, section 9.4.3). Only
-then the expensive density pi is evaluated, once, with fresh noise.
+With a screen the whole delayed-rejection move runs on a cheap density, and only its end point is
+put to the expensive one, once, with fresh noise (see `surrogate_transition`).
 
 References
 ----------
 C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
 computations. Annals of Statistics 37, 697-725.
-J. S. Liu (2001). Monte Carlo Strategies in Scientific Computing. Springer.
 """
 
 from pathlib import Path
@@ -27,6 +24,7 @@ from numba import njit
 from pymc_statespace_filters.machine_code import Call, digest, kept, make_call
 from pymc_statespace_filters.sampling.adaptation import AdaptationSettings, learn, unpack
 from pymc_statespace_filters.sampling.delayed_rejection import gaussian_log_acceptance
+from pymc_statespace_filters.sampling.surrogate_transition import log_surrogate_acceptance
 
 HEALTH_SIZE = 3
 # Reasons of a failure that no filter reports: a value that is no density, an exception.
@@ -169,7 +167,7 @@ def _copy(source, target):
         target[i] = source[i]
 
 
-_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py")
+_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py", "surrogate_transition.py")
 _SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
 
 
@@ -274,11 +272,9 @@ def _screened_move(settings, target, screen, state, chol, random, k, counts):
     if value.failure != 0:
         counts[N_FAILED] = 1
         return 0.0
-    there, here = (
-        value.log_density - move.value.log_density,
-        state.numbers[LOG_DENSITY] - log_screen,
+    log_alpha = log_surrogate_acceptance(
+        state.numbers[LOG_DENSITY], value.log_density, log_screen, move.value.log_density
     )
-    log_alpha = min(0.0, there - here)
     if random.log_uniforms[k, settings.n_stages] < log_alpha:
         _stand(state, target, value, move.value.log_density)
         counts[STAGE] = move.stage

@@ -11,6 +11,8 @@ from pymc_statespace_filters.sampling.chain import (
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
+    N_SCREEN_FAILED,
+    N_SCREENED,
     NOT_A_NUMBER,
     STAGE,
     Draws,
@@ -41,6 +43,8 @@ class Record(NamedTuple):
         Pairs of a failure's code and its count.
     collapsed : int
         Iterations that ended at an estimate which hardly more than one particle decided.
+    screened, screen_failed : int
+        Evaluations of the screen, and how many failed.
     """
 
     iterations: int = 0
@@ -48,6 +52,8 @@ class Record(NamedTuple):
     evaluations: int = 0
     failures: tuple[tuple[int, int], ...] = ()
     collapsed: int = 0
+    screened: int = 0
+    screen_failed: int = 0
 
     def include(self, draws: Draws, row: int) -> "Record":
         """Take in an iteration."""
@@ -64,6 +70,8 @@ class Record(NamedTuple):
             self.evaluations + counts[N_EVALUATIONS],
             failures,
             self.collapsed + (float(draws.numbers[row, N_EFFECTIVE]) < COLLAPSED),
+            self.screened + counts[N_SCREENED],
+            self.screen_failed + counts[N_SCREEN_FAILED],
         )
 
     @classmethod
@@ -81,6 +89,8 @@ class Record(NamedTuple):
             int(counts[:, N_EVALUATIONS].sum()),
             failures,
             int(np.count_nonzero(draws.numbers[begin:end, N_EFFECTIVE] < COLLAPSED)),
+            int(counts[:, N_SCREENED].sum()),
+            int(counts[:, N_SCREEN_FAILED].sum()),
         )
 
     @property
@@ -110,10 +120,17 @@ def closing_warning(record: Record) -> SamplerWarning | None:
         PyMC logs it in the main process, in whichever process the chain ran.
     """
     if record.moved <= STANDING * record.iterations:
+        screen = " or, with a screen, lower screen_power" if record.screened else ""
         return _warning(
             f"DRAM accepted {record.moved} of {record.iterations} proposals after warm-up: the "
             "chain hardly moves. Tune longer, start elsewhere (initvals), give proposal_cov, or, "
-            "if the likelihood is noisy, give its filter more particles."
+            f"if the likelihood is noisy, give its filter more particles{screen}."
+        )
+    if record.screen_failed > TOLERATED_FAILURES * record.screened:
+        return _warning(
+            f"The screen failed in {record.screen_failed} of {record.screened} proposals after "
+            "warm-up, which were rejected unseen: if the posterior reaches into that region it is "
+            "cut off there. Another screen, or none, helps; a lower screen_power does not."
         )
     if record.collapsed > TOLERATED_COLLAPSES * record.iterations:
         return _warning(

@@ -18,6 +18,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import (
     health_outputs,
     hold_noise,
@@ -248,6 +249,11 @@ def screening_density(model: Model, screen: Any, power: float) -> TensorVariable
     Returns
     -------
     TensorVariable
+
+    Raises
+    ------
+    ModelError
+        If the filter cannot treat a system.
     """
     names = state_space_names(model)
     variables = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
@@ -255,4 +261,7 @@ def screening_density(model: Model, screen: Any, power: float) -> TensorVariable
         pt.sum(term) * (power if name in names else 1.0)
         for name, term in zip(variables, model.logp(sum=False), strict=True)
     )
-    return with_filter([total], model, dict.fromkeys(names, screen))[0]
+    try:
+        return with_filter([total], model, dict.fromkeys(names, screen))[0]
+    except ModelError as error:
+        raise ModelError(f"screen={screen!r}: {error}") from error

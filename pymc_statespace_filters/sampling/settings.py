@@ -9,6 +9,7 @@ from typing import Any, Self, TypeGuard
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.inspection import is_filter
 
 ADAPTATIONS = ("chain", "continuous")
 
@@ -77,6 +78,10 @@ class DRAMSettings:
             raise ModelError(f"adapt_every={self.adapt_every!r}: expected an integer, at least 4")
         if not isinstance(self.refresh_noise, bool | np.bool_):
             raise ModelError(f"refresh_noise={self.refresh_noise!r}: expected True or False")
+        if self.screen is not None and not is_filter(self.screen):
+            raise ModelError(
+                f"screen={self.screen!r}: expected a filter such as psf.EKF(), or None"
+            )
         power = self.screen_power
         if not _is_real(power) or not 0.0 < power <= 1.0:
             raise ModelError(f"screen_power={power!r}: expected a number above 0, at most 1")

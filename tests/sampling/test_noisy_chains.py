@@ -1,0 +1,190 @@
+"""Whole chains by noisy likelihoods, screened and correlated, against an exact posterior."""
+
+import logging
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
+from tests.sampling.test_state_space import DATA as RECORD
+
+FEW = psf.BootstrapPF(30)
+
+
+def chains(draws=20_000, tune=1000, model=None, **settings):
+    return psf.sample_dram(
+        draws,
+        tune,
+        chains=2,
+        model=model or linear_model(FEW),
+        random_seed=4,
+        progressbar=False,
+        **settings,
+    )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"screen": psf.EKF(), "screen_power": 1.0},
+        {"screen": psf.EKF(), "screen_power": 0.5, "stages": 3},
+        {"screen": psf.EnKF(20), "screen_power": 1.0},  # on the model's seed, far from exact
+        {"correlation": 0.95, "stages": 1},
+        {"correlation": 0.95, "stages": 1, "screen": psf.EKF(), "screen_power": 0.5},
+    ],
+    ids=["fresh", "screened", "tempered", "noisy_screen", "correlated", "correlated_screened"],
+)
+def test_exact_posterior(settings):
+    """Four comparisons at 4.5 standard errors, six cases: one false alarm in 6000 seeds."""
+    assert max(worst_deviations(chains(**settings))) < 4.5
+
+
+def test_the_same_test_finds_held_noise():
+    """One seed's error stays in the posterior: common random numbers are not exact."""
+    idata = chains(refresh_noise=False)
+    assert max(worst_deviations(idata)) > 6.0
+
+
+@pytest.mark.parametrize("screen", [psf.EKF(), psf.EnKF(20)], ids=["EKF", "EnKF"])
+def test_the_target_is_evaluated_only_where_the_screen_has_moved(screen):
+    idata = chains(300, 300, screen=screen, stages=2)
+    stats = idata["sample_stats"]
+    calls, moved, screened = (
+        stats[name].to_numpy() for name in ("n_evaluations", "accepted", "n_screened")
+    )
+    assert set(np.unique(calls)) == {0, 1}
+    assert set(np.unique(screened)) == {1, 2}
+    assert np.all(moved <= calls)
+    # The first proposal's rejections are certain, as the second one was made.
+    assert np.all(calls[screened == 1] == 1)
+    assert 0 < np.mean(calls[screened == 2]) < 1
+
+
+class TestRefusals:
+    """What cannot be right, or cannot be computed, is refused alike by both entry points."""
+
+    @pytest.mark.parametrize("entry", [psf.DRAM, psf.sample_dram])
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"correlation": 0.9}, r"correlation=0\.9 needs stages=1, got stages=\(2, 1\).*cancel"),
+            ({"correlation": 0.9, "stages": 2}, r"needs stages=1, got stages=\(2, 2\)"),
+            (
+                {"correlation": 0.9, "stages": 1, "screen": psf.EnKF(20)},
+                r"correlation=0\.9 needs a screen without noise, got screen=EnKF",
+            ),
+            (
+                {"correlation": 0.9, "stages": 1, "refresh_noise": False},
+                r"correlation=0\.9 moves the noise, which refresh_noise=False holds",
+            ),
+            ({"correlation": 1.0, "stages": 1}, r"correlation=1\.0: expected a number between"),
+            ({"correlation": -0.1, "stages": 1}, r"correlation=-0\.1: expected"),
+            ({"correlation": np.nan, "stages": 1}, r"correlation=nan: expected"),
+            ({"correlation": True, "stages": 1}, r"correlation=True: expected"),
+            ({"screen": "EKF"}, r"screen='EKF': expected a filter such as psf\.EKF\(\)"),
+            ({"screen": psf.EKF}, r"screen=<class .*EKF'>: expected a filter"),
+            (
+                {"screen": "EKF", "correlation": 0.9, "stages": 1},
+                r"screen='EKF': expected a filter",
+            ),
+            ({"screen": psf.EKF(), "screen_power": 0}, r"screen_power=0: expected a number above"),
+            ({"screen": psf.EKF(), "screen_power": 2}, r"screen_power=2: expected"),
+            ({"screen": psf.EKF(), "screen_power": np.nan}, r"screen_power=nan: expected"),
+        ],
+    )
+    def test_settings(self, entry, settings, message):
+        with linear_model(FEW), pytest.raises(ModelError, match=message) as caught:
+            entry(**settings)
+        assert isinstance(caught.value, ValueError)
+
+    @pytest.mark.parametrize("entry", [psf.DRAM, psf.sample_dram])
+    def test_a_screen_that_cannot_treat_the_system(self, entry):
+        counts = psf.StateSpaceModel(
+            transition=lambda x, q, phi: [phi * x[0] + q[0]],
+            process_noise=[[0.1]],
+            observation_dist=lambda x: [pm.Poisson.dist(mu=pt.exp(x[0]))],
+            initial_mean=[0.0],
+            initial_cov=[[1.0]],
+        )
+        with pm.Model():
+            pm.Normal("phi")
+            psf.StateSpace("d", counts, FEW, steps=[1, 2], observed=[1, 0])
+            with pytest.raises(ModelError, match=r"screen=EKF\(\): EKF needs .*Gaussian noise"):
+                entry(screen=psf.EKF())
+
+    @pytest.mark.parametrize("entry", [psf.DRAM, psf.sample_dram])
+    def test_a_screen_without_state_space(self, entry):
+        with pm.Model():
+            pm.Normal("mu")
+            with pytest.raises(ModelError, match=r"screen=EKF\(\): the model has no StateSpace"):
+                entry(screen=psf.EKF())
+
+
+def kinked(x, q, phi):
+    """The derivative at zero, where the EKF begins, is 0/0 for phi above 0.5."""
+    kink = pt.sqrt(x[0] ** 2 + pt.switch(phi > 0.5, 0.0, 1.0))
+    return [phi * x[0] + 1e-9 * kink + q[0]]
+
+
+def kinked_model():
+    system = psf.StateSpaceModel(
+        transition=kinked,
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.4]],
+        process_noise=[[0.5]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 0.5)
+        psf.StateSpace("d", system, FEW, steps=STEPS, observed=RECORD)
+    return model
+
+
+def test_a_screen_that_fails_cuts_off_and_says_so(caplog):
+    start = {"phi": 0.3}
+    with caplog.at_level(logging.WARNING, logger="pymc.stats.convergence"):
+        free = chains(500, 500, kinked_model(), initvals=start)
+        assert "screen" not in caplog.text
+        screened = chains(500, 500, kinked_model(), initvals=start, screen=psf.EKF())
+    assert np.mean(free["posterior"]["phi"] > 0.5) > 0.1
+    assert np.all(screened["posterior"]["phi"] <= 0.5)
+    stats = screened["sample_stats"]
+    assert stats["n_failed"].sum() == 0
+    for chain in range(2):
+        failed, proposals = (
+            int(stats[name][chain].sum()) for name in ("n_screen_failed", "n_screened")
+        )
+        expected = f"Chain {chain}: The screen failed in {failed} of {proposals} proposals"
+        assert expected in caplog.text
+    assert "Another screen" in caplog.text
+
+
+def test_the_step_method_says_so_too(caplog):
+    with kinked_model(), caplog.at_level(logging.WARNING, logger="pymc.stats.convergence"):
+        pm.sample(
+            200,
+            tune=200,
+            chains=1,
+            step=psf.DRAM(screen=psf.EKF()),
+            initvals={"phi": 0.3},
+            random_seed=1,
+            progressbar=False,
+            compute_convergence_checks=False,
+        )
+    assert "The screen failed in" in caplog.text
+
+
+def test_screen_and_target_of_the_same_system():
+    """A screen that is the target's own deterministic filter passes nothing in vain."""
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 0.5)
+        pm.HalfNormal("spread", 1.0)
+        psf.StateSpace("d", LINEAR, psf.EKF(), steps=STEPS, observed=RECORD)
+    stats = chains(300, 300, model, screen=psf.EKF(), screen_power=1.0)["sample_stats"]
+    np.testing.assert_array_equal(stats["n_evaluations"], stats["accepted"])
