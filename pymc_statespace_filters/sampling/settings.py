@@ -45,7 +45,7 @@ class DRAMSettings:
     refresh_noise: bool = True
     correlation: float | None = None
     screen: Any = None
-    screen_power: float = 1.0
+    screen_power: float = 0.5
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Self:

@@ -75,7 +75,7 @@ class DRAM(BlockedStep):
         all; only where one ends the model's own is evaluated, and decides (surrogate transition).
         A filter with noise is used on the noise of the model's seed. The chain is right
         for any screen that is possible wherever the posterior is.
-    screen_power : float, default 1.0
+    screen_power : float, default 0.5
         In (0, 1]: tempers the likelihood of the screen, which else vetoes good points where it is
         wrong by many nats.
     correlation : float, optional
@@ -178,7 +178,7 @@ class DRAM(BlockedStep):
         proposal_cov: np.ndarray | None = None,
         refresh_noise: bool = True,
         screen: Any = None,
-        screen_power: float = 1.0,
+        screen_power: float = 0.5,
         correlation: float | None = None,
         model: Model | None = None,
         initial_point: dict[str, np.ndarray] | None = None,

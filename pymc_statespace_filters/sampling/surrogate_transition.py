@@ -6,7 +6,7 @@ to z, and the chain goes there with probability (Liu 2001, section 9.4.3)::
     min(1, pi(z) c(y) / (pi(y) c(z)))
 
 For z other than y, pi(y) K(y, z) times this is K(y, z) c(y) min(pi(y) / c(y), pi(z) / c(z)),
-which is symmetric in y and z: the chain is reversible for pi, how ever far c is from it. But where
+which is symmetric in y and z: the chain is reversible for pi, however far c is from it. But where
 c is zero and pi is not, no move of K ever arrives.
 
 References

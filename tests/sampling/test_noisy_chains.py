@@ -9,8 +9,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
 from tests.sampling.test_state_space import DATA as RECORD
+from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
 
 FEW = psf.BootstrapPF(30)
 
