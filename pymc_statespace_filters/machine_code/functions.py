@@ -10,6 +10,8 @@ import ctypes
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +72,7 @@ class NativeFunction:
 
     def __init__(self, function: Any, example: Sequence[np.ndarray]):
         self._function = function
+        self._one_at_a_time = Lock()  # PyTensor's functions have one storage for all threads
         shared = [cell.storage[0] for cell in function.input_storage[len(example) :]]
         self._is_native = hasattr(function.vm, "jit_fn") and all(
             isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
@@ -87,7 +90,8 @@ class NativeFunction:
         """Call from Python."""
         if self._is_native:
             return self._function.vm.jit_fn(*inputs, *self._data)
-        return self._function(*inputs)
+        with self._one_at_a_time:
+            return self._function(*inputs)
 
     def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
         """Make a call that reads these contiguous arrays each time.
@@ -122,7 +126,7 @@ class NativeFunction:
             out[0] = 1.0
             # An exception cannot pass through machine code; whoever finds the 1 calls again.
             with suppress(Exception):
-                values = self._function(*inputs)
+                values = self(*inputs)
                 out[1:] = np.concatenate([np.ravel(value) for value in values])
                 out[0] = 0.0
 
@@ -160,7 +164,7 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
             lines += [f"numbers[n] = results[{i}].item()", "n += 1"]
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
-    key = digest("adapter", source, str(signature), str(results))
+    key = digest("adapter", Path(__file__).read_text(), source, str(signature), str(results))
     entry = Entry(namespace["adapter"], (COUNTS, NUMBERS), "adapter", key)
     entry.compile()
     return entry.address
@@ -174,6 +178,14 @@ def _pointer(typing_context, address):
         return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.int64), generate
+
+
+def _forget_error(context: Any, builder: Any) -> None:
+    """Clear the interpreter's error: an operation in Python may have set it, and we go on."""
+    python = context.get_python_api(builder)
+    lock = python.gil_ensure()
+    python.err_clear()
+    python.gil_release(lock)
 
 
 def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
@@ -192,6 +204,8 @@ def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
             status, returned = convention.call_function(
                 builder, function, results, signature, given
             )
+            with builder.if_then(status.is_error, likely=False):
+                _forget_error(context, builder)
             return context.make_tuple(builder, outcome, (status.is_error, returned))
 
         outcome = types.Tuple((types.boolean, results))
