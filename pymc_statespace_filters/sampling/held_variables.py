@@ -37,6 +37,10 @@ class HeldVariables:
             self._layout.append((v.name, slice(begin, end), value.shape, v.dtype))
         self.dim = end
 
+    def name_at(self, i: int) -> str:
+        """Name of the variable that element i of the vector belongs to."""
+        return next(name for name, part, _, _ in self._layout if i < part.stop)
+
     def join(self, point: Mapping[str, np.ndarray]) -> np.ndarray:
         """Join a point's values into the vector, shape (d,)."""
         position = np.empty(self.dim)
@@ -70,7 +74,8 @@ def continuous_value_vars(
     if discrete:
         raise ModelError(
             f"vars: DRAM samples continuous variables, these are discrete: {', '.join(discrete)}. "
-            "Name the continuous ones, DRAM([...]), and PyMC finds a step method for the rest"
+            "Name the continuous ones, pm.sample(step=[DRAM([...])]), and PyMC finds a step method "
+            "for the rest"
         )
     return held
 

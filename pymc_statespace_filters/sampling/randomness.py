@@ -41,6 +41,11 @@ def draw_key(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, np.iinfo(np.uint64).max, size=2, dtype=np.uint64, endpoint=True)
 
 
+def side_generator(key: np.ndarray) -> np.random.Generator:
+    """Make a generator of the chain's key whose numbers are in none of its blocks."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 1]))
+
+
 def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Draw seeds of noise, non-negative int64 of the given shape."""
     return rng.integers(0, np.iinfo(np.int64).max, size=shape, dtype=np.int64)

@@ -1,15 +1,27 @@
 """One chain while it runs: where it stands, and the arrays that its machine code works on."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from pymc_statespace_filters.sampling import chain
-from pymc_statespace_filters.sampling.adaptation import pack, packed_size, start_adaptation
+from pymc_statespace_filters.sampling.adaptation import (
+    pack,
+    packed_size,
+    start_adaptation,
+    unpack,
+)
 from pymc_statespace_filters.sampling.chain import Draws, Random, Settings, State, advance
+from pymc_statespace_filters.sampling.log_density import Evaluation
 from pymc_statespace_filters.sampling.randomness import draw_seeds
+from pymc_statespace_filters.sampling.seed_spread import SeedSpread, seed_spread
 from pymc_statespace_filters.sampling.starts import EvaluatedPoint, best_start
 from pymc_statespace_filters.sampling.target import Target
+
+
+class Halted(Exception):
+    """Somebody asked for a pause outside of the chain's iterations."""
 
 
 class RunningChain:
@@ -75,10 +87,18 @@ class RunningChain:
         -------
         tuple of int
             For each evaluation made, 0 or the code of its failure.
+
+        Raises
+        ------
+        Halted
+            If somebody asked for a pause.
+        Exception
+            What the model raised.
         """
         self._density.correlation[...] = 0.0
 
         def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
+            self._heed_pause()
             return self._evaluate(
                 candidate, others, self.noise(draw_seeds(rng, self.state.seeds.shape))
             )
@@ -88,6 +108,21 @@ class RunningChain:
             self._evaluate(start.position, others, start.seeds)
         self._stand(start)
         return codes
+
+    def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
+        """Measure the scatter of the estimates at a point over seeds (R, noisy).
+
+        The chain stays where it is. Raises what `start` raises.
+        """
+
+        def evaluate_afresh(*arguments: Any) -> Evaluation:
+            self._heed_pause()
+            return self._density(*arguments)
+
+        self._density.correlation[...] = 0.0
+        spread = seed_spread(evaluate_afresh, position, (), seeds)
+        self._move_noise()
+        return spread
 
     def evaluate_again(self, others: Sequence[np.ndarray]) -> int:
         """Evaluate the current point with its noise where only others moved; its failure's code."""
@@ -125,6 +160,11 @@ class RunningChain:
             counts[chain.N_FAILED] += len(failed)
             if failed and not counts[chain.FAILURE]:
                 counts[chain.FAILURE] = failed[-1]
+
+    @property
+    def proposal_cov(self) -> np.ndarray:
+        """Covariance of the first stage's proposals, shape (d, d)."""
+        return unpack(self.state.adaptation, self.state.position.size).cov
 
     @property
     def others(self) -> list[np.ndarray]:
@@ -167,6 +207,10 @@ class RunningChain:
                 density.raise_error()
             raise RuntimeError("the model's log-density raised an error, but not when asked again")
         return done
+
+    def _heed_pause(self) -> None:
+        if self.talk[chain.PAUSE]:
+            raise Halted
 
     def _evaluate(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: np.ndarray

@@ -13,12 +13,14 @@ from threading import Event
 from typing import NamedTuple
 
 import numpy as np
+from pymc.stats.convergence import log_warnings
 
-from pymc_statespace_filters.sampling import chain
+from pymc_statespace_filters.sampling import chain, noise_check
 from pymc_statespace_filters.sampling.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.progress import watch
-from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key
-from pymc_statespace_filters.sampling.running import RunningChain
+from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key, draw_seeds
+from pymc_statespace_filters.sampling.running import Halted, RunningChain
+from pymc_statespace_filters.sampling.seed_spread import SeedSpread
 from pymc_statespace_filters.sampling.target import Target
 
 _REFRESH_SECONDS = 0.1
@@ -37,6 +39,8 @@ class Plan(NamedTuple):
         For each chain, from its generator to the candidates for its start.
     seeds : sequence of numpy.random.SeedSequence
         For each chain, all its randomness.
+    measures_noise : bool
+        Whether the scatter of the estimates is measured at each start.
     """
 
     tune: int
@@ -44,6 +48,7 @@ class Plan(NamedTuple):
     keeps_warmup: bool
     starts: Sequence[Callable[[np.random.Generator], Sequence[np.ndarray]]]
     seeds: Sequence[np.random.SeedSequence]
+    measures_noise: bool = False
 
     @property
     def n_iterations(self) -> int:
@@ -62,6 +67,12 @@ class ChainRun:
     index : int
         Which chain.
     checkpoint : Checkpoint, optional
+
+    Attributes
+    ----------
+    running : RunningChain
+    key : ndarray of uint64, shape (2,)
+        Of its random numbers.
     """
 
     def __init__(self, target: Target, plan: Plan, index: int, checkpoint: Checkpoint | None):
@@ -69,12 +80,12 @@ class ChainRun:
         n_covs = plan.tune if plan.keeps_warmup else 0
         self.running = RunningChain(target, plan.n_iterations, n_covs)
         self._rng = np.random.default_rng(plan.seeds[index])
-        self._key = draw_key(self._rng)
+        self.key = draw_key(self._rng)
         self._block: tuple[int, chain.Random] | None = None
         self._log = None if checkpoint is None else checkpoint.log(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             draws, state = stored
-            self._key = state.pop("key")
+            self.key = state.pop("key")
             self.running.restore(draws, state)
         self._n_saved = self.done
         self._saved_at = time.monotonic()
@@ -92,9 +103,7 @@ class ChainRun:
     def run(self, stop: Event) -> None:
         """Go on to the end, or until told to stop."""
         try:
-            codes: tuple[int, ...] = ()
-            if self.done == 0:
-                codes = self.running.start(self._plan.starts[self._index](self._rng), (), self._rng)
+            codes = self._start() if self.done == 0 else ()
             while self.done < self._plan.n_iterations and not stop.is_set():
                 self.running.talk[chain.PAUSE] = 0  # asked for again and again where it is needed
                 self._advance()
@@ -104,9 +113,16 @@ class ChainRun:
                 if self._must_save():
                     self._save()
             self._save()
+        except Halted:
+            return
         except Exception as error:
             error.add_note(f"in chain {self._index}, after {self.done} iterations")
             raise
+
+    def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
+        """Measure the scatter of the estimates at a point, once the chain has ended."""
+        self.running.talk[chain.PAUSE] = 0
+        return self.running.seed_spread(position, seeds)
 
     def progress(self) -> dict[str, float]:
         """What a progress bar shows of the iterations made so far, one at least."""
@@ -120,13 +136,25 @@ class ChainRun:
             "n_failed": int(counts[chain.N_FAILED]),
         }
 
+    def _start(self) -> tuple[int, ...]:
+        """Find a start; for each evaluation made, 0 or the code of its failure."""
+        candidates = self._plan.starts[self._index](self._rng)
+        codes = self.running.start(candidates, (), self._rng)
+        if self._plan.measures_noise:
+            state = self.running.state
+            seeds = draw_seeds(self._rng, (noise_check.N_SEEDS, state.seeds.size))
+            spread = self.running.seed_spread(state.position, seeds)
+            # At once: who reads it may not want to wait for the end.
+            log_warnings(list(filter(None, [noise_check.start_warning(spread, self._index)])))
+        return codes
+
     def _advance(self) -> None:
         """Go on to the end of the block of random numbers, or of the phase."""
         done, plan = self.done, self._plan
         tune = done < plan.tune
         index, first = divmod(done, BLOCK)
         if self._block is None or self._block[0] != index:
-            self._block = index, self._target.random(self._key, index)
+            self._block = index, self._target.random(self.key, index)
         end = min((index + 1) * BLOCK, plan.tune if tune else plan.n_iterations)
         self.running.advance(tune, self._block[1], first, done, end - done)
 
@@ -137,7 +165,7 @@ class ChainRun:
     def _save(self) -> None:
         if self._log is not None and self.done > self._n_saved:
             draws, state = self.running.snapshot(self._n_saved)
-            self._log.append(draws, state | {"key": self._key})
+            self._log.append(draws, state | {"key": self.key})
             self._n_saved = self.done
         self._saved_at = time.monotonic()
 
@@ -176,16 +204,16 @@ def run_chains(
     runs = [ChainRun(target, plan, i, checkpoint) for i in range(len(plan.seeds))]
     stop = Event()
     bars = watch(len(runs), plan.draws, plan.tune, progressbar)
-    with bars, ThreadPoolExecutor(cores) as pool, suppress(KeyboardInterrupt):
+    with bars, ThreadPoolExecutor(cores) as pool:
         futures = [pool.submit(run.run, stop) for run in runs]
         try:
-            _watch(runs, futures, bars, stop)
+            with suppress(KeyboardInterrupt):
+                _watch(runs, futures, bars, stop)
         finally:
-            stop.set()
-            while any(future.running() for future in futures):
-                for run in runs:
-                    run.ask_for_pause(stop)
-                wait(futures, timeout=_REFRESH_SECONDS)
+            _halt(runs, futures, stop)
+    for future in futures:
+        if not future.cancelled():
+            future.result()
     return runs
 
 
@@ -204,3 +232,16 @@ def _watch(runs: Sequence[ChainRun], futures: Sequence[Future], bars: watch, sto
                 bars.begin(i)
             if run.done > 0:
                 bars.update(i, run.done, run.progress())
+
+
+def _halt(runs: Sequence[ChainRun], futures: Sequence[Future], stop: Event) -> None:
+    """Bring all chains to a halt, however often the user interrupts meanwhile."""
+    stop.set()
+    for future in futures:
+        future.cancel()
+    running = {future for future in futures if not future.cancelled()}
+    while running:
+        with suppress(KeyboardInterrupt):
+            for run in runs:
+                run.ask_for_pause(stop)
+            _, running = wait(running, timeout=_REFRESH_SECONDS)

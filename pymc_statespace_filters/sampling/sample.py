@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from pymc.initial_point import make_initial_point_fns_per_chain
 from pymc.model import Model, modelcontext
-from pymc.stats.convergence import log_warnings, run_convergence_checks
+from pymc.stats.convergence import SamplerWarning, log_warnings, run_convergence_checks
 from pytensor.graph.basic import Variable
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import statistics
-from pymc_statespace_filters.sampling.adaptation import unpack
 from pymc_statespace_filters.sampling.chain import STAGE
 from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.fingerprint import data_fingerprint, model_fingerprint
 from pymc_statespace_filters.sampling.health import Record, closing_warning
+from pymc_statespace_filters.sampling.noise_check import at_the_highest_draw, is_worthwhile
 from pymc_statespace_filters.sampling.results import ChainDraws, to_datatree
 from pymc_statespace_filters.sampling.runs import ChainRun, Plan, run_chains
 from pymc_statespace_filters.sampling.settings import DRAMSettings, is_count
@@ -82,7 +82,9 @@ def sample_dram(
     xarray.DataTree
         As ``pm.sample`` returns it. After Ctrl-C, what was drawn until then. The attributes
         ``exact`` (whether the chains target the posterior itself, without the bias of a filter),
-        ``refresh_noise`` and ``correlation`` say what the draws are.
+        ``refresh_noise`` and ``correlation`` say what the draws are; ``log_likelihood_variance``,
+        of a run of 600 iterations or more with a noisy likelihood, is the variance of the estimated
+        log-likelihood over 12 noise seeds at the draw of highest density.
 
     Raises
     ------
@@ -105,6 +107,8 @@ def sample_dram(
     (2, 500)
     """
     model = modelcontext(model)
+    if not isinstance(model, Model):
+        raise ModelError(f"model must be a pymc.Model, got {model!r}")
     for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
         if not is_count(value) or value < least:
             raise ModelError(f"{name}={value!r}: expected an integer, at least {least}")
@@ -120,6 +124,7 @@ def sample_dram(
         not discard_tuned_samples,
         _starts(target, model, initvals, chains, disperse=tune > 0),
         np.random.SeedSequence(entropy).spawn(chains),
+        is_worthwhile(target, tune + draws),
     )
     asked = {
         "draws": draws,
@@ -153,7 +158,19 @@ def sample_dram(
         "refresh_noise": int(settings.refresh_noise),
         "correlation": settings.correlation or 0.0,
     }
-    _warn(tree, model, runs, tune)
+    warnings = _chain_warnings(target, runs, tune)
+    if plan.measures_noise and all(run.done == plan.n_iterations for run in runs):
+        spread, warning = at_the_highest_draw(
+            [run.running.draws for run in runs],
+            tune if draws else 0,
+            [run.seed_spread for run in runs],
+            [run.key for run in runs],
+        )
+        tree.attrs["log_likelihood_variance"] = spread.variance
+        warnings += filter(None, [warning])
+    if "posterior" in tree:
+        warnings += run_convergence_checks(tree, model)
+    log_warnings(warnings)
     return tree
 
 
@@ -165,7 +182,7 @@ def _chain_draws(target: Target, run: ChainRun, tune: int) -> ChainDraws:
     stats["accept_rate"] = np.concatenate(
         [np.cumsum(phase) / np.arange(1, phase.size + 1) for phase in np.split(moved, [tune])]
     )
-    frozen = unpack(run.running.state.adaptation, target.held.dim).cov
+    frozen = run.running.proposal_cov
     covs = np.broadcast_to(frozen, (max(done - tune, 0), *frozen.shape))
     if len(draws.covs):
         covs = np.concatenate([draws.covs[:done], covs])
@@ -174,23 +191,23 @@ def _chain_draws(target: Target, run: ChainRun, tune: int) -> ChainDraws:
     return ChainDraws(draws.positions[:done], stats | {"proposal_cov": covs})
 
 
-def _warn(tree: DataTree, model: Model, runs: Sequence[ChainRun], tune: int) -> None:
-    """Say what is wrong with the chains, one by one and together, through PyMC's logger."""
+def _chain_warnings(target: Target, runs: Sequence[ChainRun], tune: int) -> list[SamplerWarning]:
+    """What is wrong with the chains, one by one."""
     warnings = []
     for i, run in enumerate(runs):
         record = Record.of(run.running.draws, tune, run.done)
-        warning = closing_warning(record) if run.done > tune else None
-        if warning is not None:
-            warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
-    if "posterior" in tree:
-        warnings += run_convergence_checks(tree, model)
-    log_warnings(warnings)
+        if record.iterations:
+            warning = closing_warning(record, target.growth(run.running.proposal_cov))
+            if warning is not None:
+                warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
+    return warnings
 
 
 def _starts(
     target: Target, model: Model, initvals: Any, chains: int, *, disperse: bool
 ) -> list[Callable[[np.random.Generator], Sequence[np.ndarray]]]:
     """For each chain, a function from its generator to the candidates for its start."""
+    _check_initvals(model, initvals, chains)
     points = make_initial_point_fns_per_chain(
         model=model, overrides=initvals, jitter_rvs=set(), chains=chains
     )
@@ -203,6 +220,22 @@ def _starts(
         return target.starts.candidates(start, rng) if disperse else [start]
 
     return [partial(candidates_of, point) for point in points]
+
+
+def _check_initvals(model: Model, initvals: Any, chains: int) -> None:
+    one_for_all = initvals is None or isinstance(initvals, Mapping)
+    if not one_for_all:
+        if not isinstance(initvals, list | tuple):
+            raise ModelError(f"initvals={initvals!r}: expected a mapping, or one for each chain")
+        if len(initvals) != chains:
+            raise ModelError(f"initvals are for {len(initvals)} chains, chains={chains}")
+    known = {name for v, rv in model.values_to_rvs.items() for name in (v.name, rv.name)}
+    for given in [initvals] if one_for_all else initvals:
+        if unknown := [str(name) for name in given or () if str(name) not in known]:
+            raise ModelError(
+                f"initvals: {unknown[0]!r} is not a free variable of the model, which are "
+                f"{', '.join(rv.name for rv in model.free_RVs)}"
+            )
 
 
 def _checked_cores(cores: object, chains: int) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pymc.model import Model, modelcontext
 from pymc.step_methods.compound import BlockedStep, StepMethodState
+from pymc.stats.convergence import SamplerWarning
 from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
@@ -232,10 +233,14 @@ class DRAM(BlockedStep):
         is_last = not self.tune and self._record.iterations == self._n_draws
         stats = statistics.of_draws(self._target, running.draws, 0)
         stats["accept_rate"] = self._record.accept_rate
-        stats[statistics.WARNING] = closing_warning(self._record) if is_last else None
+        stats[statistics.WARNING] = self._closing_warning() if is_last else None
         if stats["accepted"] or self._point is None:
             self._point = point | self._target.held.split(running.state.position.copy())
         return self._point, [stats]
+
+    def _closing_warning(self) -> SamplerWarning | None:
+        # PyMC does not tell a step method which chain it makes.
+        return closing_warning(self._record, self._target.growth(self._running.proposal_cov))
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0

@@ -9,6 +9,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import exactness, noise_seeds, state_space_names
 from pymc_statespace_filters.sampling.chain import Random
+from pymc_statespace_filters.sampling.health import Growth
 from pymc_statespace_filters.sampling.held_variables import (
     HeldVariables,
     check_noise_is_held,
@@ -51,7 +52,7 @@ class Target:
     Raises
     ------
     ModelError
-        If a variable is discrete, a noisy StateSpace depends on others than ``vars``, or
+        If a variable is discrete, there are none, a noisy StateSpace depends on others than ``vars``, or
         ``proposal_cov`` or the screen does not fit.
     """
 
@@ -74,6 +75,8 @@ class Target:
         self._seed_variables = tuple(seeds.values())
         default = model.initial_point(random_seed=0)
         self.held = HeldVariables(variables, default)
+        if not self.held.dim:
+            raise ModelError("vars: the model has no free variable to sample")
         self.starts = Starts(model, self.held, default)
         if proposal_cov is None:
             self.first_cov = self.starts.covariance()
@@ -107,6 +110,12 @@ class Target:
         self.density.prepare()
         if self.screen is not None:
             self.screen.prepare()
+
+    def growth(self, cov: np.ndarray) -> Growth:
+        """Compare a covariance of proposals with that of the prior's draws."""
+        variances = np.diag(cov) / np.diag(self.starts.covariance())
+        most = int(variances.argmax())
+        return Growth(self.held.name_at(most), float(variances[most]) ** 0.5)
 
     def random(self, key: np.ndarray, index: int) -> Random:
         """Draw a block of random numbers for a chain with this key."""

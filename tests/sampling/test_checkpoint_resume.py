@@ -1,0 +1,200 @@
+"""Runs that are killed and called again: the same draws as of a run that was not."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
+from pymc_statespace_filters.sampling import runs
+from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
+
+KINDS = {
+    "deterministic": (psf.EKF(), {}),
+    "estimated": (psf.BootstrapPF(20), {}),
+    "correlated": (psf.BootstrapPF(20), {"correlation": 0.9, "stages": 1}),
+    "screened": (psf.BootstrapPF(20), {"screen": psf.EKF(), "screen_power": 0.8}),
+}
+
+
+def sample_kind(kind, **changes):
+    """A run long enough to be killed in its midst."""
+    filter, settings = KINDS[kind]
+    arguments = {"draws": 6000, "tune": 3000, "discard_tuned_samples": False} | settings
+    return sample_dram(state_space_model(filter), **arguments | changes)
+
+
+# With an argument it says when a chain begins and has made so many iterations, and waits there to
+# be killed.
+KILLED = """
+import sys, threading, time, warnings
+warnings.simplefilter("ignore")
+from pymc_statespace_filters.sampling import runs
+from tests.sampling.test_checkpoint_resume import sample_kind
+runs.CHECKPOINT_SECONDS = 0.01
+made = runs.ChainRun._advance
+def advance(self):
+    if self.done >= int(sys.argv[3]):
+        print("there", flush=True)
+        time.sleep(0.001 * (1 + self.done % 7))
+    made(self)
+runs.ChainRun._advance = advance
+sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
+print("done", flush=True)
+"""
+
+
+def kill_after(kind, folder, iterations):
+    """Run in a process that is killed once a chain has made so many iterations."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", KILLED, kind, str(folder), str(iterations)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with child:
+        assert child.stdout.readline() == "there\n"
+        child.send_signal(signal.SIGKILL)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("kind", KINDS)
+def test_killed_and_resumed(kind, tmp_path, monkeypatch):
+    """At the start, within warm-up and within the draws: nothing shows in the end."""
+    for iterations in (0, 1800, 5500) if kind == "estimated" else (4000,):
+        kill_after(kind, tmp_path / "run", iterations)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CheckpointWarning)  # killed while it wrote
+        found = sample_kind(kind, checkpoint=tmp_path / "run", cores=1)
+    expected = sample_kind(kind)
+    assert_identical(found, expected)
+    assert found.attrs == expected.attrs
+
+
+# The moments at which a process dies, without a process: quick enough for many of them.
+
+
+class Killed(BaseException):
+    """Nothing within the package catches it."""
+
+
+@pytest.fixture
+def small():
+    return state_space_model(psf.BootstrapPF(10))
+
+
+SMALL = {"draws": 700, "tune": 400}
+
+
+@pytest.fixture
+def often(monkeypatch):
+    monkeypatch.setattr(runs, "CHECKPOINT_SECONDS", 0.0)
+
+
+def test_a_log_torn_anywhere(small, tmp_path, often):
+    expected = sample_dram(small, **SMALL)
+    folder = tmp_path / "run"
+    assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
+    log = folder / "chain-1.log"
+    whole = log.read_bytes()
+    for size in (0, 5, len(whole) // 3, len(whole) - 1):
+        log.write_bytes(whole[:size])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore" if size == 0 else "default", CheckpointWarning)
+            if size:
+                with pytest.warns(CheckpointWarning, match="chain-1.log: record"):
+                    found = sample_dram(small, checkpoint=folder, **SMALL)
+            else:
+                found = sample_dram(small, checkpoint=folder, **SMALL)
+        assert_identical(found, expected)
+        # It is mended: not a byte differs in what is stored of the draws.
+        assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
+
+
+def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
+    first = sample_dram(small, checkpoint=tmp_path, **SMALL)
+    monkeypatch.setattr(runs.ChainRun, "_advance", None)
+    assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
+
+
+@pytest.mark.parametrize("random_seed", [None, "generator"])
+def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed):
+    def seed():
+        return np.random.default_rng(5) if random_seed else None
+
+    blocks, advance = itertools.count(), runs.ChainRun._advance
+
+    def die(self):
+        if next(blocks) == 5:
+            raise MemoryError("no more")
+        advance(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs.ChainRun, "_advance", die)
+        with pytest.raises(MemoryError):
+            sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
+    first = runs.Checkpoint
+    assert first is not None
+    tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
+    again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
+    assert_identical(again, tree)
+    if random_seed:
+        assert_identical(sample_dram(small, random_seed=seed(), **SMALL), tree)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"draws": 701}, r"draws: the checkpoint has 700, asked for 701"),
+        ({"random_seed": 2}, r"random_seed: the checkpoint has \[1\], asked for \[2\]"),
+        ({"random_seed": None}, r"random_seed: the checkpoint has \[1\], asked for null"),
+        ({"stages": 2}, r"stages: "),
+        ({"initvals": {"phi": 0.1}}, r"initvals: "),
+        ({"proposal_cov": [[0.1]]}, r"proposal_cov: "),
+        ({"discard_tuned_samples": False}, r"discard_tuned_samples: "),
+        ({"model": state_space_model(psf.BootstrapPF(11))}, r"model: "),
+        ({"screen": psf.EKF()}, r"screen: "),
+    ],
+)
+def test_a_checkpoint_of_another_run(tmp_path, changes, message):
+    asked = {"model": state_space_model(psf.BootstrapPF(10)), **SMALL}
+    sample_dram(**asked, checkpoint=tmp_path)
+    with pytest.raises(DataMismatchError, match=message):
+        sample_dram(**asked | changes, checkpoint=tmp_path)
+
+
+def test_a_checkpoint_of_other_data(tmp_path):
+    with pm.Model() as model:
+        record = pm.Data("record", [1.0, 2.0])
+        pm.Normal("y", pm.Normal("mu"), 1.0, observed=record)
+    sample_dram(model, checkpoint=tmp_path)
+    pm.set_data({"record": [1.0, 2.5]}, model=model)
+    with pytest.raises(DataMismatchError, match=r"of another run: data: "):
+        sample_dram(model, checkpoint=tmp_path)
+
+
+def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
+    asked = SMALL | {"discard_tuned_samples": False, "checkpoint": tmp_path}
+    watch, looks = runs._watch, itertools.count()
+
+    def interrupted(chains, *others):
+        while min(run.done for run in chains) < 1:
+            time.sleep(0.001)
+        next(looks)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "_watch", interrupted)
+    part = sample_dram(small, **asked)
+    monkeypatch.setattr(runs, "_watch", watch)
+    assert_identical(
+        sample_dram(small, **asked), sample_dram(small, **asked | {"checkpoint": None})
+    )
+    assert next(looks) == 1
+    assert "warmup_posterior" in part.children
