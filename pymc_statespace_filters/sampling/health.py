@@ -17,6 +17,7 @@ from pymc_statespace_filters.sampling.chain import (
     STAGE,
     Draws,
 )
+
 # Share of evaluations after warm-up that may fail in silence: a chain that brushes the edge of the
 # region where its filter works is normal.
 TOLERATED_FAILURES = 0.05
@@ -37,8 +38,12 @@ TOLERATED_COLLAPSES = 0.5
 
 
 class Growth(NamedTuple):
-    """The variable whose proposals have grown most, and how many times wider than its prior's draws
-    they are.
+    """The variable whose proposals have grown most, in multiples of its prior's draws.
+
+    Attributes
+    ----------
+    name : str
+    factor : float
     """
 
     name: str
@@ -192,4 +197,5 @@ def closing_warning(record: Record, growth: Growth | None = None) -> SamplerWarn
 
 
 def warning(message: str) -> SamplerWarning:
+    """Make of a message what PyMC's logger takes."""
     return SamplerWarning(WarningType.BAD_ACCEPTANCE, message, "warn")

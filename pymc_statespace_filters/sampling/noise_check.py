@@ -1,4 +1,4 @@
-"""Before and after a run: is the estimated likelihood too noisy for its chains, or too exact?"""
+"""Whether an estimated likelihood is too noisy for its chains, asked before and after a run."""
 
 from collections.abc import Callable, Sequence
 

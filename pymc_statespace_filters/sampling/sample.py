@@ -169,7 +169,8 @@ def sample_dram(
         tree.attrs["log_likelihood_variance"] = spread.variance
         warnings += filter(None, [warning])
     if "posterior" in tree:
-        warnings += run_convergence_checks(tree, model)
+        with np.errstate(invalid="ignore", divide="ignore"):  # chains that stand still
+            warnings += run_convergence_checks(tree, model)
     log_warnings(warnings)
     return tree
 

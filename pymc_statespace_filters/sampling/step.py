@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from pymc.model import Model, modelcontext
-from pymc.step_methods.compound import BlockedStep, StepMethodState
 from pymc.stats.convergence import SamplerWarning
+from pymc.step_methods.compound import BlockedStep, StepMethodState
 from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable

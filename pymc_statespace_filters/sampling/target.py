@@ -52,8 +52,8 @@ class Target:
     Raises
     ------
     ModelError
-        If a variable is discrete, there are none, a noisy StateSpace depends on others than ``vars``, or
-        ``proposal_cov`` or the screen does not fit.
+        If a variable is discrete, there are none, a noisy StateSpace depends on others than
+        ``vars``, or ``proposal_cov`` or the screen does not fit.
     """
 
     def __init__(

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pymc as pm
@@ -65,8 +66,10 @@ def kill_after(kind, folder, iterations):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("kind", KINDS)
-def test_killed_and_resumed(kind, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "kind", [pytest.param("deterministic", marks=pytest.mark.slow), *list(KINDS)[1:]]
+)
+def test_killed_and_resumed(kind, tmp_path):
     """At the start, within warm-up and within the draws: nothing shows in the end."""
     for iterations in (0, 1800, 5500) if kind == "estimated" else (4000,):
         kill_after(kind, tmp_path / "run", iterations)
@@ -79,10 +82,6 @@ def test_killed_and_resumed(kind, tmp_path, monkeypatch):
 
 
 # The moments at which a process dies, without a process: quick enough for many of them.
-
-
-class Killed(BaseException):
-    """Nothing within the package catches it."""
 
 
 @pytest.fixture
@@ -106,13 +105,9 @@ def test_a_log_torn_anywhere(small, tmp_path, often):
     whole = log.read_bytes()
     for size in (0, 5, len(whole) // 3, len(whole) - 1):
         log.write_bytes(whole[:size])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore" if size == 0 else "default", CheckpointWarning)
-            if size:
-                with pytest.warns(CheckpointWarning, match="chain-1.log: record"):
-                    found = sample_dram(small, checkpoint=folder, **SMALL)
-            else:
-                found = sample_dram(small, checkpoint=folder, **SMALL)
+        lost = pytest.warns(CheckpointWarning, match="chain-1.log: record")
+        with lost if size else nullcontext():
+            found = sample_dram(small, checkpoint=folder, **SMALL)
         assert_identical(found, expected)
         # It is mended: not a byte differs in what is stored of the draws.
         assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
@@ -140,8 +135,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         patch.setattr(runs.ChainRun, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
-    first = runs.Checkpoint
-    assert first is not None
+    assert (tmp_path / "chain-0.log").stat().st_size > 10_000
     tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     assert_identical(again, tree)

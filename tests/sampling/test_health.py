@@ -1,0 +1,170 @@
+"""What chains say of their health, by ``sample_dram`` and by the step method."""
+
+import logging
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling import DRAM, chain, noise_check
+from pymc_statespace_filters.sampling.health import Growth, Record, closing_warning
+from pymc_statespace_filters.sampling.noise_check import start_warning
+from pymc_statespace_filters.sampling.seed_spread import spread_of
+from tests.sampling.test_dram import nan_beyond, sample, simple_model
+from tests.sampling.test_sample_dram import sample_dram, state_space_model
+
+LOGGER = "pymc.stats.convergence"
+
+
+def runaway():
+    with pm.Model() as model:
+        pm.Normal("y", shape=2)
+        pm.Flat("free")
+    return model
+
+
+def both_ways(model, caplog, **settings):
+    """Messages of chain 1 by ``sample_dram``, and of any chain by the step method."""
+    run = {name: settings.pop(name) for name in ("draws", "tune") if name in settings}
+    with caplog.at_level(logging.WARNING, logger=LOGGER):
+        sample_dram(model, **run, **settings)
+        whole = [m.removeprefix("Chain 1: ") for m in caplog.messages if m.startswith("Chain 1: ")]
+        caplog.clear()
+        with model:
+            sample(DRAM(**settings), **run)
+        stepwise = list(caplog.messages)
+    return whole, stepwise
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "found", "cure"),
+    [
+        (
+            simple_model(),
+            {"proposal_cov": 1e12 * np.eye(2), "draws": 100, "tune": 0},
+            "accepted 0 of 100 proposals",
+            "proposal_cov",
+        ),
+        (runaway(), {"draws": 500, "tune": 1000}, "proposals of free have become", "proper prior"),
+        (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "cut off"),
+    ],
+)
+def test_chains_name_themselves_and_the_cure(model, settings, found, cure, caplog):
+    for messages in both_ways(model, caplog, **settings):
+        assert messages
+        assert all(found in message and cure in message for message in messages)
+
+
+def test_healthy_chains_are_silent(caplog):
+    for model in (simple_model(), state_space_model(psf.EKF())):
+        assert both_ways(model, caplog, draws=1000, tune=1000) == ([], [])
+
+
+def draws_with(stages):
+    n = len(stages)
+    counts = np.zeros((n, chain.N_COUNTS), dtype=np.int64)
+    counts[:, chain.STAGE] = stages
+    counts[:, chain.N_EVALUATIONS] = 1
+    numbers = np.full((n, chain.N_NUMBERS), np.inf)
+    none = np.empty((n, 0))
+    return chain.Draws(none, numbers, counts, none.astype(np.int64), np.empty((0, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("stages", "longest"),
+    [
+        ([0, 0, 0], 3),
+        ([1, 1, 2], 1),
+        ([0, 0, 1, 0, 1], 2),
+        ([1, 0, 0, 0, 2, 0], 4),
+        ([2, 1, 0, 0, 0], 4),
+    ],
+)
+def test_stays_are_counted_at_once_and_one_by_one(stages, longest):
+    draws = draws_with(stages)
+    whole, record = Record.of(draws, 0, len(stages)), Record()
+    for row in range(len(stages)):
+        record = record.include(draws, row)
+    assert whole == record
+    assert whole.longest_stay == longest
+
+
+def test_a_stay_of_a_fifth_of_the_draws_is_said():
+    moving = np.tile([1, 0], 400)
+    stuck = np.concatenate([moving, [1], np.zeros(205, dtype=int), [1]])
+    assert closing_warning(Record.of(draws_with(moving), 0, 800)) is None
+    warning = closing_warning(Record.of(draws_with(stuck), 0, len(stuck)))
+    assert "stood at one point for 206 of 1007 draws" in warning.message
+    assert "more particles" in warning.message
+    # Of few draws a fifth is soon passed by chance.
+    few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])
+    assert closing_warning(Record.of(draws_with(few), 0, len(few))) is None
+
+
+def test_growth_below_the_limit_is_silent():
+    record = Record.of(draws_with(np.tile([1, 0], 400)), 0, 800)
+    assert closing_warning(record, Growth("x", 900.0)) is None
+    assert "proposals of x" in closing_warning(record, Growth("x", 1100.0)).message
+
+
+# The spread of the estimates over seeds.
+
+
+def test_the_spread_at_the_highest_draw(caplog):
+    """Variance of the estimates with 20 particles and with few: against many seeds at the mode."""
+    model = state_space_model(psf.BootstrapPF(20))
+    with caplog.at_level(logging.WARNING, logger=LOGGER):
+        tree = sample_dram(model, draws=700, chains=2)
+    assert "variance" not in caplog.text
+    found = tree.attrs["log_likelihood_variance"]
+    logp = model.compile_logp()
+    (seed,) = [v for v in logp.f.get_shared() if v.name == "d0_seed"]
+    best = tree["sample_stats"]["lp"].argmax(...)
+    at = {"phi": tree["posterior"]["phi"].isel(best).to_numpy()}
+    estimates = []
+    for i in range(400):
+        seed.set_value(np.array(7919 * i + 1))
+        estimates.append(float(logp(at)))
+    # Of 12 seeds; Gaussian errors leave these limits in 3 of 1000 runs.
+    assert 0.15 < found / np.var(estimates, ddof=1) < 3.0
+    again = sample_dram(model, draws=700, chains=2, cores=1)
+    assert again.attrs["log_likelihood_variance"] == found
+
+
+@pytest.mark.parametrize(
+    ("filter", "settings"),
+    [
+        (psf.EKF(), {"draws": 700}),
+        (psf.BootstrapPF(20), {"draws": 300}),
+        (psf.BootstrapPF(20), {"draws": 700, "refresh_noise": False}),
+    ],
+)
+def test_the_spread_is_measured_where_it_says_something(filter, settings):
+    tree = sample_dram(state_space_model(filter), **settings)
+    assert "log_likelihood_variance" not in tree.attrs
+
+
+def test_spreads_far_outside_are_said(caplog, monkeypatch):
+    model = state_space_model(psf.BootstrapPF(20))
+    quiet = sample_dram(model, draws=700)
+    monkeypatch.setattr(noise_check, "HOPELESS", 1e-3)
+    monkeypatch.setattr("pymc_statespace_filters.sampling.seed_spread.TOO_NOISY", 1e-3)
+    with caplog.at_level(logging.WARNING, logger=LOGGER):
+        tree = sample_dram(model, draws=700)
+    for chain_ in (0, 1):
+        assert f"Chain {chain_}, at the start: the estimated log-likelihood has" in caplog.text
+    assert "at its highest draw: the estimated log-likelihood has a variance of" in caplog.text
+    # Measuring takes no random number from the chains.
+    np.testing.assert_array_equal(tree["posterior"]["phi"], quiet["posterior"]["phi"])
+
+
+def test_a_noisy_start_may_be_left():
+    noisy = 6.0 * np.random.default_rng(1).normal(size=12)
+    assert 10.0 < spread_of(noisy).variance < noise_check.HOPELESS
+    assert start_warning(spread_of(noisy), 3) is None
+    message = start_warning(spread_of(3.0 * noisy), 3).message
+    assert message.startswith("Chain 3, at the start:")
+    assert "initvals" in message
+    assert "suggest_particles" in message
+    assert start_warning(spread_of(np.full(12, -np.inf)), 3) is None
