@@ -108,7 +108,7 @@ def suggest_particles(
 
     The cost is 1000 to 1300 evaluations for the pilot, with 200 to 1000 particles, twice that where
     its own noise turns out to be above 10, and 250 for each of at most seven numbers. Numbers above
-    64 times the model's own (and 6400) are not tried.
+    64 times the model's own, and above 16 000, are not tried.
 
     The number of particles changes the noise, and for EnKF and PFEnKF also the bias, which a small
     variance says nothing about.
