@@ -138,17 +138,37 @@ class RunningChain:
                 mine[...] = given
 
     def snapshot(self, begin: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Draws from an iteration on, and the state, as plain arrays for a checkpoint."""
+        """Draws from an iteration on, and the state, as plain arrays for a checkpoint.
+
+        What has not changed since the iteration before is left out: most proposals are rejected.
+        """
         rows = slice(begin, int(self.talk[chain.DONE]))
-        draws = {name: array[rows] for name, array in self.draws._asdict().items()}
+        counts, numbers = self.draws.counts[rows], self.draws.numbers[rows]
+        changed = counts[:, chain.STAGE] > 0
+        changed[1:] |= numbers[1:, chain.SCALING] != numbers[:-1, chain.SCALING]
+        changed[:1] = True
+        draws = {
+            "counts": counts.astype(np.int16),
+            "acceptance": numbers[:, chain.ACCEPTANCE],
+            "changed": changed,
+            "positions": self.draws.positions[rows][changed],
+            "numbers": numbers[changed],
+            "seeds": self.draws.seeds[rows][changed],
+            "covs": self.draws.covs[rows],
+        }
         return draws, self.state._asdict()
 
     def restore(self, draws: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> None:
         """Go on from all the snapshots of a checkpoint together."""
-        for name, array in self.draws._asdict().items():
-            array[: len(draws[name])] = draws[name]
+        done = len(draws["counts"])
+        last_change = np.cumsum(draws["changed"]) - 1
+        for name in ("positions", "numbers", "seeds"):
+            getattr(self.draws, name)[:done] = draws[name][last_change]
+        self.draws.counts[:done] = draws["counts"]
+        self.draws.numbers[:done, chain.ACCEPTANCE] = draws["acceptance"]
+        self.draws.covs[: len(draws["covs"])] = draws["covs"]
         self.adopt(State(**state))
-        self.talk[chain.DONE] = len(draws["positions"])
+        self.talk[chain.DONE] = done
         self._move_noise()
 
     def add_evaluations(self, codes: Sequence[int]) -> None:
