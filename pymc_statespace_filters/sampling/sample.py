@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -126,43 +126,57 @@ def sample_dram(
         np.random.SeedSequence(entropy).spawn(chains),
         is_worthwhile(target, tune + draws),
     )
-    asked = {
-        "draws": draws,
-        "tune": tune,
-        "chains": chains,
-        "random_seed": None if random_seed is None else entropy,
-        "initvals": _plain(initvals),
-        "discard_tuned_samples": bool(discard_tuned_samples),
-        "proposal_cov": _plain(proposal_cov),
-        **{name: repr(value) for name, value in asdict(settings).items()},
-    }
     opened: Any = nullcontext()
     if checkpoint is not None:
-        asked |= {"model": model_fingerprint(model), "data": data_fingerprint(model)}
-        asked["version"] = version("pymc-statespace-filters")
-        opened = open_checkpoint(checkpoint, asked)
+        asked = {
+            "random_seed": None if random_seed is None else entropy,
+            "initvals": _plain(initvals),
+            "proposal_cov": _plain(proposal_cov),
+        }
+        opened = open_checkpoint(checkpoint, asked | _all_that_matters(model, settings, plan))
     began = time.monotonic()
     with opened as store:
         runs = run_chains(target, plan, cores=cores, checkpoint=store, progressbar=progressbar)
-    seconds = time.monotonic() - began
     tree = to_datatree(
         model,
         target.held,
         [_chain_draws(target, run, tune) for run in runs],
         tune=tune,
         keep_warmup=not discard_tuned_samples,
-        sampling_time=seconds,
+        sampling_time=time.monotonic() - began,
     )
     tree.attrs |= {
         "exact": int(target.exact),
         "refresh_noise": int(settings.refresh_noise),
         "correlation": settings.correlation or 0.0,
     }
-    warnings = _chain_warnings(target, runs, tune)
+    _check(tree, model, target, plan, runs)
+    return tree
+
+
+def _all_that_matters(model: Model, settings: DRAMSettings, plan: Plan) -> dict[str, Any]:
+    """What draws depend on, besides what the user gave as numbers of his own."""
+    return {
+        "draws": plan.draws,
+        "tune": plan.tune,
+        "chains": len(plan.seeds),
+        "discard_tuned_samples": not plan.keeps_warmup,
+        **{field.name: repr(getattr(settings, field.name)) for field in fields(settings)},
+        "model": model_fingerprint(model),
+        "data": data_fingerprint(model),
+        "version": version("pymc-statespace-filters"),
+    }
+
+
+def _check(
+    tree: DataTree, model: Model, target: Target, plan: Plan, runs: Sequence[ChainRun]
+) -> None:
+    """Say what is wrong with the chains, and note how noisy their likelihood is."""
+    warnings = _chain_warnings(target, runs, plan.tune)
     if plan.measures_noise and all(run.done == plan.n_iterations for run in runs):
         spread, warning = at_the_highest_draw(
             [run.running.draws for run in runs],
-            tune if draws else 0,
+            plan.tune if plan.draws else 0,
             [run.seed_spread for run in runs],
             [run.key for run in runs],
         )
@@ -172,7 +186,6 @@ def sample_dram(
         with np.errstate(invalid="ignore", divide="ignore"):  # chains that stand still
             warnings += run_convergence_checks(tree, model)
     log_warnings(warnings)
-    return tree
 
 
 def _chain_draws(target: Target, run: ChainRun, tune: int) -> ChainDraws:
