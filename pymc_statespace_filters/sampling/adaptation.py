@@ -11,8 +11,7 @@ Two schemes:
     moves.
 
 The state is a few small arrays, views of one vector. Machine code changes them in place with
-`learn`; `adapt_by_blocks` and `adapt_continuously` are its pure forms. Adaptation must stop before
-draws are kept: whoever drives it simply stops calling.
+`learn`. Adaptation must stop before draws are kept: whoever drives it simply stops calling.
 
 Differences from the sources
     * "What came before" is the last block for the first two blocks and from then on the latest half
@@ -62,7 +61,6 @@ JITTER = 1e-8
 SCALE, N_BLOCKS, N_STALLS = range(3)
 N, MOVED, FIRST = range(3)
 
-_compiled = njit(cache=True, error_model="numpy")
 # For functions that compiled functions alone call: what Python needs takes as long to compile.
 _internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -236,40 +234,6 @@ def learn(
         _learn_covariance(state)
     elif continuous and state.numbers[N_BLOCKS] > 0.0:
         _learn_covariance(state)
-
-
-@_compiled
-def adapt_by_blocks(
-    settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int
-) -> AdaptationState:
-    """Give what `learn` makes of a state under ``"chain"``, and leave the state alone."""
-    state = _copy_of(state)
-    learn(settings, False, state, position, stage)
-    return state
-
-
-@_compiled
-def adapt_continuously(
-    settings: AdaptationSettings, state: AdaptationState, position: np.ndarray, stage: int
-) -> AdaptationState:
-    """Give what `learn` makes of a state under ``"continuous"``, and leave the state alone."""
-    state = _copy_of(state)
-    learn(settings, True, state, position, stage)
-    return state
-
-
-@_compiled
-def _copy_of(state: AdaptationState) -> AdaptationState:
-    return AdaptationState(
-        state.numbers.copy(),
-        state.cov.copy(),
-        state.chol.copy(),
-        state.base.copy(),
-        state.first_cov.copy(),
-        _copy_of_moments(state.block),
-        _copy_of_moments(state.recent),
-        _copy_of_moments(state.older),
-    )
 
 
 # The helpers below are written as loops, which compile several times faster than array expressions.

@@ -118,12 +118,13 @@ def sample_dram(
     entropy = _entropy(random_seed)
     target = Target(model, None, settings, proposal_cov)
     target.prepare()
+    seeds = np.random.SeedSequence(entropy).spawn(chains)
     plan = Plan(
         tune,
         draws,
         not discard_tuned_samples,
-        _starts(target, model, initvals, chains, disperse=tune > 0),
-        np.random.SeedSequence(entropy).spawn(chains),
+        _starts(target, model, initvals, seeds, disperse=tune > 0),
+        seeds,
         is_worthwhile(target, tune + draws),
     )
     opened: Any = nullcontext()
@@ -218,22 +219,29 @@ def _chain_warnings(target: Target, runs: Sequence[ChainRun], tune: int) -> list
 
 
 def _starts(
-    target: Target, model: Model, initvals: Any, chains: int, *, disperse: bool
+    target: Target,
+    model: Model,
+    initvals: Any,
+    seeds: Sequence[np.random.SeedSequence],
+    *,
+    disperse: bool,
 ) -> list[Callable[[np.random.Generator], Sequence[np.ndarray]]]:
     """For each chain, a function from its generator to the candidates for its start."""
-    _check_initvals(model, initvals, chains)
+    _check_initvals(model, initvals, len(seeds))
     points = make_initial_point_fns_per_chain(
-        model=model, overrides=initvals, jitter_rvs=set(), chains=chains
+        model=model, overrides=initvals, jitter_rvs=set(), chains=len(seeds)
     )
     disperse = disperse and initvals is None
 
-    def candidates_of(
-        point: Callable[[int], Mapping[str, np.ndarray]], rng: np.random.Generator
-    ) -> Sequence[np.ndarray]:
-        start = target.held.join(point(int(rng.integers(2**31))))
+    def candidates(start: np.ndarray, rng: np.random.Generator) -> Sequence[np.ndarray]:
         return target.starts.candidates(start, rng) if disperse else [start]
 
-    return [partial(candidates_of, point) for point in points]
+    # Here and now: chains would call PyMC's functions from several threads at once.
+    starts = [
+        target.held.join(point(int(seed.generate_state(1)[0])))
+        for point, seed in zip(points, seeds, strict=True)
+    ]
+    return [partial(candidates, start) for start in starts]
 
 
 def _check_initvals(model: Model, initvals: Any, chains: int) -> None:

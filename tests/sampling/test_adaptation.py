@@ -1,16 +1,17 @@
 """Adaptation: what a covariance learns from a chain, on exact Gaussian targets."""
 
+from functools import partial
 from threading import Event
 
 import numpy as np
 import pymc as pm
 import pytest
+from numba import njit
 
 from pymc_statespace_filters.sampling.adaptation import (
     STALLED,
     AdaptationSettings,
-    adapt_by_blocks,
-    adapt_continuously,
+    learn,
     pack,
     packed_size,
     start_adaptation,
@@ -20,7 +21,26 @@ from pymc_statespace_filters.sampling.runs import ChainRun, Plan
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
 
-BOTH = pytest.mark.parametrize("adapt", [adapt_by_blocks, adapt_continuously])
+
+@njit
+def learn_from(settings, continuous, state, position, stage):
+    learn(settings, continuous, state, position, stage)
+
+
+def adapted(continuous, settings, state, position, stage):
+    """What is learnt from an iteration, by a state of its own."""
+    dim = len(state.cov)
+    packed = np.empty(packed_size(dim))
+    pack(state, packed)
+    learn_from(settings, continuous, unpack(packed, dim), np.asarray(position), stage)
+    return unpack(packed, dim)
+
+
+adapt_by_blocks = partial(adapted, False)
+adapt_continuously = partial(adapted, True)
+BOTH = pytest.mark.parametrize(
+    "adapt", [adapt_by_blocks, adapt_continuously], ids=["chain", "continuous"]
+)
 SETTINGS = AdaptationSettings(adapt_every=100)
 
 
