@@ -85,6 +85,8 @@ class DRAMSettings:
         power = self.screen_power
         if not _is_real(power) or not 0.0 < power <= 1.0:
             raise ModelError(f"screen_power={power!r}: expected a number above 0, at most 1")
+        if _is_real(self.correlation) and self.correlation == 0.0:  # noise drawn anew
+            object.__setattr__(self, "correlation", None)
         if self.correlation is not None:
             self._check_correlation(self.correlation)
 

@@ -9,6 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.settings import DRAMSettings
 from tests.sampling.test_state_space import DATA as RECORD
 from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
 
@@ -82,6 +83,7 @@ class TestRefusals:
                 {"correlation": 0.9, "stages": 1, "refresh_noise": False},
                 r"correlation=0\.9 moves the noise, which refresh_noise=False holds",
             ),
+            ({"correlation": False}, r"correlation=False: expected"),
             ({"correlation": 1.0, "stages": 1}, r"correlation=1\.0: expected a number between"),
             ({"correlation": -0.1, "stages": 1}, r"correlation=-0\.1: expected"),
             ({"correlation": np.nan, "stages": 1}, r"correlation=nan: expected"),
@@ -188,3 +190,7 @@ def test_screen_and_target_of_the_same_system():
         psf.StateSpace("d", LINEAR, psf.EKF(), steps=STEPS, observed=RECORD)
     stats = chains(300, 300, model, screen=psf.EKF(), screen_power=1.0)["sample_stats"]
     np.testing.assert_array_equal(stats["n_evaluations"], stats["accepted"])
+
+
+def test_no_correlation_is_fresh_noise():
+    assert DRAMSettings(correlation=0.0) == DRAMSettings()
