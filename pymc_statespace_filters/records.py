@@ -177,7 +177,8 @@ def _floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -
     if bad.any():
         at = tuple(int(i) for i in np.argwhere(bad)[0])
         allowed = "numbers, or NaN where missing" if missing else "finite numbers"
-        raise ModelError(f"{name} must hold {allowed}, but {name}[{at}] is {array[at]}")
+        place = f"{name}[{', '.join(map(str, at))}]" if at else name
+        raise ModelError(f"{name} must hold {allowed}, but {place} is {array[at]}")
     return array
 
 

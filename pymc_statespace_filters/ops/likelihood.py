@@ -48,7 +48,8 @@ class LogLikelihood(RecordOp):
             raise GradientUnavailableError(
                 f"The likelihood by {self.filter} {what} gradient, so "
                 f"NUTS, HMC, nutpie and find_MAP cannot use it. Sample with "
-                f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
+                f"psf.sample_dram() or pm.sample(step=psf.DRAM()), or take psf.EKF() for a "
+                f"likelihood with a gradient."
             )
         terms_bar = cotangents[0]
         if isinstance(terms_bar.type, DisconnectedType):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from pymc.progress_bar import MCMCProgressBarManager
+from pymc.progress_bar.rich_progress import RichProgressBackend
 from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
 from rich.theme import Theme
@@ -96,6 +97,7 @@ class watch(MCMCProgressBarManager):
             progressbar_theme=theme,
         )
         self._done = [0] * n_chains
+        self._seconds = [0.0] * n_chains
 
     def begin(self, chain: int) -> None:
         """Start a chain's clock, by which its speed is measured, when the chain starts.
@@ -104,7 +106,7 @@ class watch(MCMCProgressBarManager):
         """
         self._advance(chain, 0, failing=False, stats={})
 
-    def update(self, chain: int, done: int, stats: Mapping[str, Any]) -> None:
+    def update(self, chain: int, done: int, stats: Mapping[str, Any], seconds: float = 0.0) -> None:
         """Show how far a chain has come.
 
         Parameters
@@ -115,17 +117,28 @@ class watch(MCMCProgressBarManager):
             nothing is drawn: so a chain that waits for its turn may be updated like the others.
         stats : mapping of str to number
             What a draw has in ``sample_stats``: "accept_rate", "stage", "scaling", "n_failed".
+        seconds : float, optional
+            How long the chain has run, once it has ended: PyMC's bar has no speed for what took
+            less than a quarter of a second.
         """
         advance = done - self._done[chain]
         if not self._show_progress or advance <= 0:
             return
-        self._done[chain] = done
+        self._done[chain], self._seconds[chain] = done, seconds
         failing, shown = self._extract_stats([stats])
         count = sum(self._done) if self.combined_progress else done
         shown["draw"] = count if count <= self._tune_total else count - self._tune_total
         self._advance(chain, advance, failing, shown)
         if count == self.total_draws:
-            self._advance(chain, 0, failing, shown, is_last=True)
+            self._advance(chain, 0, failing, shown | self._speed(chain), is_last=True)
+
+    def _speed(self, chain: int) -> dict[str, Any]:
+        """What a terminal shows as the speed of a chain that has ended."""
+        seconds = self._seconds[chain]
+        in_terminal = isinstance(self._backend, RichProgressBackend)
+        if self.combined_progress or not in_terminal or seconds <= 0.0:
+            return {}
+        return {"sampling_speed": self._done[chain] / seconds, "speed_unit": "draws/s"}
 
     def _advance(
         self,

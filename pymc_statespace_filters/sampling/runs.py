@@ -73,6 +73,8 @@ class ChainRun:
     running : RunningChain
     key : ndarray of uint64, shape (2,)
         Of its random numbers.
+    seconds : float
+        How long it took from start to end; 0 if a checkpoint had begun it.
     """
 
     def __init__(self, target: Target, plan: Plan, index: int, checkpoint: Checkpoint | None):
@@ -89,6 +91,7 @@ class ChainRun:
             self.running.restore(draws, state)
         self._n_saved = self.done
         self._saved_at = time.monotonic()
+        self.seconds = 0.0
 
     @property
     def done(self) -> int:
@@ -102,6 +105,7 @@ class ChainRun:
 
     def run(self, stop: Event) -> None:
         """Go on to the end, or until told to stop."""
+        began, resumed = time.monotonic(), self.done > 0
         try:
             codes = self._start() if self.done == 0 else ()
             while self.done < self._plan.n_iterations and not stop.is_set():
@@ -113,6 +117,7 @@ class ChainRun:
                 if self._must_save():
                     self._save()
             self._save()
+            self.seconds = 0.0 if resumed else time.monotonic() - began
         except Halted:
             return
         except Exception as error:
@@ -231,7 +236,7 @@ def _watch(runs: Sequence[ChainRun], futures: Sequence[Future], bars: watch, sto
                 waiting.remove(i)
                 bars.begin(i)
             if run.done > 0:
-                bars.update(i, run.done, run.progress())
+                bars.update(i, run.done, run.progress(), run.seconds)
 
 
 def _halt(runs: Sequence[ChainRun], futures: Sequence[Future], stop: Event) -> None:

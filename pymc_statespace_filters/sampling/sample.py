@@ -29,6 +29,7 @@ from pymc_statespace_filters.sampling.settings import DRAMSettings, is_count
 from pymc_statespace_filters.sampling.target import Target
 
 _HAS_AFFINITY = hasattr(os, "sched_getaffinity")  # not on macOS
+_SHOWN_DIGITS = 16  # of a fingerprint: 64 bits, in a file and in messages
 
 
 def sample_dram(
@@ -163,8 +164,8 @@ def _all_that_matters(model: Model, settings: DRAMSettings, plan: Plan) -> dict[
         "chains": len(plan.seeds),
         "discard_tuned_samples": not plan.keeps_warmup,
         **{field.name: repr(getattr(settings, field.name)) for field in fields(settings)},
-        "model": model_fingerprint(model),
-        "data": data_fingerprint(model),
+        "model": model_fingerprint(model)[:_SHOWN_DIGITS],
+        "data": data_fingerprint(model)[:_SHOWN_DIGITS],
         "version": version("pymc-statespace-filters"),
     }
 

@@ -118,11 +118,15 @@ class DRAM(BlockedStep):
     ``proposal_cov``, ``scaling``
         covariance of the first stage's proposals, shape (d, d); and the geometric mean of its
         standard deviations
-    ``n_screened``, ``n_screen_failed``
-        with a screen: its evaluations, and how many failed
     ``n_evaluations``, ``n_failed``, ``failure``
         evaluations of the model; how many failed, so that the point counts as impossible; and the
         last one's reason, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity
+    ``n_effective``
+        with a noisy likelihood: the smallest effective number of particles behind ``lp``
+    ``n_screened``, ``n_screen_failed``
+        with a screen: its evaluations, and how many failed
+    ``exact``
+        whether the chain targets the posterior itself, without the bias of a filter
 
     A chain that stood still after warm-up, or whose evaluations often failed, says so when it ends,
     through PyMC's logger.

@@ -83,6 +83,14 @@ def test_what_is_drawn(capsys, monkeypatch):
     assert drawn.count("900") == 2
 
 
+def test_the_speed_of_what_took_no_time():
+    """PyMC's bar says 0 draws a second of a chain that ended within a quarter of a second."""
+    with watch(2, DRAWS, TUNE, "split") as bars:
+        bars.update(0, 1000, STATS, seconds=0.05)
+        bars.update(1, 1000, STATS)
+        assert [task.fields["sampling_speed"] for task in tasks(bars)] == [20_000, 0]
+
+
 @pytest.mark.parametrize("progressbar", FORMS)
 def test_an_interrupt_leaves_the_terminal_clean(progressbar):
     bars = watch(2, DRAWS, TUNE, progressbar)
