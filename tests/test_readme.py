@@ -9,10 +9,12 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-def run_code_of(page: str) -> dict:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+def run_code_of(*pages: str) -> dict:
+    """Run the code of pages in their order, a later one with the names of those before."""
     names: dict = {}
-    exec(compile("\n".join(blocks), page, "exec"), names)
+    for page in pages:
+        blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+        exec(compile("\n".join(blocks), page, "exec"), names)
     return names
 
 

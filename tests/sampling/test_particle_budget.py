@@ -178,7 +178,9 @@ def test_ensemble_filters_are_tuned_too():
             assert np.isfinite(table["variance_centre"]).all()
 
 
-def test_the_page_on_sampling_runs():
-    names = run_code_of("docs/sampling.md")
+def test_the_pages_on_sampling_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # one writes a checkpoint
+    names = run_code_of("docs/sampling.md", "docs/noisy-likelihoods.md")
     table = names["table"]
     assert 1.0 < table.loc[table.attrs["n_particles"], "variance_centre"] < 3.3
+    assert (tmp_path / "first-run").is_dir()
