@@ -1,6 +1,9 @@
 """Sphinx settings."""
 
 from importlib.metadata import version as installed_version
+from inspect import signature
+
+from pymc_statespace_filters import DRAM
 
 project = "pymc-statespace-filters"
 author = "The pymc-statespace-filters developers"
@@ -14,6 +17,8 @@ exclude_patterns = ["_build"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # shapes and types are told in the docstrings
 numpydoc_show_class_members = False
+# Sphinx would show that of __new__, by which PyMC makes every step method: (*args, **kwargs).
+DRAM.__signature__ = signature(DRAM)
 
 html_theme = "pydata_sphinx_theme"
 html_title = "pymc-statespace-filters"

@@ -165,7 +165,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--csv", type=Path, help="a record of your own: columns time, value")
     parser.add_argument("--filter", choices=list(filters(2)), default="bootstrap")
-    parser.add_argument("--particles", type=int, default=128)
+    parser.add_argument("--particles", type=int, default=256)
     parser.add_argument("--draws", type=int, default=8000)
     parser.add_argument("--tune", type=int, default=2000)
     parser.add_argument("--chains", type=int, default=4)
