@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from pymc.model import Model
 from pymc.util import get_value_vars_from_user_vars
-from pytensor.graph.traversal import ancestors
+from pytensor.graph.traversal import ancestors, graph_inputs
+from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
@@ -78,6 +79,24 @@ def continuous_value_vars(
             "for the rest"
         )
     return held
+
+
+def check_no_generators(model: Model) -> None:
+    """Check that the log-density draws no random numbers of its own.
+
+    Raises
+    ------
+    ModelError
+        If a term of it does, as `pymc.Minibatch` and `pymc.Simulator` do.
+    """
+    variables = [*model.basic_RVs, *model.potentials]
+    for variable, term in zip(variables, model.logp(sum=False), strict=True):
+        if any(isinstance(v.type, RandomType) for v in graph_inputs([term])):
+            raise ModelError(
+                f"the log-density of {variable.name!r} draws random numbers of its own, from a "
+                "generator that all chains would share: the draws would be no function of "
+                "random_seed. pm.sample(step=psf.DRAM()) takes such a model"
+            )
 
 
 def check_noise_is_held(

@@ -99,13 +99,16 @@ class RunningChain:
 
         def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
             self._heed_pause()
-            return self._evaluate(
-                candidate, others, self.noise(draw_seeds(rng, self.state.seeds.shape))
-            )
+            seeds = self.noise(draw_seeds(rng, self.state.seeds.shape))
+            log_screen, failure = self._evaluate_screen(candidate, others, seeds)
+            if log_screen == -np.inf:  # no move would ever leave
+                return EvaluatedPoint(candidate, seeds, -np.inf, failure)
+            value = self._density(candidate, others, seeds)
+            return EvaluatedPoint(candidate, seeds, *value, log_screen)
 
         start, codes = best_start(candidates, evaluate_afresh)
         if self.state.carried.size:  # the noise of the start, which others have overwritten
-            self._evaluate(start.position, others, start.seeds)
+            self._density(start.position, others, start.seeds)
         self._stand(start)
         return codes
 
@@ -125,11 +128,16 @@ class RunningChain:
         return spread
 
     def evaluate_again(self, others: Sequence[np.ndarray]) -> int:
-        """Evaluate the current point with its noise where only others moved; its failure's code."""
+        """Evaluate the current point with its noise where only others moved; its failure's code.
+
+        Where the screen is impossible now, no move of it is accepted until others move again.
+        """
         self._density.correlation[...] = 1.0
-        again = self._evaluate(self.state.position.copy(), others, self.state.seeds.copy())
-        self._stand(again)
-        return again.failure
+        position, seeds = self.state.position.copy(), self.state.seeds.copy()
+        log_screen, _ = self._evaluate_screen(position, others, seeds)
+        value = self._density(position, others, seeds)
+        self._stand(EvaluatedPoint(position, seeds, *value, log_screen))
+        return value.failure
 
     def adopt(self, state: State) -> None:
         """Go on from a state: a copy of it, as the machine code reads arrays of its own."""
@@ -232,15 +240,14 @@ class RunningChain:
         if self.talk[chain.PAUSE]:
             raise Halted
 
-    def _evaluate(
+    def _evaluate_screen(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: np.ndarray
-    ) -> EvaluatedPoint:
-        log_screen = 0.0
-        if self._screen is not None:
-            log_screen, failure, _ = self._screen(position, others, seeds)
-            if log_screen == -np.inf:
-                return EvaluatedPoint(position, seeds, -np.inf, failure)
-        return EvaluatedPoint(position, seeds, *self._density(position, others, seeds), log_screen)
+    ) -> tuple[float, int]:
+        """Log-density of the screen, 0 without one; and the code of its failure."""
+        if self._screen is None:
+            return 0.0, 0
+        value = self._screen(position, others, seeds)
+        return value.log_density, value.failure
 
     def _stand(self, point: EvaluatedPoint) -> None:
         """Take a point just evaluated as the current one, and its noise."""

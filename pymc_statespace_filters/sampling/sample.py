@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
@@ -22,6 +22,7 @@ from pymc_statespace_filters.sampling.chain import STAGE
 from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.fingerprint import data_fingerprint, model_fingerprint
 from pymc_statespace_filters.sampling.health import Record, closing_warning
+from pymc_statespace_filters.sampling.held_variables import check_no_generators
 from pymc_statespace_filters.sampling.noise_check import at_the_highest_draw, is_worthwhile
 from pymc_statespace_filters.sampling.results import ChainDraws, to_datatree
 from pymc_statespace_filters.sampling.runs import ChainRun, Plan, run_chains
@@ -90,8 +91,8 @@ def sample_dram(
     Raises
     ------
     ModelError
-        If an argument is not as described, a free variable is discrete, or no starting point with
-        finite log-density is found.
+        If an argument is not as described, a free variable is discrete, the log-density draws
+        random numbers of its own, or no starting point with finite log-density is found.
     DataMismatchError
         If the checkpoint is of a run with other arguments, another model or other data.
 
@@ -117,6 +118,7 @@ def sample_dram(
     proposal_cov = dram_settings.pop("proposal_cov", None)
     settings = DRAMSettings.of(dram_settings)
     entropy = _entropy(random_seed)
+    check_no_generators(model)
     target = Target(model, None, settings, proposal_cov)
     target.prepare()
     seeds = np.random.SeedSequence(entropy).spawn(chains)
@@ -159,8 +161,8 @@ def sample_dram(
 def _all_that_matters(model: Model, settings: DRAMSettings, plan: Plan) -> dict[str, Any]:
     """What draws depend on, besides what the user gave as numbers of his own."""
     return {
-        "draws": plan.draws,
-        "tune": plan.tune,
+        "draws": int(plan.draws),
+        "tune": int(plan.tune),
         "chains": len(plan.seeds),
         "discard_tuned_samples": not plan.keeps_warmup,
         **{field.name: repr(getattr(settings, field.name)) for field in fields(settings)},
@@ -175,18 +177,19 @@ def _check(
 ) -> None:
     """Say what is wrong with the chains, and note how noisy their likelihood is."""
     warnings = _chain_warnings(target, runs, plan.tune)
-    if plan.measures_noise and all(run.done == plan.n_iterations for run in runs):
-        spread, warning = at_the_highest_draw(
-            [run.running.draws for run in runs],
-            plan.tune if plan.draws else 0,
-            [run.seed_spread for run in runs],
-            [run.key for run in runs],
-        )
-        tree.attrs["log_likelihood_variance"] = spread.variance
-        warnings += filter(None, [warning])
-    if "posterior" in tree:
-        with np.errstate(invalid="ignore", divide="ignore"):  # chains that stand still
-            warnings += run_convergence_checks(tree, model)
+    with suppress(KeyboardInterrupt):  # the draws are there, whoever does not want to wait
+        if plan.measures_noise and all(run.done == plan.n_iterations for run in runs):
+            spread, warning = at_the_highest_draw(
+                [run.running.draws for run in runs],
+                plan.tune if plan.draws else 0,
+                [run.seed_spread for run in runs],
+                [run.key for run in runs],
+            )
+            tree.attrs["log_likelihood_variance"] = spread.variance
+            warnings += filter(None, [warning])
+        if "posterior" in tree:
+            with np.errstate(invalid="ignore", divide="ignore"):  # chains that stand still
+                warnings += run_convergence_checks(tree, model)
     log_warnings(warnings)
 
 

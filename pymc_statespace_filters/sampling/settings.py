@@ -65,6 +65,9 @@ class DRAMSettings:
         return cls(**arguments)
 
     def __post_init__(self) -> None:
+        for field in fields(self):  # settings that are equal shall look equal
+            if isinstance(value := getattr(self, field.name), np.generic):
+                object.__setattr__(self, field.name, value.item())
         object.__setattr__(self, "stages", stage_pair(self.stages))
         scale = self.stage_scale
         if not _is_real(scale) or not 0.0 < scale < math.inf:

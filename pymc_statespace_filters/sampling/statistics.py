@@ -42,11 +42,12 @@ def dtypes(target: Target) -> dict[str, Any]:
         "accept_rate": np.float64,
         # A number, as Metropolis has it: PyMC wants one type for a name in all steps of a model.
         "accepted": np.float64,
-        # A subarray type: the only way to have a matrix per draw stored as numbers.
-        "proposal_cov": np.dtype((np.float64, (dim, dim))),
         "exact": np.bool_,
         WARNING: SamplerWarning,
     }
+    if target.holds_all:  # else another DRAM may have one of another shape, which PyMC refuses
+        # A subarray type: the only way to have a matrix per draw stored as numbers.
+        types["proposal_cov"] = np.dtype((np.float64, (dim, dim)))
     if target.seed_names:
         types["n_effective"] = np.float64
     if target.moves_noise:  # no seed alone gives the estimate again
@@ -83,7 +84,7 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     stats |= {name: draws.counts[rows, column] for name, column in _COUNTS.items()}
     stats["accepted"] = (stats["stage"] > 0) * 1.0
     stats["exact"] = np.full(stats["stage"].shape, target.exact)
-    if draws.covs.size:
+    if draws.covs.size and target.holds_all:
         stats["proposal_cov"] = draws.covs[rows].copy()
     if target.seed_names:
         stats["n_effective"] = draws.numbers[rows, N_EFFECTIVE]

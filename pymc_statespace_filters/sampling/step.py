@@ -116,8 +116,8 @@ class DRAM(BlockedStep):
         for each noisy variable "d", the noise seed behind that estimate; if the noise is moved
         there is none, and ``correlation`` says by how much
     ``proposal_cov``, ``scaling``
-        covariance of the first stage's proposals, shape (d, d); and the geometric mean of its
-        standard deviations
+        covariance of the first stage's proposals, shape (d, d), unless other step methods move
+        continuous variables; and the geometric mean of its standard deviations
     ``n_evaluations``, ``n_failed``, ``failure``
         evaluations of the model; how many failed, so that the point counts as impossible; and the
         last one's reason, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity

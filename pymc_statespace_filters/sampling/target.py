@@ -48,6 +48,8 @@ class Target:
         Whether the chains target the posterior itself, without the bias of a filter's noise.
     seed_names : tuple of str
         Of the noise seeds that are noted down.
+    holds_all : bool
+        Whether no other step method moves continuous variables.
 
     Raises
     ------
@@ -73,6 +75,7 @@ class Target:
         self.exact = exactness(model) and (settings.refresh_noise or not seeds)
         self.seed_names = tuple(f"{name}_seed" for name in seeds)
         self._seed_variables = tuple(seeds.values())
+        self.holds_all = set(variables) >= set(model.continuous_value_vars)
         default = model.initial_point(random_seed=0)
         self.held = HeldVariables(variables, default)
         if not self.held.dim:

@@ -164,6 +164,13 @@ def test_a_checkpoint_of_another_run(tmp_path, changes, message):
         sample_dram(**asked | changes, checkpoint=tmp_path)
 
 
+def test_numbers_of_numpy_are_numbers(small, tmp_path):
+    plain = SMALL | {"adapt_every": 50, "stage_scale": 0.5}
+    first = sample_dram(small, checkpoint=tmp_path, **plain)
+    of_numpy = {name: np.array(value)[()] for name, value in plain.items()}
+    assert_identical(sample_dram(small, checkpoint=tmp_path, **of_numpy), first)
+
+
 def test_a_checkpoint_of_other_data(tmp_path):
     with pm.Model() as model:
         record = pm.Data("record", [1.0, 2.0])

@@ -89,6 +89,18 @@ def test_beside_other_step_methods():
     assert model.free_RVs[2].name == "n"
 
 
+def test_two_of_different_sizes():
+    """PyMC wants one type for a statistic in all steps, so that there is no matrix here."""
+    with pm.Model():
+        a = pm.Normal("a", 0, 1)
+        b = pm.Normal("b", a, 0.5, shape=2)
+        idata = sample([DRAM([a]), DRAM([b])], draws=8000)
+    assert_moments(idata["posterior"]["a"].to_numpy(), 0.0, 1.0)
+    assert_moments(idata["posterior"]["b"].to_numpy()[..., 1], 0.0, np.sqrt(1.25))
+    assert idata["sample_stats"]["scaling"].shape == (2, 8000, 2)
+    assert "proposal_cov" not in idata["sample_stats"]
+
+
 def test_lp_is_the_model_log_density():
     with simple_model() as model:
         idata = sample(DRAM(), draws=50)

@@ -194,3 +194,46 @@ def test_screen_and_target_of_the_same_system():
 
 def test_no_correlation_is_fresh_noise():
     assert DRAMSettings(correlation=0.0) == DRAMSettings()
+
+
+def brittle(x, q, phi, narrow):
+    """No number for a member of the screen's ensemble, one for the mean at which the EKF looks."""
+    gone = pt.switch((narrow > 0.5) & pt.neq(x[0], 0.0), np.nan, 0.0)
+    return [phi * x[0] + gone + q[0]]
+
+
+def test_a_screen_that_fails_where_another_step_moved():
+    """DRAM waits there; what it notes down is the density of the target."""
+    system = psf.StateSpaceModel(
+        transition=brittle,
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.4]],
+        process_noise=[[0.5]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    with pm.Model() as model:
+        phi, narrow = pm.Normal("phi", 0.5, 0.5), pm.Normal("narrow", 0.5, 0.3)
+        psf.StateSpace("d", system, psf.EKF(), steps=[1], observed=[[0.4]])
+        idata = pm.sample(
+            400,
+            tune=200,
+            chains=1,
+            cores=1,
+            step=[pm.Metropolis([narrow]), psf.DRAM([phi], screen=psf.EnKF(50))],
+            initvals={"narrow": 0.2},
+            random_seed=1,
+            progressbar=False,
+            compute_convergence_checks=False,
+        )
+    draws, stats = idata["posterior"], idata["sample_stats"]
+    phi, narrow = draws["phi"][0].to_numpy(), draws["narrow"][0].to_numpy()
+    waits = (narrow > 0.5)[1:]
+    assert 0.2 < waits.mean() < 0.8
+    moved = phi[1:] != phi[:-1]
+    assert not moved[waits].any()
+    assert moved[~waits].mean() > 0.1
+    log_density = model.compile_logp()
+    expected = [log_density({"phi": p, "narrow": n}) for p, n in zip(phi, narrow, strict=True)]
+    np.testing.assert_allclose(stats["lp"][0], expected, rtol=1e-9)
+    assert stats["n_failed"].sum() == 0

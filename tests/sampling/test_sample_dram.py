@@ -243,6 +243,11 @@ def test_models_that_cannot_be_sampled():
         pm.Normal("y", 0, 1, shape=0)
     with pytest.raises(ModelError, match="no free variable"):
         sample_dram(empty)
+    with pm.Model() as drawing:
+        mu = pm.Normal("mu")
+        pm.Normal("y", mu, 1, observed=pm.Minibatch(np.arange(9.0), batch_size=3), total_size=9)
+    with pytest.raises(ModelError, match=r"'y' draws random numbers of its own"):
+        sample_dram(drawing)
     with pytest.raises(TypeError, match="context stack"):
         psf.sample_dram()
 
@@ -383,3 +388,14 @@ def test_an_interrupt_returns_what_is_there(seconds, tune, presses):
     assert sizes["posterior"]["draw"] >= 1
     assert sizes["posterior"]["chain"] == 2
     assert sizes.get("warmup_posterior", {"draw": 0})["draw"] == tune
+
+
+@pytest.mark.parametrize("last", ["at_the_highest_draw", "run_convergence_checks"])
+def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    expected = sample_dram(noisy, draws=300, tune=300)
+    monkeypatch.setattr(f"pymc_statespace_filters.sampling.sample.{last}", interrupted)
+    found = sample_dram(noisy, draws=300, tune=300)
+    assert found["posterior"].equals(expected["posterior"])
