@@ -105,8 +105,6 @@ def open_checkpoint(path: str | os.PathLike, asked: Mapping[str, Any]) -> Checkp
     (2, 2)
     >>> folder.cleanup()
     """
-    if not isinstance(path, str | os.PathLike):
-        raise ModelError(f"checkpoint={path!r}: expected the path of a folder")
     folder = Path(path).absolute()
     text = _canonical(dict(asked))
     try:
