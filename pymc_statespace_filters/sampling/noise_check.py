@@ -22,6 +22,8 @@ LEAST_ITERATIONS = 600
 # A start may lie in the tail, where estimates scatter more, and a chain leaves it for better ones.
 # At this variance noise alone lets through one move in ten thousand: a warm-up ends before.
 HOPELESS = 30.0
+# After so many iterations without a single move it is said.
+STILL = 100
 
 Measure = Callable[[np.ndarray, np.ndarray], SeedSpread]
 
@@ -33,15 +35,15 @@ def is_worthwhile(target: Target, n_iterations: int) -> bool:
 
 
 def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
-    """Say that the noise at a start is such that no chain gets away from it."""
+    """Say that the noise at a start is such that a chain may not get away from it."""
     if not HOPELESS < spread.variance < np.inf:
         return None
     return warning(
         f"Chain {chain}, at the start: the estimated log-likelihood has a variance of "
         f"{spread.variance:.3g} over {spread.n} noise seeds. The noise lets through some "
         f"{acceptance_share(spread.variance):.1g} of the moves of an exact likelihood, so that the "
-        "chain may never leave. Start elsewhere (initvals), or give the filter more particles; "
-        "psf.suggest_particles(model) finds the number."
+        "chain may never leave, and it has not yet. Start elsewhere (initvals), or give the filter "
+        "more particles; psf.suggest_particles(model) finds the number."
     )
 
 

@@ -13,7 +13,7 @@ from threading import Event
 from typing import NamedTuple
 
 import numpy as np
-from pymc.stats.convergence import log_warnings
+from pymc.stats.convergence import SamplerWarning, log_warnings
 
 from pymc_statespace_filters.sampling import chain, noise_check
 from pymc_statespace_filters.sampling.checkpoint import Checkpoint
@@ -92,6 +92,7 @@ class ChainRun:
         self._n_saved = self.done
         self._saved_at = time.monotonic()
         self.seconds = 0.0
+        self._start_warning: SamplerWarning | None = None
 
     @property
     def done(self) -> int:
@@ -114,6 +115,7 @@ class ChainRun:
                 if codes and self.done > 0:
                     self.running.add_evaluations(codes)
                     codes = ()
+                self._warn_if_still_there()
                 if self._must_save():
                     self._save()
             self._save()
@@ -149,9 +151,15 @@ class ChainRun:
             state = self.running.state
             seeds = draw_seeds(self._rng, (noise_check.N_SEEDS, state.seeds.size))
             spread = self.running.seed_spread(state.position, seeds)
-            # At once: who reads it may not want to wait for the end.
-            log_warnings(list(filter(None, [noise_check.start_warning(spread, self._index)])))
+            self._start_warning = noise_check.start_warning(spread, self._index)
         return codes
+
+    def _warn_if_still_there(self) -> None:
+        """Say that the start is too noisy, unless the chain has left it: most do, uphill."""
+        if self._start_warning is not None and self.done >= noise_check.STILL:
+            if not self.running.draws.counts[: noise_check.STILL, chain.STAGE].any():
+                log_warnings([self._start_warning])
+            self._start_warning = None
 
     def _advance(self) -> None:
         """Go on to the end of the block of random numbers, or of the phase."""
