@@ -188,7 +188,7 @@ def test_times_in_place_of_steps():
         ({"observed": np.zeros((1, 4))}, r"observed must have shape \(4, 1\)"),
         ({"observed": pytensor.shared(np.zeros((3, 1)))}, r"observed must have shape \(4, 1\)"),
         ({"observed": pt.dvector("v")}, "symbolic observed must have 2 dimensions"),
-        ({"observed": [1, np.inf, 3, 4]}, r"observed\[\(1,\)\] is inf"),
+        ({"observed": [1, np.inf, 3, 4]}, r"observed\[1\] is inf"),
         ({"observed": "data.csv"}, "observed must be numbers, got 'data.csv'"),
         ({"times": STEPS * 1.0}, "give exactly one of steps and times"),
         ({"steps": None}, "give exactly one of steps and times"),

@@ -75,7 +75,7 @@ def test_each_row_of_seeds_is_one_evaluation():
 def test_a_known_noise_is_found():
     """Noise of variance 1.69: missed by 4 standard errors once in 16 000 times."""
     model, seed = noisy_model(noise_sd=1.3)
-    density = LogDensity(model, model.value_vars, model.initial_point(), {"d": seed})
+    density = LogDensity(model, model.value_vars, model.initial_point(), {"d": seed}).bind()
     seeds = np.random.default_rng(4).integers(0, 2**63 - 1, size=(2000, 1))
     spread = seed_spread(density, np.array([1.0]), (), seeds)
     assert abs(spread.variance - 1.69) < 4.0 * 1.69 * np.sqrt(2.0 / 2000)
