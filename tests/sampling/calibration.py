@@ -26,7 +26,7 @@ import pytensor
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.log_density import screening_density
 from pymc_statespace_filters.sampling.quantities import Quantities
-from pymc_statespace_filters.sampling.randomness import BLOCK, draw_seeds
+from pymc_statespace_filters.sampling.randomness import BLOCK
 from pymc_statespace_filters.sampling.runs import ChainRun, Plan
 from pymc_statespace_filters.sampling.sample import _starts
 from pymc_statespace_filters.sampling.settings import DRAMSettings
@@ -200,8 +200,7 @@ class Redrawing(ChainRun):
         if self.done < self._plan.tune:
             return super()._advance()
         running, done = self.running, self.done
-        seeds = draw_seeds(self._rng, running.state.seeds.shape)
-        running._stand(running._evaluate(running.state.position.copy(), (), seeds))
+        running.start([running.state.position.copy()], (), self._rng)
         index, first = divmod(done, BLOCK)
         if self._block is None or self._block[0] != index:
             self._block = index, self._target.random(self.key, index)
