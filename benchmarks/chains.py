@@ -19,7 +19,8 @@ import pymc as pm
 from numba import njit
 
 import pymc_statespace_filters as psf
-from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, simulated
+from benchmarks.sampling import double_well_model
+from benchmarks.systems import DOUBLE_WELL_TRUTH
 from pymc_statespace_filters.sampling.chain import evaluate
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
@@ -81,17 +82,6 @@ def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
     return 1e6 * median(rounds) / n
 
 
-def well(filter, steps) -> pm.Model:
-    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH, steps)
-    with pm.Model() as model:
-        pm.Normal("alpha", 0, 10)
-        pm.Normal("beta", 0, 10)
-        pm.HalfNormal("sigma", 1)
-        pm.HalfNormal("gamma", 1)
-        psf.StateSpace("d", DOUBLE_WELL, filter, steps=steps, observed=observed)
-    return model
-
-
 def walls(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
     """Median wall seconds of each, in turn, once warm."""
     times: dict[str, list[float]] = {name: [] for name in runs}
@@ -105,9 +95,9 @@ def walls(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
     return {name: median(seconds) for name, seconds in times.items()}
 
 
-def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
-    """Two chains in two threads, against the same one after the other."""
-    run = partial(
+def two_chains(model: pm.Model, **settings) -> Callable:
+    """Two chains from the truth on, given the number of draws."""
+    return partial(
         psf.sample_dram,
         tune=0,
         chains=2,
@@ -115,7 +105,13 @@ def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
         initvals=DOUBLE_WELL_TRUTH,
         random_seed=1,
         progressbar=False,
+        **settings,
     )
+
+
+def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
+    """Two chains in two threads, against the same one after the other."""
+    run = two_chains(model)
     taken = walls(
         {
             "before": lambda: run(1, cores=1),
@@ -132,17 +128,8 @@ def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
 
 def checkpoints(seconds: float = 16.0) -> ChainCost:
     """Chains of some seconds with a checkpoint every five, and without."""
-    model = well(psf.EKF(), np.arange(0, 2001, 20))
-    run = partial(
-        psf.sample_dram,
-        tune=0,
-        chains=2,
-        cores=2,
-        model=model,
-        initvals=DOUBLE_WELL_TRUTH,
-        random_seed=1,
-        progressbar=False,
-    )
+    model = double_well_model(psf.EKF())
+    run = two_chains(model, cores=2)
     start = time.perf_counter()
     run(20_000)
     draws = int(20_000 * seconds / (time.perf_counter() - start))
@@ -183,8 +170,10 @@ def chains() -> list[ChainCost]:
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         found += [
-            threads("EKF, 20,000 steps", well(psf.EKF(), np.arange(0, 20001, 20)), 8000),
-            threads("EnKF(100)", well(psf.EnKF(100), np.arange(0, 2001, 20)), 1500),
+            threads(
+                "EKF, 20,000 steps", double_well_model(psf.EKF(), np.arange(0, 20001, 20)), 8000
+            ),
+            threads("EnKF(100)", double_well_model(psf.EnKF(100)), 1500),
             checkpoints(),
         ]
     finally:

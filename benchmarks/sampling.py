@@ -47,14 +47,14 @@ class Chains:
         return asdict(self)
 
 
-def the_model() -> pm.Model:
-    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH)
+def double_well_model(filter, steps=STEPS) -> pm.Model:
+    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH, steps)
     with pm.Model() as model:
         pm.Normal("alpha", 0, 10)
         pm.Normal("beta", 0, 10)
         pm.HalfNormal("sigma", 1)
         pm.HalfNormal("gamma", 1)
-        psf.StateSpace("d", DOUBLE_WELL, psf.EKF(), steps=STEPS, observed=observed)
+        psf.StateSpace("d", DOUBLE_WELL, filter, steps=steps, observed=observed)
     return model
 
 
@@ -101,7 +101,7 @@ def of_runs(sampler: str, sample: Callable) -> Chains:
         return np.stack([idata.posterior[name].values[0] for name in NAMES], axis=1), seconds
 
     logging.getLogger("pymc").setLevel(logging.ERROR)  # of far too short chains
-    with the_model():
+    with double_well_model(psf.EKF()):
         run(0, 1, 1)
         before = np.median([run(0, 1, 1)[1] for _ in range(5)])
         pairs = [(run(s, TUNE, DRAWS), run(s, TUNE, 1)) for s in range(N_SEEDS)]

@@ -17,8 +17,8 @@ import pymc as pm
 from arviz_stats.base import array_stats
 
 import pymc_statespace_filters as psf
-from benchmarks.sampling import NAMES
-from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, STEPS, simulated
+from benchmarks.sampling import NAMES, double_well_model
+from benchmarks.systems import DOUBLE_WELL_TRUTH
 
 TUNE = 1000
 SCREENS = {"`EKF()`": psf.EKF(), "`EnKF(100)`": psf.EnKF(100)}
@@ -34,17 +34,6 @@ class Plan(NamedTuple):
 
 # By the number of particles.
 PLANS = {250: Plan(5, 3000, (1.0, 0.5, 0.25)), 1000: Plan(3, 2000, (1.0, 0.5))}
-
-
-def model_with(n_particles: int) -> pm.Model:
-    _, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH)
-    with pm.Model() as model:
-        pm.Normal("alpha", 0, 10)
-        pm.Normal("beta", 0, 10)
-        pm.HalfNormal("sigma", 1)
-        pm.HalfNormal("gamma", 1)
-        psf.StateSpace("d", DOUBLE_WELL, psf.PFEnKF(n_particles), steps=STEPS, observed=observed)
-    return model
 
 
 def timed(model: pm.Model, settings: dict, chains: int, tune: int, draws: int):
@@ -87,7 +76,7 @@ def row(name: str, model: pm.Model, plan: Plan, settings: dict) -> str:
 def main() -> None:
     logging.getLogger("pymc").setLevel(logging.ERROR)
     for n_particles in [int(n) for n in sys.argv[1:]] or PLANS:
-        plan, model = PLANS[n_particles], model_with(n_particles)
+        plan, model = PLANS[n_particles], double_well_model(psf.PFEnKF(n_particles))
         print(f"\n`PFEnKF({n_particles})`, {plan.chains} chains of {TUNE} + {plan.draws}\n")
         print("| screen | calls | called | accepted | ESS per 1000 calls | ESS per CPU second |")
         print("| --- " * 6 + "|")

@@ -26,6 +26,7 @@ __all__ = [
     "health_outputs",
     "hold_noise",
     "is_filter",
+    "log_density_terms",
     "move_noise",
     "noise_seeds",
     "noisy_filters",
@@ -42,6 +43,17 @@ def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
         for rv in model.basic_RVs
         if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
     }
+
+
+def _likelihood_nodes(graphs: Sequence[Variable]) -> list[Any]:
+    nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
+    return [node for node in nodes if isinstance(node.op, LogLikelihood)]
+
+
+def log_density_terms(model: pm.Model) -> list[tuple[str, TensorVariable]]:
+    """The terms of a model's log-density, with the names of the variables they belong to."""
+    names = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
+    return list(zip(names, model.logp(sum=False), strict=True))
 
 
 def state_space_names(model: pm.Model) -> list[str]:
@@ -84,8 +96,7 @@ def resized(filter: Filter, n_members: int) -> Filter:
 
 def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
-    nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
-    return [node.outputs[1] for node in nodes if isinstance(node.op, LogLikelihood)]
+    return [node.outputs[1] for node in _likelihood_nodes(graphs)]
 
 
 def hold_noise(
@@ -99,8 +110,8 @@ def hold_noise(
     replaced: dict[Variable, Variable] = {}
     normals: dict[TensorVariable, TensorVariable] = {}
     names = {seed: name for name, seed in seeds.items()}
-    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
-        if isinstance(node.op, LogLikelihood) and node.inputs[-1] in names:
+    for node in _likelihood_nodes(graphs):
+        if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, filter = node.op.system, node.op.filter
             stored = pt.dvector(f"{names[seed]}_normals")
@@ -151,11 +162,11 @@ def move_noise(
     replaced: dict[Variable, Variable] = {}
     noises: list[tuple[TensorVariable, TensorVariable, TensorVariable]] = []
     names = {seed: name for name, seed in seeds.items()}
-    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
-        if isinstance(node.op, LogLikelihood) and node.inputs[-1] in names:
+    for node in _likelihood_nodes(graphs):
+        if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
-            filter: Any = noisy.smooth(system)  # type: ignore[union-attr]
+            filter: Any = noisy.smooth(system)
             filter.check(system)
             normals = pt.dvector(f"{names[seed]}_normals")
             fresh = StoredNoise(system, filter)(steps, seed)
@@ -191,9 +202,7 @@ def with_filter(
         check_kinds(variables[name].op.system, filter)
     replaced: dict[Variable, Variable] = {}
     found: set[str] = set()
-    for node in {v.owner: None for v in ancestors(graphs) if v.owner is not None}:
-        if not isinstance(node.op, LogLikelihood):
-            continue
+    for node in _likelihood_nodes(graphs):
         names = [name for name in variables if _is_likelihood_of(node, model, variables[name])]
         found.update(names)
         new = {filters.get(name, node.op.filter) for name in names}
@@ -222,11 +231,9 @@ def _is_same(a: Variable, b: Variable) -> bool:
 
 def smooth_filters(model: pm.Model) -> dict[str, Filter]:
     """Every noisy variable's filter in the version that `move_noise` puts in its place."""
-    return {
-        name: node.op.filter.smooth(node.op.system)
-        for name, node in _state_space_nodes(model).items()
-        if node.op.filter.noisy
-    }
+    nodes = _state_space_nodes(model)
+    ops = {name: nodes[name].op for name in noisy_filters(model)}
+    return {name: op.filter.smooth(op.system) for name, op in ops.items()}
 
 
 def exactness(model: pm.Model) -> bool:

@@ -21,134 +21,37 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pymc_statespace_filters.machine_code import Call, digest, kept, make_call
-from pymc_statespace_filters.sampling.adaptation import AdaptationSettings, learn, unpack
+from pymc_statespace_filters.machine_code import digest, kept, make_call
+from pymc_statespace_filters.sampling.adaptation import AdaptationSettings, learn
+from pymc_statespace_filters.sampling.adaptation_state import unpack
+from pymc_statespace_filters.sampling.chain_arrays import (
+    ACCEPTANCE,
+    DONE,
+    FAILURE,
+    HEALTH_SIZE,
+    LOG_DENSITY,
+    LOG_SCREEN,
+    N_EFFECTIVE,
+    N_EVALUATIONS,
+    N_FAILED,
+    N_SCREEN_FAILED,
+    N_SCREENED,
+    NOT_A_NUMBER,
+    PAUSE,
+    RAISED,
+    SCALING,
+    STAGE,
+    Evaluation,
+)
 from pymc_statespace_filters.sampling.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.surrogate_transition import log_surrogate_acceptance
-
-HEALTH_SIZE = 3
-# Reasons of a failure that no filter reports: a value that is no density, an exception.
-NOT_A_NUMBER, RAISED = -1, -2
-
-# Columns of a chain's numbers, and of the numbers and counts of its draws.
-LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN = range(3)
-ACCEPTANCE, SCALING = 2, 3
-N_NUMBERS = 4
-STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED = range(6)
-N_COUNTS = 6
-# Cells by which a running chain and whoever waits for it talk.
-PAUSE, DONE = range(2)
-
-
-class Density(NamedTuple):
-    """A log-density that machine code can call.
-
-    Attributes
-    ----------
-    call : Call
-        Its results are the log-density, the health of each filter, and the noise it used if the
-        chain carries that.
-    position : ndarray, shape (d,)
-        What the call reads.
-    seeds : ndarray of int64, shape (noisy,)
-        What the call reads too.
-    n_healths : int
-    """
-
-    call: Call
-    position: np.ndarray
-    seeds: np.ndarray
-    n_healths: int
-
-
-class Settings(NamedTuple):
-    """What does not change within a phase of a chain, warm-up or sampling."""
-
-    n_stages: int
-    stage_scale: float
-    screened: bool
-    adapts: bool
-    continuous: bool
-    adapt_every: int
-
-
-class State(NamedTuple):
-    """Where a chain stands: plain arrays, changed in place.
-
-    Attributes
-    ----------
-    position : ndarray, shape (d,)
-        On the unconstrained space.
-    seeds : ndarray of int64, shape (noisy,)
-        The noise behind the estimate.
-    numbers : ndarray, shape (3,)
-        Log-density as it was estimated when the chain came here; smallest effective number of
-        particles behind it (infinity without noise); log-density of the screen.
-    adaptation : ndarray
-        What was learnt, see `adaptation.unpack`.
-    carried : ndarray
-        The noise itself, where the chain moves it instead of drawing it anew.
-    """
-
-    position: np.ndarray
-    seeds: np.ndarray
-    numbers: np.ndarray
-    adaptation: np.ndarray
-    carried: np.ndarray
-
-
-class Random(NamedTuple):
-    """Random numbers of consecutive iterations: the first axis.
-
-    Attributes
-    ----------
-    normals : ndarray, shape (iterations, stages, d)
-        Standard normals, for the proposals.
-    log_uniforms : ndarray, shape (iterations, stages + 1)
-        Logs of uniforms for acceptance: by stage, and of a screened move.
-    seeds : ndarray of int64, shape (iterations, stages, noisy)
-        Seeds of the likelihoods' own noise.
-    """
-
-    normals: np.ndarray
-    log_uniforms: np.ndarray
-    seeds: np.ndarray
-
-
-class Draws(NamedTuple):
-    """What is noted down of each iteration: the first axis.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n, d)
-    numbers : ndarray, shape (n, 4)
-        Columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING.
-    counts : ndarray of int64, shape (n, 6)
-        Columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS, N_FAILED, FAILURE
-        (the last one's code), N_SCREENED, N_SCREEN_FAILED.
-    seeds : ndarray of int64, shape (n, noisy)
-    covs : ndarray, shape (n_covs, d, d)
-        Covariance of the first stage's proposals, of the first few iterations, or of none.
-    """
-
-    positions: np.ndarray
-    numbers: np.ndarray
-    counts: np.ndarray
-    seeds: np.ndarray
-    covs: np.ndarray
-
-
-class _Value(NamedTuple):
-    log_density: float
-    failure: int
-    n_effective: float
 
 
 class _Move(NamedTuple):
     """Outcome of delayed rejection; the new point, if any, is in the density's own arrays."""
 
     stage: int
-    value: _Value
+    value: Evaluation
     acceptance: float
     n_evaluations: int
     n_failed: int
@@ -167,7 +70,13 @@ def _copy(source, target):
         target[i] = source[i]
 
 
-_SOURCES = ("chain.py", "adaptation.py", "delayed_rejection.py", "surrogate_transition.py")
+_SOURCES = (
+    "chain.py",
+    "chain_arrays.py",
+    "adaptation.py",
+    "delayed_rejection.py",
+    "surrogate_transition.py",
+)
 _SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
 
 
@@ -185,16 +94,16 @@ def evaluate(density):
     the code of its reason.
     """
     if not make_call(density.call):
-        return _Value(-np.inf, RAISED, 0.0)
+        return Evaluation(-np.inf, RAISED, 0.0)
     out, n_effective = density.call.out, np.inf
     for i in range(density.n_healths):
         at = 2 + HEALTH_SIZE * i
         n_effective = min(n_effective, out[at])
         if out[at + 1] != 0.0:
-            return _Value(-np.inf, int(out[at + 1]), n_effective)
+            return Evaluation(-np.inf, int(out[at + 1]), n_effective)
     if not out[1] < np.inf:
-        return _Value(-np.inf, NOT_A_NUMBER, n_effective)
-    return _Value(out[1], 0, n_effective)
+        return Evaluation(-np.inf, NOT_A_NUMBER, n_effective)
+    return Evaluation(out[1], 0, n_effective)
 
 
 @_internal
@@ -205,7 +114,7 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
     log_pi[0] = log_density
     offsets = np.zeros((settings.n_stages + 1, dim))
     acceptance, scale, n_failed, failure = 0.0, 1.0, 0, 0
-    value = _Value(log_density, 0, np.inf)
+    value = Evaluation(log_density, 0, np.inf)
     for stage in range(1, settings.n_stages + 1):
         for i in range(dim):
             offsets[stage, i] = random.normals[k, stage - 1, i] * scale

@@ -6,7 +6,7 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
 from pymc_statespace_filters.inspection import COLLAPSED, FAILURES
-from pymc_statespace_filters.sampling.chain import (
+from pymc_statespace_filters.sampling.chain_arrays import (
     FAILURE,
     N_EFFECTIVE,
     N_EVALUATIONS,

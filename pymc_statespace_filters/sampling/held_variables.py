@@ -10,6 +10,7 @@ from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.inspection import log_density_terms
 
 
 class HeldVariables:
@@ -89,11 +90,10 @@ def check_no_generators(model: Model) -> None:
     ModelError
         If a term of it does, as `pymc.Minibatch` and `pymc.Simulator` do.
     """
-    variables = [*model.basic_RVs, *model.potentials]
-    for variable, term in zip(variables, model.logp(sum=False), strict=True):
+    for name, term in log_density_terms(model):
         if any(isinstance(v.type, RandomType) for v in graph_inputs([term])):
             raise ModelError(
-                f"the log-density of {variable.name!r} draws random numbers of its own, from a "
+                f"the log-density of {name!r} draws random numbers of its own, from a "
                 "generator that all chains would share: the draws would be no function of "
                 "random_seed. pm.sample(step=psf.DRAM()) takes such a model"
             )

@@ -7,7 +7,7 @@ comes out of the same call, so that a failure has a reason and costs no second e
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
@@ -22,30 +22,14 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import (
     health_outputs,
     hold_noise,
+    log_density_terms,
     move_noise,
     state_space_names,
     with_filter,
 )
 from pymc_statespace_filters.machine_code import NativeFunction
-from pymc_statespace_filters.sampling.chain import RAISED, Density, evaluate
-
-
-class Evaluation(NamedTuple):
-    """What one evaluation gives.
-
-    Attributes
-    ----------
-    log_density : float
-        Never NaN nor plus infinity; a failed evaluation is minus infinity.
-    failure : int
-        0, or the code of the reason: a key of ``inspection.FAILURES``, or ``chain.NOT_A_NUMBER``.
-    n_effective : float
-        Smallest effective number of particles in any filter, infinity without noisy filters.
-    """
-
-    log_density: float
-    failure: int
-    n_effective: float
+from pymc_statespace_filters.sampling.chain import evaluate
+from pymc_statespace_filters.sampling.chain_arrays import RAISED, Density, Evaluation
 
 
 class LogDensity:
@@ -175,7 +159,7 @@ class BoundDensity:
 
     Attributes
     ----------
-    density : chain.Density
+    density : Density
         For machine code.
     others : list of ndarray
         Values of the variables that are not in the vector.
@@ -225,7 +209,7 @@ class BoundDensity:
         self.density.seeds[:] = seeds
         for mine, value in zip(self.others, others, strict=True):
             mine[...] = value
-        result = Evaluation(*evaluate(self.density))
+        result = evaluate(self.density)
         if result.failure == RAISED:
             self.raise_error()
         return result
@@ -256,10 +240,8 @@ def screening_density(model: Model, screen: Any, power: float) -> TensorVariable
         If the filter cannot treat a system.
     """
     names = state_space_names(model)
-    variables = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
     total = sum(
-        pt.sum(term) * (power if name in names else 1.0)
-        for name, term in zip(variables, model.logp(sum=False), strict=True)
+        pt.sum(term) * (power if name in names else 1.0) for name, term in log_density_terms(model)
     )
     try:
         return with_filter([total], model, dict.fromkeys(names, screen))[0]

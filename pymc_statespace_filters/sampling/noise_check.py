@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
-from pymc_statespace_filters.sampling.chain import LOG_DENSITY, Draws
+from pymc_statespace_filters.sampling.chain_arrays import LOG_DENSITY, Draws
 from pymc_statespace_filters.sampling.health import warning
 from pymc_statespace_filters.sampling.randomness import draw_seeds, side_generator
 from pymc_statespace_filters.sampling.seed_spread import (
@@ -56,7 +56,7 @@ def at_the_highest_draw(
 
     Parameters
     ----------
-    draws : sequence of chain.Draws
+    draws : sequence of Draws
         Of each chain, whole.
     tune : int
         Iterations of warm-up, which are left out.

@@ -7,7 +7,7 @@ again anywhere and does not depend on who runs it.
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.chain import Random
+from pymc_statespace_filters.sampling.chain_arrays import Random
 
 BLOCK = 256
 
@@ -25,7 +25,7 @@ def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: 
 
     Returns
     -------
-    chain.Random
+    Random
     """
     # Each index begins 2^128 numbers after the one before it.
     rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))

@@ -5,15 +5,30 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.sampling import chain
-from pymc_statespace_filters.sampling.adaptation import (
+from pymc_statespace_filters.sampling.adaptation_state import (
     pack,
     packed_size,
     start_adaptation,
     unpack,
 )
-from pymc_statespace_filters.sampling.chain import Draws, Random, Settings, State, advance
-from pymc_statespace_filters.sampling.log_density import Evaluation
+from pymc_statespace_filters.sampling.chain import advance
+from pymc_statespace_filters.sampling.chain_arrays import (
+    ACCEPTANCE,
+    DONE,
+    FAILURE,
+    N_COUNTS,
+    N_EVALUATIONS,
+    N_FAILED,
+    N_NUMBERS,
+    PAUSE,
+    SCALING,
+    STAGE,
+    Draws,
+    Evaluation,
+    Random,
+    Settings,
+    State,
+)
 from pymc_statespace_filters.sampling.randomness import draw_seeds
 from pymc_statespace_filters.sampling.seed_spread import SeedSpread, seed_spread
 from pymc_statespace_filters.sampling.starts import EvaluatedPoint, best_start
@@ -41,7 +56,7 @@ class RunningChain:
     state : State
     draws : Draws
     talk : ndarray of int64, shape (2,)
-        See `chain.PAUSE` and `chain.DONE`.
+        See `chain_arrays.PAUSE` and `chain_arrays.DONE`.
     """
 
     def __init__(self, target: Target, n_rows: int, n_covs: int):
@@ -60,8 +75,8 @@ class RunningChain:
         )
         self.draws = Draws(
             np.empty((n_rows, dim)),
-            np.empty((n_rows, chain.N_NUMBERS)),
-            np.zeros((n_rows, chain.N_COUNTS), dtype=np.int64),
+            np.empty((n_rows, N_NUMBERS)),
+            np.zeros((n_rows, N_COUNTS), dtype=np.int64),
             np.empty((n_rows, n_noisy), dtype=np.int64),
             np.empty((n_covs, dim, dim)),
         )
@@ -150,14 +165,14 @@ class RunningChain:
 
         What has not changed since the iteration before is left out: most proposals are rejected.
         """
-        rows = slice(begin, int(self.talk[chain.DONE]))
+        rows = slice(begin, int(self.talk[DONE]))
         counts, numbers = self.draws.counts[rows], self.draws.numbers[rows]
-        changed = counts[:, chain.STAGE] > 0
-        changed[1:] |= numbers[1:, chain.SCALING] != numbers[:-1, chain.SCALING]
+        changed = counts[:, STAGE] > 0
+        changed[1:] |= numbers[1:, SCALING] != numbers[:-1, SCALING]
         changed[:1] = True
         draws = {
             "counts": counts.astype(np.int16),
-            "acceptance": numbers[:, chain.ACCEPTANCE],
+            "acceptance": numbers[:, ACCEPTANCE],
             "changed": changed,
             "positions": self.draws.positions[rows][changed],
             "numbers": numbers[changed],
@@ -173,10 +188,10 @@ class RunningChain:
         for name in ("positions", "numbers", "seeds"):
             getattr(self.draws, name)[:done] = draws[name][last_change]
         self.draws.counts[:done] = draws["counts"]
-        self.draws.numbers[:done, chain.ACCEPTANCE] = draws["acceptance"]
+        self.draws.numbers[:done, ACCEPTANCE] = draws["acceptance"]
         self.draws.covs[: len(draws["covs"])] = draws["covs"]
         self.adopt(State(**state))
-        self.talk[chain.DONE] = done
+        self.talk[DONE] = done
         self._move_noise()
 
     def add_evaluations(self, codes: Sequence[int]) -> None:
@@ -184,10 +199,10 @@ class RunningChain:
         if codes:
             counts = self.draws.counts[0]
             failed = [code for code in codes if code]
-            counts[chain.N_EVALUATIONS] += len(codes)
-            counts[chain.N_FAILED] += len(failed)
-            if failed and not counts[chain.FAILURE]:
-                counts[chain.FAILURE] = failed[-1]
+            counts[N_EVALUATIONS] += len(codes)
+            counts[N_FAILED] += len(failed)
+            if failed and not counts[FAILURE]:
+                counts[FAILURE] = failed[-1]
 
     @property
     def proposal_cov(self) -> np.ndarray:
@@ -230,14 +245,14 @@ class RunningChain:
         done = advance(
             phase, target, screen, self.state, random, first, self.draws, row, n, self.talk
         )
-        if done < n and not self.talk[chain.PAUSE]:
+        if done < n and not self.talk[PAUSE]:
             for density in filter(None, (self._screen, self._density)):
                 density.raise_error()
             raise RuntimeError("the model's log-density raised an error, but not when asked again")
         return done
 
     def _heed_pause(self) -> None:
-        if self.talk[chain.PAUSE]:
+        if self.talk[PAUSE]:
             raise Halted
 
     def _evaluate_screen(

@@ -15,7 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, log_warnings
 
-from pymc_statespace_filters.sampling import chain, noise_check
+from pymc_statespace_filters.sampling import noise_check
+from pymc_statespace_filters.sampling.chain_arrays import (
+    DONE,
+    N_FAILED,
+    PAUSE,
+    SCALING,
+    STAGE,
+    Random,
+)
 from pymc_statespace_filters.sampling.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.progress import watch
 from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key, draw_seeds
@@ -83,7 +91,7 @@ class ChainRun:
         self.running = RunningChain(target, plan.n_iterations, n_covs)
         self._rng = np.random.default_rng(plan.seeds[index])
         self.key = draw_key(self._rng)
-        self._block: tuple[int, chain.Random] | None = None
+        self._block: tuple[int, Random] | None = None
         self._log = None if checkpoint is None else checkpoint.log(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             draws, state = stored
@@ -97,12 +105,12 @@ class ChainRun:
     @property
     def done(self) -> int:
         """Iterations made so far."""
-        return int(self.running.talk[chain.DONE])
+        return int(self.running.talk[DONE])
 
     def ask_for_pause(self, stop: Event) -> None:
         """Bring the chain back to Python if there is something to do there."""
         if stop.is_set() or self._must_save():
-            self.running.talk[chain.PAUSE] = 1
+            self.running.talk[PAUSE] = 1
 
     def run(self, stop: Event) -> None:
         """Go on to the end, or until told to stop."""
@@ -110,7 +118,7 @@ class ChainRun:
         try:
             codes = self._start() if self.done == 0 else ()
             while self.done < self._plan.n_iterations and not stop.is_set():
-                self.running.talk[chain.PAUSE] = 0  # asked for again and again where it is needed
+                self.running.talk[PAUSE] = 0  # asked for again and again where it is needed
                 self._advance()
                 if codes and self.done > 0:
                     self.running.add_evaluations(codes)
@@ -128,7 +136,7 @@ class ChainRun:
 
     def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
         """Measure the scatter of the estimates at a point, once the chain has ended."""
-        self.running.talk[chain.PAUSE] = 0
+        self.running.talk[PAUSE] = 0
         return self.running.seed_spread(position, seeds)
 
     def progress(self) -> dict[str, float]:
@@ -137,10 +145,10 @@ class ChainRun:
         begin = self._plan.tune if done > self._plan.tune else 0
         counts = draws.counts[done - 1]
         return {
-            "accept_rate": float(np.mean(draws.counts[begin:done, chain.STAGE] > 0)),
-            "stage": int(counts[chain.STAGE]),
-            "scaling": float(draws.numbers[done - 1, chain.SCALING]),
-            "n_failed": int(counts[chain.N_FAILED]),
+            "accept_rate": float(np.mean(draws.counts[begin:done, STAGE] > 0)),
+            "stage": int(counts[STAGE]),
+            "scaling": float(draws.numbers[done - 1, SCALING]),
+            "n_failed": int(counts[N_FAILED]),
         }
 
     def _start(self) -> tuple[int, ...]:
@@ -157,7 +165,7 @@ class ChainRun:
     def _warn_if_still_there(self) -> None:
         """Say that the start is too noisy, unless the chain has left it: most do, uphill."""
         if self._start_warning is not None and self.done >= noise_check.STILL:
-            if not self.running.draws.counts[: noise_check.STILL, chain.STAGE].any():
+            if not self.running.draws.counts[: noise_check.STILL, STAGE].any():
                 log_warnings([self._start_warning])
             self._start_warning = None
 

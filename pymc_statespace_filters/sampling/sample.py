@@ -18,7 +18,7 @@ from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import statistics
-from pymc_statespace_filters.sampling.chain import STAGE
+from pymc_statespace_filters.sampling.chain_arrays import STAGE
 from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.fingerprint import data_fingerprint, model_fingerprint
 from pymc_statespace_filters.sampling.health import Record, closing_warning
@@ -202,11 +202,9 @@ def _chain_draws(target: Target, run: ChainRun, tune: int) -> ChainDraws:
         [np.cumsum(phase) / np.arange(1, phase.size + 1) for phase in np.split(moved, [tune])]
     )
     frozen = run.running.proposal_cov
-    covs = np.broadcast_to(frozen, (max(done - tune, 0), *frozen.shape))
+    covs = np.broadcast_to(frozen, (done, *frozen.shape))  # of the draws, where the warm-up goes
     if len(draws.covs):
-        covs = np.concatenate([draws.covs[:done], covs])
-    else:
-        covs = np.broadcast_to(frozen, (done, *frozen.shape))
+        covs = np.concatenate([draws.covs[:done], covs[tune:]])
     return ChainDraws(draws.positions[:done], stats | {"proposal_cov": covs})
 
 

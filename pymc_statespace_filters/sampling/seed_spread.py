@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import t as student_t
 
-from pymc_statespace_filters.sampling.log_density import Evaluation
+from pymc_statespace_filters.sampling.chain_arrays import Evaluation
 
 # The variances between which a chain gains most for its time, and the middle of their logs.
 TARGET = (1.0, 3.3)

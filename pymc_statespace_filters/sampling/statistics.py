@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
-from pymc_statespace_filters.sampling.chain import (
+from pymc_statespace_filters.sampling.chain_arrays import (
     ACCEPTANCE,
     FAILURE,
     LOG_DENSITY,
@@ -72,7 +72,7 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     Parameters
     ----------
     target : Target
-    draws : chain.Draws
+    draws : Draws
     rows : int or slice
 
     Returns

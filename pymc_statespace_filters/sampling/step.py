@@ -17,7 +17,7 @@ from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.sampling import progress, statistics
-from pymc_statespace_filters.sampling.chain import Random, State
+from pymc_statespace_filters.sampling.chain_arrays import Random, State
 from pymc_statespace_filters.sampling.health import Record, closing_warning
 from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key
 from pymc_statespace_filters.sampling.running import RunningChain

@@ -8,7 +8,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import exactness, noise_seeds, state_space_names
-from pymc_statespace_filters.sampling.chain import Random
+from pymc_statespace_filters.sampling.chain_arrays import Random
 from pymc_statespace_filters.sampling.health import Growth
 from pymc_statespace_filters.sampling.held_variables import (
     HeldVariables,

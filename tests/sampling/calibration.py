@@ -31,17 +31,11 @@ from pymc_statespace_filters.sampling.runs import ChainRun, Plan
 from pymc_statespace_filters.sampling.sample import _starts
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
+from tests.sampling.autoregression import autoregression
 from tests.sampling.rank_uniformity import chi_square_p, ecdf_p
 
 STEPS = np.arange(1, 31)
-LINEAR = psf.StateSpaceModel(
-    transition=lambda x, q, phi: [phi * x[0] + q[0]],
-    process_noise=lambda spread: [[spread**2]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.5]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
+LINEAR = autoregression(observation_noise=[[0.5]])
 # The last is exact, and finds a posterior that is too wide or too narrow all around, which hardly
 # shows in the parameters.
 QUANTITIES = ("phi", "spread", "log-likelihood")

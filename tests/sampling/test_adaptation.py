@@ -8,10 +8,8 @@ import pymc as pm
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.sampling.adaptation import (
-    STALLED,
-    AdaptationSettings,
-    learn,
+from pymc_statespace_filters.sampling.adaptation import STALLED, AdaptationSettings, learn
+from pymc_statespace_filters.sampling.adaptation_state import (
     pack,
     packed_size,
     start_adaptation,

@@ -7,7 +7,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling import DRAM, chain, noise_check
+from pymc_statespace_filters.sampling import DRAM, chain_arrays, noise_check
 from pymc_statespace_filters.sampling.health import Growth, Record, closing_warning
 from pymc_statespace_filters.sampling.noise_check import start_warning
 from pymc_statespace_filters.sampling.seed_spread import spread_of
@@ -63,12 +63,12 @@ def test_healthy_chains_are_silent(caplog):
 
 def draws_with(stages):
     n = len(stages)
-    counts = np.zeros((n, chain.N_COUNTS), dtype=np.int64)
-    counts[:, chain.STAGE] = stages
-    counts[:, chain.N_EVALUATIONS] = 1
-    numbers = np.full((n, chain.N_NUMBERS), np.inf)
+    counts = np.zeros((n, chain_arrays.N_COUNTS), dtype=np.int64)
+    counts[:, chain_arrays.STAGE] = stages
+    counts[:, chain_arrays.N_EVALUATIONS] = 1
+    numbers = np.full((n, chain_arrays.N_NUMBERS), np.inf)
     none = np.empty((n, 0))
-    return chain.Draws(none, numbers, counts, none.astype(np.int64), np.empty((0, 1, 1)))
+    return chain_arrays.Draws(none, numbers, counts, none.astype(np.int64), np.empty((0, 1, 1)))
 
 
 @pytest.mark.parametrize(

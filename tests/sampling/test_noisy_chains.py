@@ -9,7 +9,11 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.chain_arrays import STAGE
+from pymc_statespace_filters.sampling.running import RunningChain
 from pymc_statespace_filters.sampling.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target import Target
+from tests.sampling.autoregression import autoregression
 from tests.sampling.test_state_space import DATA as RECORD
 from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
 
@@ -134,14 +138,7 @@ def kinked(x, q, phi):
 
 
 def kinked_model():
-    system = psf.StateSpaceModel(
-        transition=kinked,
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.4]],
-        process_noise=[[0.5]],
-        initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )
+    system = autoregression(transition=kinked, process_noise=[[0.5]])
     with pm.Model() as model:
         pm.Normal("phi", 0.5, 0.5)
         psf.StateSpace("d", system, FEW, steps=STEPS, observed=RECORD)
@@ -204,14 +201,7 @@ def brittle(x, q, phi, narrow):
 
 def test_a_screen_that_fails_where_another_step_moved():
     """DRAM waits there; what it notes down is the density of the target."""
-    system = psf.StateSpaceModel(
-        transition=brittle,
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.4]],
-        process_noise=[[0.5]],
-        initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )
+    system = autoregression(transition=brittle, process_noise=[[0.5]])
     with pm.Model() as model:
         phi, narrow = pm.Normal("phi", 0.5, 0.5), pm.Normal("narrow", 0.5, 0.3)
         psf.StateSpace("d", system, psf.EKF(), steps=[1], observed=[[0.4]])
@@ -237,3 +227,24 @@ def test_a_screen_that_fails_where_another_step_moved():
     expected = [log_density({"phi": p, "narrow": n}) for p, n in zip(phi, narrow, strict=True)]
     np.testing.assert_allclose(stats["lp"][0], expected, rtol=1e-9)
     assert stats["n_failed"].sum() == 0
+
+
+def test_the_noise_of_a_proposal_is_as_correlated_as_it_is_asked_to_be():
+    """2080 normals and more: 0.02 is four standard errors at most."""
+    settings = DRAMSettings(stages=1, correlation=0.9)
+    target = Target(linear_model(psf.EnKF(30)), None, settings)
+    target.prepare()
+    chain = RunningChain(target, 200, 0)
+    chain.start([np.array([0.7, -0.4])], (), np.random.default_rng(1))
+    random = target.random(np.array([1, 2], dtype=np.uint64), 0)
+    before, agreements = chain.state.carried.copy(), []
+    for i in range(200):
+        chain.advance(False, random, i, i, 1)
+        if chain.draws.counts[i, STAGE]:
+            agreements.append(np.corrcoef(before, chain.state.carried)[0, 1])
+        else:
+            np.testing.assert_array_equal(chain.state.carried, before)
+        before = chain.state.carried.copy()
+    assert before.size > 2000
+    assert len(agreements) > 10
+    np.testing.assert_allclose(agreements, 0.9, atol=0.02)

@@ -13,17 +13,11 @@ from pymc_statespace_filters.sampling import particle_budget
 from pymc_statespace_filters.sampling.budget_search import Row
 from pymc_statespace_filters.sampling.held_variables import HeldVariables
 from pymc_statespace_filters.sampling.seed_spread import SeedSpread
+from tests.sampling.autoregression import autoregression
 from tests.test_readme import run_code_of
 
 STEPS = np.arange(1, 61)
-LINEAR = psf.StateSpaceModel(
-    transition=lambda x, q, phi: [phi * x[0] + q[0]],
-    process_noise=lambda spread: [[spread**2]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.2]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
+LINEAR = autoregression(observation_noise=[[0.2]])
 TRUTH = {"phi": 0.8, "spread": 0.7}
 DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=5)["observations"].to_numpy()
 
@@ -151,14 +145,7 @@ def test_a_reading_is_a_warning_and_the_table_is_there(monkeypatch):
 @pytest.mark.slow
 def test_a_variance_that_stays_warns_and_leaves_a_table():
     """A precise sensor far from where the particles start: one of them decides at once."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, phi: [phi * x[0] + q[0]],
-        process_noise=[[1e-4]],
-        observation=lambda x: [x[0]],
-        observation_noise=[[1e-8]],
-        initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )
+    system = autoregression(process_noise=[[1e-4]], observation_noise=[[1e-8]])
     with pm.Model() as model:
         pm.Normal("phi", 0.5, 0.5)
         psf.StateSpace("d", system, psf.BootstrapPF(10), steps=[1, 2, 3], observed=[3.0, -2.0, 4.0])

@@ -15,6 +15,7 @@ from pymc_statespace_filters.sampling import quantities as of_quantities
 from pymc_statespace_filters.sampling.held_variables import HeldVariables
 from pymc_statespace_filters.sampling.quantities import BLOCK, Quantities
 from pymc_statespace_filters.sampling.results import ChainDraws, to_datatree
+from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 
 TUNE, DRAWS = 30, 40
@@ -303,21 +304,10 @@ def test_one_by_one_with_and_without_machine_code(monkeypatch):
         np.testing.assert_allclose(fast[name], slow[name], rtol=1e-13)
 
 
-def decay(x, q, phi):
-    return [phi * x[0] + q[0]]
-
-
 @pytest.fixture(scope="module")
 def state_space():
     """Two records, one quantity computed from a likelihood, and a tree of some draws."""
-    system = psf.StateSpaceModel(
-        transition=decay,
-        process_noise=[[0.5]],
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.4]],
-        initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )
+    system = autoregression(process_noise=[[0.5]])
     steps = np.arange(1, 9)
     data = np.array([[0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1]]).T
     with pm.Model() as model:

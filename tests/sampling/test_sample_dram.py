@@ -39,18 +39,7 @@ def sample_dram(model, **changes):
     return psf.sample_dram(model=model, **settings | changes)
 
 
-def decay(x, q, phi):
-    return [phi * x[0] + q[0]]
-
-
-SYSTEM = psf.StateSpaceModel(
-    transition=decay,
-    process_noise=[[0.5]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.4]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
+SYSTEM = autoregression(process_noise=[[0.5]])
 STEPS = np.arange(1, 9)
 DATA = np.array([[0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1]]).T
 
@@ -349,6 +338,7 @@ INTERRUPTED = """
 import warnings
 warnings.simplefilter("ignore")
 from tests.sampling.test_sample_dram import Watched, sample_dram
+from tests.sampling.autoregression import autoregression
 watched = Watched()
 sample_dram(watched.model, draws=1, tune=1)
 watched.seconds, watched.announced = {seconds}, watched.calls + {calls}

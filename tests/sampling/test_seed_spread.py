@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.log_density import Evaluation, LogDensity
+from pymc_statespace_filters.sampling.chain_arrays import Evaluation
+from pymc_statespace_filters.sampling.log_density import LogDensity
 from pymc_statespace_filters.sampling.seed_spread import (
     MIDDLE,
     SeedSpread,

@@ -11,32 +11,14 @@ from pymc_statespace_filters.inspection import FAILURES, noise_seeds
 from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.log_density import LogDensity
+from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 from tests.sampling.test_noise import Redrawing
 
 STEPS = np.arange(1, 21)
 
 
-def decay(x, q, phi):
-    return [phi * x[0] + q[0]]
-
-
-def level(x):
-    return [x[0]]
-
-
-def process_noise(spread):
-    return [[spread**2]]
-
-
-LINEAR = psf.StateSpaceModel(
-    transition=decay,
-    observation=level,
-    observation_noise=[[0.4]],
-    process_noise=process_noise,
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
+LINEAR = autoregression()
 TRUTH = {"phi": 0.7, "spread": 0.7}
 DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=3)["observations"].to_numpy()
 
@@ -136,13 +118,8 @@ def cubed(x, q, phi):
 
 @pytest.mark.parametrize("filter", [FEW, psf.EKF()], ids=["particles", "EKF"])
 def test_failures_come_with_the_filters_reason(filter):
-    explosive = psf.StateSpaceModel(
-        transition=cubed,
-        observation=level,
-        observation_noise=[[0.4]],
-        process_noise=[[1e-4]],
-        initial_mean=[0.05],
-        initial_cov=[[1e-4]],
+    explosive = autoregression(
+        transition=cubed, process_noise=[[1e-4]], initial_mean=[0.05], initial_cov=[[1e-4]]
     )
     with pm.Model():
         pm.Normal("phi", 0.0, 3.0)
