@@ -21,6 +21,7 @@ from pytensor.compile.ops import wrap_py
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
+from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
 
@@ -338,7 +339,6 @@ INTERRUPTED = """
 import warnings
 warnings.simplefilter("ignore")
 from tests.sampling.test_sample_dram import Watched, sample_dram
-from tests.sampling.autoregression import autoregression
 watched = Watched()
 sample_dram(watched.model, draws=1, tune=1)
 watched.seconds, watched.announced = {seconds}, watched.calls + {calls}
