@@ -1,14 +1,13 @@
 """The random-walk proposal q of Chib and Jeliazkov's identity: its centre and its width."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import arviz as az
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence._means import log_mean_of_chains, log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
@@ -47,35 +46,6 @@ class Proposal:
     def log_arriving(self, log_density: Array) -> Array:
         """Log alpha(x, x*) for x of these log-densities."""
         return np.minimum(0.0, self.log_density - log_density)
-
-
-class LogMean(NamedTuple):
-    """Log of a mean of positive terms, and the relative standard error of that mean."""
-
-    value: float
-    error: float
-
-
-def log_mean_of_chains(log_terms: Array) -> LogMean:
-    """Average autocorrelated terms, shape (chain, draw).
-
-    The error is ArviZ's, from Geyer's initial monotone sequence over split chains: it counts the
-    disagreement between chains as well as the autocorrelation within them.
-    """
-    peak = log_terms.max()
-    terms = np.exp(log_terms - peak)
-    mean = terms.mean()
-    return LogMean(float(peak + np.log(mean)), float(az.mcse(terms, method="mean") / mean))
-
-
-def log_mean_of_independent(log_terms: Array) -> LogMean:
-    """Average independent terms, shape (m,); terms of -inf are zeros, and they count."""
-    peak = log_terms.max()
-    if np.isneginf(peak):
-        return LogMean(-np.inf, np.inf)
-    terms = np.exp(log_terms - peak)
-    mean = terms.mean()
-    return LogMean(float(peak + np.log(mean)), float(terms.std() / mean / len(terms) ** 0.5))
 
 
 def choose_proposal(

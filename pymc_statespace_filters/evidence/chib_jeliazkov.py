@@ -25,35 +25,28 @@ error only.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from pymc.progress_bar import create_simple_progress
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence._proposal import (
-    Proposal,
-    choose_proposal,
+from pymc_statespace_filters.evidence._means import (
+    LogMean,
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
-from pymc_statespace_filters.evidence.diagnostics import warn_if_doubtful
-from pymc_statespace_filters.evidence.posterior import (
-    ModelDensity,
-    Posterior,
-    noise_was_moved,
-    posterior_of,
-)
-from pymc_statespace_filters.evidence.result import Evidence, store_evidence
+from pymc_statespace_filters.evidence._proposal import Proposal, choose_proposal
+from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.report import evidences_of
+from pymc_statespace_filters.evidence.result import Evidence
 
 MIN_PROPOSALS = 100
-N_BATCHES = 50
-PATIENCE = 2.0  # seconds without a progress bar
+MIN_EFFECTIVE = 100  # with fewer effective terms the standard error is itself a guess
+MAX_GAP = 4.0
 
 
 def chib_jeliazkov(
@@ -123,84 +116,20 @@ def chib_jeliazkov(
     >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
     True
     """
-    density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
-    posterior, noise = posterior_of(idata, density)
-    n_draws = posterior.log_density.size
-    if n_proposals is None:
-        n_proposals = min(max(n_draws, 1000), 5000)
-    if not isinstance(n_proposals, int | np.integer) or n_proposals < MIN_PROPOSALS:
-        raise ModelError(
-            f"n_proposals must be an integer of at least {MIN_PROPOSALS}, got {n_proposals!r}"
-        )
-
-    rng = np.random.default_rng(random_seed)
-    is_slow = n_proposals * _seconds_per_evaluation(posterior) > PATIENCE
-    bar = create_simple_progress(progressbar and is_slow)
-    with bar:
-        task = bar.add_task("Evaluating proposals", completed=0, total=n_proposals)
-        found = estimate(
-            posterior,
-            n_proposals=n_proposals,
-            rng=rng,
-            progress=lambda count: bar.advance(task, advance=count),
-        )
-    warn_if_doubtful(
-        posterior,
-        found.log_evidence,
-        gap=found.gap,
-        n_effective_draws=found.n_effective_numerator,
-        n_effective_proposals=found.n_effective_denominator,
+    found = evidences_of(
+        idata,
+        model,
+        {"chib_jeliazkov": ChibJeliazkov(n_proposals)},
+        random_seed=random_seed,
+        extend_inferencedata=extend_inferencedata,
+        progressbar=progressbar,
     )
-
-    evidence = Evidence(
-        log_evidence=found.log_evidence,
-        se=found.se,
-        estimator="chib_jeliazkov",
-        n_parameters=posterior.draws.shape[-1],
-        n_observations=observation_count(density.model),
-        max_log_likelihood=_max_log_likelihood(found, posterior, density),
-        data_fingerprint=data_fingerprint(density.model),
-        noise=noise,
-    )
-    if extend_inferencedata:
-        settings = {
-            "scale": found.scale,
-            "n_draws": n_draws,
-            "n_proposals": n_proposals,
-            "n_effective_numerator": found.n_effective_numerator,
-            "n_effective_denominator": found.n_effective_denominator,
-            "zero_density": found.zero_density,
-        }
-        store_evidence(idata, evidence, settings)
-    return evidence
+    return found["chib_jeliazkov"]
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """The log-evidence, its standard error, and how it came about.
-
-    An effective number is the inverse squared relative error of a mean: so many independent terms
-    of relative variance one would be as good.
-    """
-
-    log_evidence: float
-    se: float
-    scale: float  # geometric mean over the halves
-    n_effective_numerator: float
-    n_effective_denominator: float
-    zero_density: float  # share of the proposals
-    proposals: tuple[Proposal, ...]
-    gap: float = 0.0  # between the halves, in standard errors of their difference
-
-
-def estimate(
-    posterior: Posterior,
-    *,
-    n_proposals: int,
-    rng: np.random.Generator,
-    progress: Callable[[int], None] = lambda count: None,
-) -> Estimate:
-    """Estimate the log-evidence from draws and a log-density that can be evaluated (Eq. 3.44).
+class ChibJeliazkov:
+    """The estimator behind `chib_jeliazkov` (Eq. 3.44).
 
     Each half of the chains fits the proposal under which the other half is averaged; the two
     estimates are averaged. Fitted to the very draws that it averages, q would overrate the
@@ -208,73 +137,89 @@ def estimate(
 
     Parameters
     ----------
-    posterior : Posterior
-        Draws, their stored log-densities, and the function that evaluates more.
-    n_proposals : int
+    n_proposals : int, optional
         Draws from q(x*, .) for the denominators of both halves together.
-    rng : numpy.random.Generator
-        For those draws and for the noise of their log-densities.
-    progress : callable
-        Told after each batch how many proposals it had.
-
-    Returns
-    -------
-    Estimate
     """
-    first, second = posterior.halves()
-    folds = []
-    for fitted, averaged in ((first, second), (second, first)):
-        proposal = choose_proposal(fitted, n_proposals=n_proposals // 2, rng=rng)
-        folds.append(
-            _estimate_fold(proposal, averaged, n_proposals // 2, rng=rng, progress=progress)
+
+    n_proposals: int | None = None
+
+    def __post_init__(self) -> None:
+        given = self.n_proposals
+        if given is not None and not (
+            isinstance(given, int | np.integer) and given >= MIN_PROPOSALS
+        ):
+            raise ModelError(
+                f"n_proposals must be an integer of at least {MIN_PROPOSALS}, got {given!r}"
+            )
+
+    def n_evaluations(self, posterior: Posterior) -> int:
+        """The number of proposals."""
+        return self.n_proposals or min(max(posterior.log_density.size, 1000), 5000)
+
+    def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
+        """Estimate the log-evidence from draws and a log-density that can be evaluated."""
+        n_draws = posterior.log_density.size
+        n_proposals = self.n_evaluations(posterior)
+        first, second = posterior.halves()
+        folds = []
+        for fitted, averaged in ((first, second), (second, first)):
+            proposal = choose_proposal(fitted, n_proposals=n_proposals // 2, rng=rng)
+            folds.append(_estimate_fold(proposal, averaged, n_proposals // 2, rng=rng))
+        se = math.hypot(*(fold.se for fold in folds)) / 2
+        gap = abs(folds[0].log_evidence - folds[1].log_evidence) / math.hypot(
+            *(f.se for f in folds)
         )
-    return Estimate(
-        log_evidence=float(np.mean([fold.log_evidence for fold in folds])),
-        se=math.hypot(*(fold.se for fold in folds)) / 2,
-        scale=float(np.sqrt(folds[0].scale * folds[1].scale)),
-        n_effective_numerator=_effective(fold.n_effective_numerator for fold in folds),
-        n_effective_denominator=_effective(fold.n_effective_denominator for fold in folds),
-        zero_density=float(np.mean([fold.zero_density for fold in folds])),
-        proposals=(*folds[0].proposals, *folds[1].proposals),
-        gap=(folds[0].log_evidence - folds[1].log_evidence) / math.hypot(folds[0].se, folds[1].se),
-    )
+        numerator = _effective(fold.numerator.n_effective for fold in folds)
+        denominator = _effective(fold.denominator.n_effective for fold in folds)
+        return Estimate(
+            log_evidence=float(np.mean([fold.log_evidence for fold in folds])),
+            se=se,
+            settings={
+                "scale": float(np.sqrt(folds[0].scale * folds[1].scale)),
+                "n_draws": n_draws,
+                "n_proposals": n_proposals,
+                "n_effective_numerator": numerator,
+                "n_effective_denominator": denominator,
+                "zero_density": float(np.mean([fold.zero_density for fold in folds])),
+            },
+            doubts=tuple(_doubts(numerator, denominator, gap)),
+        )
+
+
+@dataclass(frozen=True)
+class _Fold:
+    """The estimate from one half of the draws."""
+
+    log_evidence: float
+    scale: float
+    numerator: LogMean
+    denominator: LogMean
+    zero_density: float  # share of the proposals
+
+    @property
+    def se(self) -> float:
+        return math.hypot(self.numerator.error, self.denominator.error)
 
 
 def _estimate_fold(
-    proposal: Proposal,
-    posterior: Posterior,
-    n_proposals: int,
-    *,
-    rng: np.random.Generator,
-    progress: Callable[[int], None],
-) -> Estimate:
+    proposal: Proposal, posterior: Posterior, n_proposals: int, *, rng: np.random.Generator
+) -> _Fold:
     # Numerator: the draws, with the log-densities that their chain stored.
     numerator = log_mean_of_chains(
         proposal.log_arriving(posterior.log_density) + proposal.log_q(posterior.draws)
     )
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
-    batches = []
-    for batch in np.array_split(proposal.sample(n_proposals, rng), min(n_proposals, N_BATCHES)):
-        batches.append(proposal.log_leaving(posterior.evaluate(batch, rng)))
-        progress(len(batch))
-    log_alpha = np.concatenate(batches)
+    log_alpha = proposal.log_leaving(posterior.evaluate(proposal.sample(n_proposals, rng), rng))
     denominator = log_mean_of_independent(log_alpha)
     if np.isneginf(denominator.value):
         raise DataMismatchError(
             f"none of {n_proposals} proposals around the draws has a density: idata belongs to "
             "another model or to other data"
         )
-
-    return Estimate(
-        log_evidence=proposal.log_density - numerator.value + denominator.value,
-        se=float(np.hypot(numerator.error, denominator.error)),
-        scale=proposal.scale,
-        n_effective_numerator=numerator.error**-2,
-        n_effective_denominator=denominator.error**-2,
-        zero_density=float(np.isneginf(log_alpha).mean()),
-        proposals=(proposal,),
-    )
+    log_evidence = proposal.log_density - numerator.value + denominator.value
+    impossible = float(np.isneginf(log_alpha).mean())
+    return _Fold(log_evidence, proposal.scale, numerator, denominator, impossible)
 
 
 def _effective(halves: Iterable[float]) -> float:
@@ -282,17 +227,18 @@ def _effective(halves: Iterable[float]) -> float:
     return 4 / sum(1 / number for number in halves)
 
 
-def _max_log_likelihood(found: Estimate, posterior: Posterior, density: ModelDensity) -> float:
-    if posterior.is_noisy:  # the largest of many noisy values would be the luckiest
-        points = np.stack([proposal.point for proposal in found.proposals])
-        values = np.array([proposal.log_density for proposal in found.proposals])
-    else:
-        points = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-        values = posterior.log_density.ravel()
-    return float((values - density.log_prior(points)).max())
-
-
-def _seconds_per_evaluation(posterior: Posterior) -> float:
-    start = perf_counter()
-    posterior.evaluate(posterior.draws[0, :3], np.random.default_rng(0))
-    return (perf_counter() - start) / 3
+def _doubts(n_draws: float, n_proposals: float, gap: float) -> Iterator[str]:
+    """Reasons for doubt, from the effective numbers and the gap between halves in its errors."""
+    if n_draws < MIN_EFFECTIVE:
+        yield (
+            f"the draws near its central point are worth {n_draws:.0f} independent "
+            f"ones, fewer than {MIN_EFFECTIVE}: draw more"
+        )
+    if n_proposals < MIN_EFFECTIVE:
+        yield (
+            f"the proposals are worth {n_proposals:.0f} independent ones, fewer than "
+            f"{MIN_EFFECTIVE}: raise n_proposals, or give the parameters a scale on which their "
+            "posterior is nearer to a Gaussian"
+        )
+    if gap > MAX_GAP:
+        yield f"the halves of the draws differ by {gap:.1f} of their standard errors"

@@ -6,23 +6,33 @@ transform, vectors and matrices are flattened, and the compiled log-density hold
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import NDArray
 from pymc.model.transform_values import unconstrain_values
-from pymc.pytensorf import compile, join_nonshared_inputs
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.inspection import noise_seeds, smooth_filters, with_filter
+from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.prior import ModelPrior
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats
 MIN_DRAWS = 20
 
 Array = NDArray[np.float64]
+
+
+class Prior(Protocol):
+    """The prior of the free variables on the unconstrained space, Jacobians included."""
+
+    def log_density(self, x: Array) -> Array:
+        """Log-density of points x (m, k), shape (m,); normalised if the priors are."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Independent draws, shape (count, k); a `ModelError` if there is no law to draw from."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +51,15 @@ class Posterior:
         takes fresh noise from `rng` for each.
     is_noisy : bool
         Whether `evaluate` gives something else each time.
+    prior : Prior
+        Everything else in `evaluate` is the likelihood.
     """
 
     draws: Array
     log_density: Array
     evaluate: Callable[[Array, np.random.Generator], Array]
     is_noisy: bool = False
+    prior: Prior | None = None
 
     def halves(self) -> tuple["Posterior", "Posterior"]:
         """Split every chain in the middle."""
@@ -55,61 +68,6 @@ class Posterior:
             replace(self, draws=self.draws[:, :middle], log_density=self.log_density[:, :middle]),
             replace(self, draws=self.draws[:, middle:], log_density=self.log_density[:, middle:]),
         )
-
-
-class ModelDensity:
-    """The compiled log-density of a model over one flat vector, noise seeds as arguments.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    moved : bool
-        Whether the draws' noise was moved along the chain, by the smooth versions of the filters.
-
-    Attributes
-    ----------
-    seed_names : tuple of str
-        The noisy state-space variables, in the order of the columns of a seed array.
-    """
-
-    def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
-        if model.discrete_value_vars:
-            names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
-            raise ModelError(
-                f"model must have continuous free variables only; {names} are discrete: "
-                "sum them out of the likelihood first"
-            )
-        if not model.free_RVs:
-            raise ModelError("model must have at least one free variable, it has none")
-        self.model = model
-        self.moved = moved
-        shared = noise_seeds(model)
-        self.seed_names = tuple(shared)
-        self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
-        seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
-        log_density = model.logp()
-        if moved:
-            (log_density,) = with_filter([log_density], model, smooth_filters(model))
-        self._log_density = self._compiled(log_density, seeds)
-        self._log_prior = self._compiled(model.logp(vars=model.free_RVs), {})
-
-    def _compiled(self, output: pt.TensorVariable, seeds: dict) -> Callable:
-        values = [self.model.rvs_to_values[rv] for rv in self.model.free_RVs]
-        (output,), flat = join_nonshared_inputs(self.model.initial_point(), [output], values)
-        function = compile([flat, *seeds.values()], output, givens=seeds, on_unused_input="ignore")
-        function.trust_input = True
-        return function
-
-    def log_density(self, x: Array, seeds: NDArray[np.int64]) -> Array:
-        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf."""
-        rows = [[np.asarray(seed) for seed in row] for row in seeds]
-        values = [self._log_density(point, *row) for point, row in zip(x, rows, strict=True)]
-        found = np.array(values, dtype=np.float64)
-        return np.where(np.isnan(found), -np.inf, found)
-
-    def log_prior(self, x: Array) -> Array:
-        """Log-density of the free variables alone, Jacobians included; x is (m, k)."""
-        return np.array([self._log_prior(point) for point in x], dtype=np.float64)
 
 
 def noise_was_moved(idata: xr.DataTree) -> bool:
@@ -216,7 +174,8 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
         size = (len(x), seeds.shape[-1])
         return density.log_density(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
-    return Posterior(draws, log_density, evaluate, is_noisy=not held), noise
+    prior = ModelPrior(density.model)
+    return Posterior(draws, log_density, evaluate, is_noisy=not held, prior=prior), noise
 
 
 def _stored_seeds(

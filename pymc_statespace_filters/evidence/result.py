@@ -23,7 +23,7 @@ class Evidence:
         Natural logarithm of the evidence (thesis, Eq. 3.5), priors normalised as the PyMC model
         states them: a Uniform prior contributes its volume.
     se : float
-        Numerical standard error of `log_evidence`, in nats.
+        Numerical standard error of `log_evidence`, in nats; NaN where the estimator has none.
     estimator : str
         Name of the function that made it.
     n_parameters : int
@@ -40,6 +40,8 @@ class Evidence:
         evidence that of its expectation. "held": the chains kept one noise seed, and this is that
         seed's evidence; `se` then lacks the error of the filter, which takes whole chains at
         several seeds.
+    doubts : str
+        Why the error may be larger than `se` says; empty if nothing speaks for that.
 
     Examples
     --------
@@ -56,12 +58,13 @@ class Evidence:
     max_log_likelihood: float
     data_fingerprint: str
     noise: str = "none"
+    doubts: str = ""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.log_evidence):
             raise ModelError(f"log_evidence must be a finite number, got {self.log_evidence!r}")
-        if not (math.isfinite(self.se) and self.se >= 0):
-            raise ModelError(f"se must be a finite number >= 0, got {self.se!r}")
+        if not (math.isnan(self.se) or 0 <= self.se < math.inf):
+            raise ModelError(f"se must be a finite number >= 0 or NaN, got {self.se!r}")
         if self.n_parameters < 0 or self.n_observations < 0:
             raise ModelError(
                 "n_parameters and n_observations must be counts, "

@@ -1,5 +1,6 @@
 """Machine code with a name or an address, called from other machine code; it knows no system."""
 
+from pymc_statespace_filters.machine_code.cores import available_cores
 from pymc_statespace_filters.machine_code.entries import (
     COUNTS,
     NUMBERS,
@@ -19,6 +20,7 @@ __all__ = [
     "Entry",
     "NativeFunction",
     "address_of",
+    "available_cores",
     "call_address",
     "digest",
     "kept",

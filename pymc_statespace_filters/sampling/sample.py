@@ -17,6 +17,7 @@ from pytensor.graph.basic import Variable
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.machine_code import available_cores
 from pymc_statespace_filters.sampling import statistics
 from pymc_statespace_filters.sampling.chain_arrays import STAGE
 from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
@@ -29,7 +30,6 @@ from pymc_statespace_filters.sampling.runs import ChainRun, Plan, run_chains
 from pymc_statespace_filters.sampling.settings import DRAMSettings, is_count
 from pymc_statespace_filters.sampling.target import Target
 
-_HAS_AFFINITY = hasattr(os, "sched_getaffinity")  # not on macOS
 _SHOWN_DIGITS = 16  # of a fingerprint: 64 bits, in a file and in messages
 
 
@@ -264,7 +264,7 @@ def _check_initvals(model: Model, initvals: Any, chains: int) -> None:
 
 def _checked_cores(cores: object, chains: int) -> int:
     if cores is None:
-        return min(chains, len(os.sched_getaffinity(0)) if _HAS_AFFINITY else os.cpu_count() or 1)
+        return min(chains, available_cores())
     if not is_count(cores) or cores < 1:
         raise ModelError(f"cores={cores!r}: expected an integer, at least 1, or None")
     return cores

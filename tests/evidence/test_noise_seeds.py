@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence import chib_jeliazkov, posterior
+from pymc_statespace_filters.evidence import chib_jeliazkov, density
 
 SD = 1.2
 Y = 0.7
@@ -42,7 +42,7 @@ def _seeds_are_found(monkeypatch):
     def noise_seeds(model):
         return {"d": model.seed} if hasattr(model, "seed") else {}
 
-    monkeypatch.setattr(posterior, "noise_seeds", noise_seeds)
+    monkeypatch.setattr(density, "noise_seeds", noise_seeds)
 
 
 def log_density(mu, seed):

@@ -6,11 +6,8 @@ import pymc as pm
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.posterior import (
-    ModelDensity,
-    posterior_of,
-    unconstrained_draws,
-)
+from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior import posterior_of, unconstrained_draws
 
 DATA = np.array([0.3, 1.2, 0.8])
 

@@ -1,0 +1,49 @@
+"""A progress bar for evaluations of a log-density, whoever asks for them."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from time import perf_counter
+
+from pymc.progress_bar import create_simple_progress
+
+from pymc_statespace_filters.evidence.density import ModelDensity
+
+PATIENCE = 2.0  # seconds without a progress bar
+
+
+class _Bar:
+    """A bar that appears once its task has taken two seconds, and goes with the next task."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self.announce("", 0)
+
+    def announce(self, task: str, total: int) -> None:
+        """Name what is evaluated next, and about how many evaluations that takes."""
+        self._stack.close()
+        self._task, self._total = task, total
+        self._done, self._start = 0, perf_counter()
+        self._shown: tuple | None = None
+
+    def advance(self, count: int) -> None:
+        self._done += count
+        if self._shown is None and perf_counter() - self._start > PATIENCE:
+            bar = self._stack.enter_context(create_simple_progress())
+            self._shown = bar, bar.add_task(self._task, completed=0, total=self._total)
+            count = self._done
+        if self._shown is not None:
+            bar, task = self._shown
+            bar.advance(task, advance=count)
+
+
+@contextmanager
+def watched(density: ModelDensity, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
+    """Show how many evaluations were made, and for what.
+
+    Gives the function that names what comes next and about how many evaluations it will make.
+    """
+    with ExitStack() as stack:
+        bar = _Bar(stack)
+        if enabled:
+            density.watch = bar.advance
+        yield bar.announce

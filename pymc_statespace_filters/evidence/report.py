@@ -1,0 +1,94 @@
+"""From draws and a model to `Evidence`: what every estimator has in common."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from pymc_statespace_filters.errors import EvidenceWarning
+from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
+from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.diagnostics import doubts_of_draws
+from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
+from pymc_statespace_filters.evidence.posterior import Posterior, noise_was_moved, posterior_of
+from pymc_statespace_filters.evidence.progress import watched
+from pymc_statespace_filters.evidence.result import Evidence, store_evidence
+
+
+class Estimator(Protocol):
+    """The evidence from draws of a posterior, and a log-density that can be evaluated."""
+
+    def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
+        """Estimate the log-evidence."""
+
+    def n_evaluations(self, posterior: Posterior) -> int:
+        """About how many evaluations of the log-density it will take."""
+
+
+def evidences_of(
+    idata: xr.DataTree,
+    model: pm.Model | None,
+    estimators: Mapping[str, Estimator],
+    *,
+    random_seed: int | np.random.Generator | None,
+    extend_inferencedata: bool,
+    progressbar: bool,
+) -> dict[str, Evidence]:
+    """Run estimators on the same draws and report each as an `Evidence`.
+
+    Parameters
+    ----------
+    idata, model, random_seed, extend_inferencedata, progressbar
+        As in `chib_jeliazkov`.
+    estimators : mapping of str to Estimator
+        By the name that the result will carry.
+
+    Returns
+    -------
+    dict of str to Evidence
+
+    Warns
+    -----
+    EvidenceWarning
+        For each estimate with doubts, with all of them.
+    """
+    density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
+    posterior, noise = posterior_of(idata, density)
+    of_draws = tuple(doubts_of_draws(posterior))
+    rng = np.random.default_rng(random_seed)
+    with watched(density, enabled=progressbar) as announce:
+        estimates = {}
+        for name, estimator in estimators.items():
+            announce(name, estimator.n_evaluations(posterior))
+            estimates[name] = estimator.estimate(posterior, rng=rng)
+        announce("maximum likelihood", N_EVALUATIONS)
+        largest = max_log_likelihood(posterior, rng)
+
+    found = {}
+    for name, estimate in estimates.items():
+        doubts = (*of_draws, *estimate.doubts)
+        found[name] = Evidence(
+            log_evidence=estimate.log_evidence,
+            se=estimate.se,
+            estimator=name,
+            n_parameters=posterior.draws.shape[-1],
+            n_observations=observation_count(density.model),
+            max_log_likelihood=largest,
+            data_fingerprint=data_fingerprint(density.model),
+            noise=noise,
+            doubts="; ".join(doubts),
+        )
+        if doubts:
+            warnings.warn(
+                f"log-evidence {estimate.log_evidence:.2f} ({name}) is less certain than its error "
+                f"says: {found[name].doubts}",
+                EvidenceWarning,
+                stacklevel=4,
+            )
+        if extend_inferencedata:
+            store_evidence(idata, found[name], dict(estimate.settings))
+    return found
