@@ -8,6 +8,7 @@ import pytest
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior import posterior_of, unconstrained_draws
+from pymc_statespace_filters.evidence.prior import ModelPrior
 
 DATA = np.array([0.3, 1.2, 0.8])
 
@@ -72,7 +73,7 @@ def test_log_density_is_that_of_the_model_with_jacobians(idata, model, density):
     assert posterior.log_density[1, 7] == pytest.approx(expected, rel=1e-12)
     assert posterior.evaluate(x[None], np.random.default_rng(0))[0] == pytest.approx(expected)
     likelihood = model.compile_logp(vars=model.observed_RVs)(point)
-    assert expected - density.log_prior(x[None])[0] == pytest.approx(likelihood)
+    assert expected - ModelPrior(density.model).log_density(x[None])[0] == pytest.approx(likelihood)
 
 
 def test_no_density_is_minus_infinity_never_nan(density):
