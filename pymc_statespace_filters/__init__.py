@@ -16,6 +16,7 @@ from pymc_statespace_filters.evidence import (
     Evidence,
     chib_jeliazkov,
     compare_evidence,
+    estimate_evidence,
 )
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
@@ -49,6 +50,7 @@ __all__ = [
     "chib_jeliazkov",
     "compare_evidence",
     "cubic",
+    "estimate_evidence",
     "freeplay",
     "hysteresis",
     "log_likelihood",

@@ -2,6 +2,14 @@
 
 from pymc_statespace_filters.evidence.chib_jeliazkov import chib_jeliazkov
 from pymc_statespace_filters.evidence.comparison import DimensionCorrection, compare_evidence
+from pymc_statespace_filters.evidence.estimators import EvidenceEstimates, estimate_evidence
 from pymc_statespace_filters.evidence.result import Evidence
 
-__all__ = ["DimensionCorrection", "Evidence", "chib_jeliazkov", "compare_evidence"]
+__all__ = [
+    "DimensionCorrection",
+    "Evidence",
+    "EvidenceEstimates",
+    "chib_jeliazkov",
+    "compare_evidence",
+    "estimate_evidence",
+]

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from typing import Protocol
+from zlib import crc32
 
 import numpy as np
 import pymc as pm
@@ -17,6 +18,8 @@ from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, m
 from pymc_statespace_filters.evidence.posterior import Posterior, noise_was_moved, posterior_of
 from pymc_statespace_filters.evidence.progress import watched
 from pymc_statespace_filters.evidence.result import Evidence, store_evidence
+
+MAXIMUM = "maximum likelihood"
 
 
 class Estimator(Protocol):
@@ -59,14 +62,19 @@ def evidences_of(
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
     of_draws = tuple(doubts_of_draws(posterior))
-    rng = np.random.default_rng(random_seed)
+    entropy = np.random.default_rng(random_seed).integers(2**63, size=2)
+
+    def stream(name: str) -> np.random.Generator:
+        """The same for an estimator whatever the others are."""
+        return np.random.default_rng([*entropy, crc32(name.encode())])
+
     with watched(density, enabled=progressbar) as announce:
         estimates = {}
         for name, estimator in estimators.items():
             announce(name, estimator.n_evaluations(posterior))
-            estimates[name] = estimator.estimate(posterior, rng=rng)
-        announce("maximum likelihood", N_EVALUATIONS)
-        largest = max_log_likelihood(posterior, rng)
+            estimates[name] = estimator.estimate(posterior, rng=stream(name))
+        announce(MAXIMUM, N_EVALUATIONS)
+        largest = max_log_likelihood(posterior, stream(MAXIMUM))
 
     found = {}
     for name, estimate in estimates.items():

@@ -1,0 +1,143 @@
+"""Several estimators on the same draws, and whether they agree."""
+
+import warnings
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import xarray as xr
+
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
+from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.report import Estimator, evidences_of
+from pymc_statespace_filters.evidence.result import Evidence
+
+ESTIMATORS: Mapping[str, Estimator] = {
+    "chib_jeliazkov": ChibJeliazkov(),
+}
+
+
+class EvidenceEstimates(dict[str, Evidence]):
+    """What `estimate_evidence` found, by estimator: a dictionary that is shown as a table.
+
+    Attributes
+    ----------
+    agreement : Agreement
+        True if the estimates agree.
+    """
+
+    @property
+    def agreement(self) -> Agreement:
+        """Whether the estimates agree, and the likely cause if they do not."""
+        return agreement_of(self)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Index ``estimator``; columns ``log_evidence``, ``se``, ``doubts``."""
+        rows = {
+            name: {"log_evidence": e.log_evidence, "se": e.se, "doubts": e.doubts}
+            for name, e in self.items()
+        }
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("estimator")
+
+    def __repr__(self) -> str:
+        return f"{self.to_dataframe()}\n{self._verdict()}"
+
+    def _repr_html_(self) -> str:
+        return f"{self.to_dataframe().to_html()}<p>{self._verdict()}</p>"
+
+    def _verdict(self) -> str:
+        judged = sum(np.isfinite(e.se) for e in self.values())
+        if judged < 2:
+            return "one estimate with an error: nothing to compare it with"
+        if self.agreement:
+            return f"the estimates agree within {self.agreement.difference:.3f} nats"
+        return f"the estimates disagree: {self.agreement.reading}"
+
+
+def estimate_evidence(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    estimators: Iterable[str] = ("chib_jeliazkov", "bridge"),
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+    progressbar: bool = True,
+) -> EvidenceEstimates:
+    """Estimate the evidence of a model in several ways, and see whether they agree.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Posterior draws by any sampler, as for `chib_jeliazkov`.
+    model : pymc.Model, optional
+        The model that was sampled; by default that of the ``with`` block.
+    estimators : iterable of str
+        Any of "chib_jeliazkov", "bridge" (bridge sampling from a normal), "warp_bridge" (from a
+        normal that is moved, scaled and mirrored, for skewed posteriors), "importance" (from a
+        mixture of Student-t densities, for several modes), "tempered_smc" (from the prior, needs no
+        draws), "prior_monte_carlo" (the mean likelihood of draws of the prior, for few parameters)
+        and "laplace" (an approximation without error).
+    random_seed : int or numpy.random.Generator, optional
+        Gives each estimator a stream of its own, whatever the others are.
+    extend_inferencedata : bool
+        Also store the results in the group ``evidence`` of `idata`, dimension ``estimator``.
+    progressbar : bool
+        Show one if the evaluations take more than two seconds.
+
+    Returns
+    -------
+    EvidenceEstimates
+        A dictionary of name to `Evidence`, with an ``agreement``.
+
+    Raises
+    ------
+    ModelError
+        If an estimator is unknown, or cannot treat the model.
+    DataMismatchError
+        As `chib_jeliazkov`.
+
+    Warns
+    -----
+    EvidenceWarning
+        If an estimate is doubtful, or if the estimates disagree: p < 0.001 by Cochran's chi-square
+        test, and by more than 0.05 nats. The warning names the likely cause.
+
+    Examples
+    --------
+    >>> import arviz as az
+    >>> import numpy as np
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> normals = np.random.default_rng(1).standard_normal((4, 1000))
+    >>> idata = az.from_dict({"posterior": {"mu": 4 / 13 + normals / np.sqrt(3.25)}})
+    >>> with pm.Model():
+    ...     mu = pm.Normal("mu", 0, 2)
+    ...     _ = pm.Normal("y", mu, 1, observed=[0.3, -0.4, 1.1])
+    ...     found = psf.estimate_evidence(idata, random_seed=2)
+    >>> bool(found.agreement)
+    True
+    """
+    names = [estimators] if isinstance(estimators, str) else list(estimators)
+    if not names or not set(names) <= set(ESTIMATORS):
+        raise ModelError(
+            f"estimators must name at least one of {list(ESTIMATORS)} and nothing else, got {names}"
+        )
+    found = EvidenceEstimates(
+        evidences_of(
+            idata,
+            model,
+            {name: ESTIMATORS[name] for name in names},
+            random_seed=random_seed,
+            extend_inferencedata=extend_inferencedata,
+            progressbar=progressbar,
+        )
+    )
+    if not found.agreement:
+        warnings.warn(
+            f"the estimates of the log-evidence disagree: {found.agreement.reading}",
+            EvidenceWarning,
+            stacklevel=2,
+        )
+    return found

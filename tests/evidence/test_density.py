@@ -1,0 +1,122 @@
+"""A log-density at many points: the model's own, whoever evaluates it and in how many threads."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.compile.ops import wrap_py
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.evidence import density as module
+from pymc_statespace_filters.evidence.density import ModelDensity
+from tests.sampling.autoregression import autoregression
+
+DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])
+
+
+def model_of(*filters):
+    with pm.Model() as model:
+        phi = pm.Normal("phi", 0.5, 0.3, shape=2)
+        for i, filter in enumerate(filters):
+            system = autoregression(process_noise=[[0.5]])
+            psf.StateSpace(
+                f"d{i}",
+                system,
+                filter,
+                params={"phi": phi[i % 2]},
+                steps=range(1, 9),
+                observed=DATA,
+            )
+    return model
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return ModelDensity(model_of(psf.BootstrapPF(20), psf.BootstrapPF(30)))
+
+
+@pytest.fixture(scope="module")
+def points():
+    rng = np.random.default_rng(1)
+    return rng.normal(0.5, 0.3, (23, 2)), rng.integers(2**62, size=(23, 2))
+
+
+def test_each_point_has_its_own_seeds(noisy, points):
+    x, seeds = points
+    found = noisy.log_density(x, seeds)
+    shared = psf.inspection.noise_seeds(noisy.model)
+    log_density = noisy.model.compile_logp()
+    for i in (0, 7, 22):
+        for column, seed in enumerate(shared.values()):
+            seed.set_value(seeds[i, column])
+        assert found[i] == pytest.approx(log_density({"phi": x[i]}), rel=1e-12)
+
+
+@pytest.mark.parametrize("n_threads", [1, 2, 5, 40])
+def test_threads_do_not_matter(noisy, points, n_threads, monkeypatch):
+    expected = noisy.log_density(*points)
+    monkeypatch.setattr(module, "available_cores", lambda: n_threads)
+    np.testing.assert_array_equal(noisy.log_density(*points), expected)
+
+
+def test_no_points_no_values(noisy):
+    assert noisy.log_density(np.empty((0, 2)), np.empty((0, 2), dtype=np.int64)).shape == (0,)
+
+
+def test_the_watch_hears_of_every_point(noisy, points, monkeypatch):
+    counts = []
+    monkeypatch.setattr(noisy, "watch", counts.append)
+    noisy.log_density(*points)
+    assert sum(counts) == 23
+
+
+def test_failed_estimates_are_minus_infinity():
+    density = ModelDensity(model_of(psf.EKF()))
+    with np.errstate(over="ignore"):
+        found = density.log_density(np.array([[0.5, 0.5], [1e300, 0.5]]), np.empty((2, 0)))
+    assert np.isfinite(found[0])
+    assert np.isneginf(found[1])
+
+
+def python_model(function):
+    """A model whose likelihood is a Python function, which machine code calls back."""
+    wrapped = wrap_py([pt.dscalar], [pt.dscalar])(function)
+    with pm.Model() as model:
+        pm.Potential("p", wrapped(pm.Normal("x", 0, 1)))
+    return model
+
+
+@pytest.mark.filterwarnings("ignore:Numba will use object mode")
+def test_an_exception_of_the_model_is_raised():
+    def picky(x):
+        if x > 1.0:
+            raise ArithmeticError("too large")
+        return np.asarray(x)
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        density = ModelDensity(python_model(picky))
+    seeds = np.empty((3, 0))
+    assert np.isfinite(density.log_density(np.zeros((3, 1)), seeds)).all()
+    with pytest.raises(ArithmeticError, match="too large"):
+        density.log_density(np.array([[0.0], [2.0], [0.5]]), seeds)
+
+
+def test_an_interrupt_stops_all_threads():
+    def slow(x):
+        time.sleep(0.01)
+        return np.asarray(x)
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        density = ModelDensity(python_model(slow))
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    start = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt):
+        density.log_density(np.zeros((10_000, 1)), np.empty((10_000, 0)))
+    assert time.perf_counter() - start < 20.0  # all of them take 100 s

@@ -1,0 +1,118 @@
+"""Several estimators at once: the names, the streams, the verdict."""
+
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.agreement import agreement_of
+from pymc_statespace_filters.evidence.estimators import ESTIMATORS, EvidenceEstimates
+from tests.evidence.test_models import REGRESSION, exact_draws
+
+ALL = tuple(ESTIMATORS)
+WITH_ERROR = tuple(name for name in ALL if name != "laplace")
+
+
+@pytest.fixture(scope="module")
+def model():
+    with pm.Model() as model:
+        w = pm.Normal("w", 0, REGRESSION.scale, shape=4)
+        pm.Normal("y", REGRESSION.x @ w, REGRESSION.sd, observed=REGRESSION.y)
+    return model
+
+
+@pytest.fixture(scope="module")
+def idata():
+    return exact_draws((4, 1000))
+
+
+@pytest.fixture(scope="module")
+def found(idata, model):
+    with warnings.catch_warnings():
+        # Four parameters under a wide prior are too many for the mean likelihood of its draws.
+        warnings.filterwarnings("ignore", r".*prior_monte_carlo.*", EvidenceWarning)
+        return psf.estimate_evidence(idata, model, estimators=ALL, random_seed=5)
+
+
+def test_every_estimator_meets_the_truth(found):
+    assert tuple(found) == ALL
+    for name, evidence in found.items():
+        assert evidence.estimator == name
+        if name == "laplace":  # exact, for this posterior is a Gaussian
+            assert np.isnan(evidence.se)
+            assert evidence.log_evidence == pytest.approx(REGRESSION.log_evidence, abs=1e-4)
+        else:
+            assert 0 < evidence.se < (2.0 if name == "prior_monte_carlo" else 0.3)
+            assert abs(evidence.log_evidence - REGRESSION.log_evidence) < 4 * evidence.se
+    assert found.agreement
+
+
+def test_all_are_stored_beside_the_draws(found, idata):
+    group = idata["evidence"].to_dataset()
+    assert tuple(group["estimator"].values) == ALL
+    for name, evidence in found.items():
+        assert group["log_evidence"].sel(estimator=name).item() == evidence.log_evidence
+
+
+def test_an_estimate_does_not_depend_on_its_company(found, idata, model):
+    alone = psf.chib_jeliazkov(idata, model, random_seed=5, extend_inferencedata=False)
+    assert alone.log_evidence == found["chib_jeliazkov"].log_evidence
+
+
+def test_a_single_name_will_do(idata, model):
+    (name,) = psf.estimate_evidence(idata, model, estimators="chib_jeliazkov", random_seed=1)
+    assert name == "chib_jeliazkov"
+
+
+@pytest.mark.parametrize("names", [[], ["bridge", "harmonic_mean"]])
+def test_unknown_names(idata, model, names):
+    with pytest.raises(ModelError, match=r"estimators must name at least one of \['chib_j"):
+        psf.estimate_evidence(idata, model, estimators=names)
+
+
+def evidence(name, log_evidence, se):
+    return psf.Evidence(log_evidence, se, name, 2, 10, -3.0, "0c5f")
+
+
+def estimates(**values):
+    return EvidenceEstimates({name: evidence(name, *value) for name, value in values.items()})
+
+
+class TestAgreement:
+    def test_chi_square_by_hand(self):
+        found = agreement_of(estimates(bridge=(-10.0, 0.3), importance=(-10.8, 0.4)))
+        assert found.p_value == pytest.approx(0.10960, abs=1e-5)  # z = 0.8 / 0.5 = 1.6
+        assert found.difference == pytest.approx(0.8)
+        assert found
+
+    def test_what_no_choice_depends_on_is_agreement(self):
+        assert agreement_of(estimates(bridge=(-10.0, 0.001), importance=(-10.04, 0.001)))
+
+    def test_estimates_without_errors_take_no_part(self):
+        found = estimates(bridge=(-10.0, 0.01), laplace=(-12.0, np.nan))
+        assert found.agreement
+        assert "nothing to compare it with" in repr(found)
+
+    def test_an_error_of_zero(self):
+        assert agreement_of(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
+
+    @pytest.mark.parametrize(
+        ("values", "reading"),
+        [
+            ({"bridge": (-10.0, 0.01), "tempered_smc": (-9.0, 0.1)}, "not visited all"),
+            ({"bridge": (-10.0, 0.01), "tempered_smc": (-11.0, 0.1)}, "missed a narrow peak"),
+            ({"bridge": (-10.0, 0.01), "importance": (-11.0, 0.1)}, "draws are too few"),
+            (
+                {"prior_monte_carlo": (-10.0, 0.01), "tempered_smc": (-11.0, 0.1)},
+                "too narrow in its prior",
+            ),
+        ],
+    )
+    def test_readings(self, values, reading):
+        found = estimates(**values)
+        assert not found.agreement
+        assert reading in found.agreement.reading
+        assert reading in repr(found)
