@@ -14,6 +14,7 @@ from pymc_statespace_filters.errors import (
 from pymc_statespace_filters.evidence import (
     DimensionCorrection,
     Evidence,
+    average_models,
     chib_jeliazkov,
     compare_evidence,
     estimate_evidence,
@@ -47,6 +48,7 @@ __all__ = [
     "StateSpace",
     "StateSpaceFiltersError",
     "StateSpaceModel",
+    "average_models",
     "chib_jeliazkov",
     "compare_evidence",
     "cubic",

@@ -1,0 +1,249 @@
+"""What all models say together: a mixture of their draws by probability (thesis, Eq. 3.8)."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from pymc_statespace_filters.errors import ModelError
+
+N_NORMALS = 50_000
+SAMPLE_DIMS = ("chain", "draw")
+
+Array = NDArray[np.float64]
+Function = Callable[[xr.Dataset], xr.DataArray]
+
+
+def average_models(
+    idatas: Mapping[str, xr.DataTree],
+    weights: pd.DataFrame | Mapping[str, float],
+    function: Function | Mapping[str, Function],
+    *,
+    n_draws: int = 4000,
+    random_seed: int | np.random.Generator | None = None,
+) -> xr.DataTree:
+    """Average a quantity over rival models, each with its probability (thesis, Eq. 3.8).
+
+    The average is a mixture of draws, not a weighted mean of curves: it keeps the spread within the
+    models and that between them.
+
+    Parameters
+    ----------
+    idatas : mapping of str to xarray.DataTree
+        Draws of the rival models, in their groups ``posterior``.
+    weights : pandas.DataFrame or mapping of str to float
+        The table of `compare_evidence`, or one weight >= 0 for each model (normalised here). With
+        the table, the errors of the log-evidences count too: a draw comes from a model with the
+        probability averaged over them.
+    function : callable, or mapping of str to callable
+        Takes the posterior of a model and gives the quantity, dims ``chain``, ``draw`` and others,
+        the same for all models; one for each model if their parameters differ. It may return
+        other draws than those of the posterior: states or forecasts of some of them.
+    n_draws : int
+        Draws of the mixture.
+    random_seed : None, int or numpy.random.Generator
+
+    Returns
+    -------
+    xarray.DataTree
+        ``posterior``: the mixture, named as the function names its array (``average`` if it does
+        not, or not alike), dims chain (1), draw (`n_draws`) and the function's own; coordinate
+        ``model`` (chain, draw): where a draw is from. ``members``: the same under each model alone,
+        dims model, chain (1), draw (as many for each, none twice, `n_draws` at most) and the
+        function's own; coordinate ``prob`` (model): the share of the mixture that was aimed at.
+
+    Raises
+    ------
+    ModelError
+        If an argument is wrong, or if the models' arrays disagree in dims, shape or coordinates.
+
+    Notes
+    -----
+    Numbers of draws by model, and the draws within a model, are chosen systematically, evenly
+    along the chains, and shuffled then. Their order has therefore lost the autocorrelation of the
+    chains: judge convergence by the chains themselves.
+
+    Examples
+    --------
+    >>> import arviz as az
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import average_models
+    >>> rng = np.random.default_rng(1)
+    >>> linear = az.from_dict({"posterior": {"k": rng.normal(2.0, 0.1, (4, 500))}})
+    >>> cubic = az.from_dict({"posterior": {"c": rng.normal(0.5, 0.1, (4, 500))}})
+    >>> x = xr.DataArray(np.linspace(-2, 2, 5), coords=[("x", np.linspace(-2, 2, 5))])
+    >>> force = average_models(
+    ...     {"linear": linear, "cubic": cubic},
+    ...     {"linear": 0.25, "cubic": 0.75},
+    ...     {"linear": lambda post: post["k"] * x, "cubic": lambda post: post["c"] * x**3},
+    ...     random_seed=2,
+    ... )
+    >>> force["posterior"]["average"].sizes
+    Frozen({'chain': 1, 'draw': 4000, 'x': 5})
+    >>> force["posterior"]["average"].mean(["chain", "draw"]).round(1).values
+    array([-4. , -0.9,  0. ,  0.9,  4. ])
+    """
+    names = _names(idatas)
+    if not (isinstance(n_draws, int | np.integer) and n_draws >= 1):
+        raise ModelError(f"n_draws must be an integer >= 1, got {n_draws!r}")
+    rng = np.random.default_rng(random_seed)
+    prob = _probabilities(weights, names, rng)
+    arrays = _arrays(idatas, function)
+    samples = {name: _flat(array) for name, array in arrays.items()}
+
+    counts = _counts(prob, n_draws, rng)
+    chosen = [
+        sample[_spread(len(sample), count, rng)]
+        for sample, count in zip(samples.values(), counts, strict=True)
+    ]
+    origin = np.repeat(names, counts)
+    order = rng.permutation(n_draws)
+    n_alone = min(n_draws, *(len(sample) for sample in samples.values()))
+    alone = np.stack([sample[_spread(len(sample), n_alone, rng)] for sample in samples.values()])
+
+    label, dims, coords = _form(arrays)
+    posterior = xr.Dataset(
+        {label: ((*SAMPLE_DIMS, *dims), np.concatenate(chosen)[order][None])},
+        coords={"chain": [0], "draw": np.arange(n_draws), **coords},
+    ).assign_coords(model=(SAMPLE_DIMS, origin[order][None]))
+    members = xr.Dataset(
+        {label: (("model", *SAMPLE_DIMS, *dims), alone[:, None])},
+        coords={"model": names, "chain": [0], "draw": np.arange(n_alone), **coords},
+    ).assign_coords(prob=("model", prob))
+    return xr.DataTree.from_dict({"posterior": posterior, "members": members})
+
+
+def _names(idatas: Mapping[str, xr.DataTree]) -> list[str]:
+    if not isinstance(idatas, Mapping) or not idatas:
+        raise ModelError(
+            "idatas must be a mapping of model names to DataTree with at least one entry, "
+            f"got {idatas!r}"
+        )
+    for name, idata in idatas.items():
+        if not (isinstance(idata, xr.DataTree) and "posterior" in idata.children):
+            raise ModelError(
+                f"idatas[{name!r}] must be a DataTree with a group 'posterior', got {idata!r}"
+            )
+    return list(idatas)
+
+
+def _probabilities(
+    weights: pd.DataFrame | Mapping[str, float], names: list[str], rng: np.random.Generator
+) -> Array:
+    """Probabilities of the models; from a table, their mean over errors of the log-evidences."""
+    if isinstance(weights, pd.DataFrame):
+        if not {"prob", "se"} <= set(weights.columns):
+            raise ModelError(
+                "weights must have the columns 'prob' and 'se' of compare_evidence, "
+                f"got {list(weights.columns)}"
+            )
+        given, se = _matched(weights["prob"], names), _matched(weights["se"], names)
+        if np.isnan(se).any():
+            raise ModelError(
+                f"weights has no standard error for {names[int(np.isnan(se).argmax())]!r}: pass "
+                "dict(table['prob']) to average with the probabilities as they are"
+            )
+    elif isinstance(weights, Mapping):
+        given, se = _matched(weights, names), np.zeros(len(names))
+    else:
+        raise ModelError(
+            "weights must be the table of compare_evidence or a mapping of model names to "
+            f"numbers, got {weights!r}"
+        )
+    if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
+        got = dict(zip(names, given.tolist(), strict=True))
+        raise ModelError(f"weights must be finite and >= 0, one of them > 0, got {got}")
+    if not se.any():
+        return given / given.sum()
+    with np.errstate(divide="ignore"):
+        log_weight = np.log(given)
+    errors = se * rng.standard_normal((N_NORMALS, len(names)))
+    return softmax(log_weight + errors, axis=1).mean(axis=0)
+
+
+def _matched(weights: pd.Series | Mapping[str, float], names: list[str]) -> Array:
+    models = list(weights.keys())
+    if len(models) != len(names) or set(models) != set(names):
+        raise ModelError(f"weights must be of exactly the models {names}, got those of {models}")
+    return np.array([weights[name] for name in names], dtype=np.float64)
+
+
+def _arrays(
+    idatas: Mapping[str, xr.DataTree], function: Function | Mapping[str, Function]
+) -> dict[str, xr.DataArray]:
+    """Compute the quantity under every model, and see that all are of one form."""
+    if isinstance(function, Mapping) and set(function) != set(idatas):
+        raise ModelError(
+            f"function must be given for exactly the models {list(idatas)}, got {list(function)}"
+        )
+    arrays = {}
+    for name, idata in idatas.items():
+        of_model = function[name] if isinstance(function, Mapping) else function
+        try:
+            array = of_model(idata["posterior"].to_dataset())
+        except Exception as error:
+            error.add_note(f"raised by function with the posterior of model {name!r}")
+            raise
+        if not (isinstance(array, xr.DataArray) and set(SAMPLE_DIMS) <= set(array.dims)):
+            raise ModelError(
+                "function must return a DataArray with dims 'chain' and 'draw', for model "
+                f"{name!r} it returned {array!r}"
+            )
+        arrays[name] = array
+
+    first, reference = next(iter(arrays.items()))
+    for name, array in arrays.items():
+        difference = _difference(_without_samples(reference), _without_samples(array))
+        if difference:
+            raise ModelError(f"function returned for {first!r} and {name!r} {difference}")
+    return {name: array.transpose(*SAMPLE_DIMS, *_own(reference)) for name, array in arrays.items()}
+
+
+def _difference(one: xr.DataArray, other: xr.DataArray) -> str:
+    """Say in what two arrays differ besides their values; nothing if they do not."""
+    if set(one.dims) != set(other.dims):
+        return f"arrays of different dims, {one.dims} and {other.dims}"
+    for dim in one.dims:
+        if one.sizes[dim] != other.sizes[dim]:
+            return f"arrays of different length along {dim!r}, {one.sizes[dim]}, {other.sizes[dim]}"
+        if (dim in one.coords) != (dim in other.coords) or not one[dim].equals(other[dim]):
+            return f"arrays with different coordinates along {dim!r}"
+    return ""
+
+
+def _form(arrays: Mapping[str, xr.DataArray]) -> tuple[str, tuple, dict]:
+    """Return name, dims and coordinates of the average."""
+    labels = {array.name for array in arrays.values()}
+    label = labels.pop() if len(labels) == 1 else None
+    reference = _without_samples(next(iter(arrays.values())))
+    return str(label or "average"), reference.dims, dict(reference.coords)
+
+
+def _own(array: xr.DataArray) -> tuple:
+    return tuple(dim for dim in array.dims if dim not in SAMPLE_DIMS)
+
+
+def _without_samples(array: xr.DataArray) -> xr.DataArray:
+    of_samples = [name for name, coord in array.coords.items() if {*SAMPLE_DIMS} & {*coord.dims}]
+    return array.drop_vars(of_samples).isel(chain=0, draw=0)
+
+
+def _flat(array: xr.DataArray) -> NDArray:
+    """Return the draws of all chains one after the other."""
+    return array.values.reshape(-1, *array.shape[2:])
+
+
+def _counts(prob: Array, n_draws: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Share out the draws systematically: less than one away from n_draws times the probability."""
+    edges = np.concatenate([[0.0], np.cumsum(prob)])
+    return np.diff(np.floor(n_draws * edges / edges[-1] + rng.random())).astype(np.int64)
+
+
+def _spread(n_available: int, n_wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Choose draws evenly along the chains, with numbers of copies that differ by one at most."""
+    places = (np.arange(n_wanted) + rng.random()) * (n_available / max(n_wanted, 1))
+    return np.minimum(places.astype(np.int64), n_available - 1)
