@@ -18,6 +18,7 @@ from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, m
 from pymc_statespace_filters.evidence.posterior import Posterior, noise_was_moved, posterior_of
 from pymc_statespace_filters.evidence.progress import watched
 from pymc_statespace_filters.evidence.result import Evidence, store_evidence
+from pymc_statespace_filters.evidence.support import Support
 
 MAXIMUM = "maximum likelihood"
 
@@ -61,7 +62,8 @@ def evidences_of(
     """
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
-    of_draws = tuple(doubts_of_draws(posterior))
+    support = Support.of(density.model)
+    of_all = (*support.doubts(), *doubts_of_draws(posterior))
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2)
 
     def stream(name: str) -> np.random.Generator:
@@ -78,7 +80,7 @@ def evidences_of(
 
     found = {}
     for name, estimate in estimates.items():
-        doubts = (*of_draws, *estimate.doubts)
+        doubts = (*of_all, *estimate.doubts)
         found[name] = Evidence(
             log_evidence=estimate.log_evidence,
             se=estimate.se,
@@ -89,6 +91,9 @@ def evidences_of(
             data_fingerprint=data_fingerprint(density.model),
             noise=noise,
             doubts="; ".join(doubts),
+            log_volume=support.log_volume,
+            uniform=support.uniform,
+            improper=support.improper,
         )
         if doubts:
             warnings.warn(

@@ -41,7 +41,17 @@ class Evidence:
         seed's evidence; `se` then lacks the error of the filter, which takes whole chains at
         several seeds.
     doubts : str
-        Why the error may be larger than `se` says; empty if nothing speaks for that.
+        Why the error may be larger than `se` says, or the number depend on more than model and
+        data; empty if nothing speaks for that.
+    log_volume : float
+        Sum of the log widths of the Uniform priors of constant bounds, over their scalars:
+        ``log_evidence + log_volume`` is the integral under a density of one on the same supports,
+        the number of the thesis (Eq. 3.7).
+    uniform : str
+        Names of the variables with such priors, separated by commas.
+    improper : str
+        Names of the free variables whose prior is improper, as ``pm.Flat``, or is not normalised,
+        as under an ordering transform.
 
     Examples
     --------
@@ -59,6 +69,9 @@ class Evidence:
     data_fingerprint: str
     noise: str = "none"
     doubts: str = ""
+    log_volume: float = 0.0
+    uniform: str = ""
+    improper: str = ""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.log_evidence):
@@ -72,12 +85,34 @@ class Evidence:
             )
         if self.noise not in NOISE:
             raise ModelError(f"noise must be one of {NOISE}, got {self.noise!r}")
+        if not math.isfinite(self.log_volume):
+            raise ModelError(f"log_volume must be a finite number, got {self.log_volume!r}")
+
+    @property
+    def prior_note(self) -> str:
+        """What the number owes to the supports of the priors; empty if they have no such part."""
+        notes = []
+        if self.improper:
+            notes.append(
+                f"The prior of {self.improper} is improper or not normalised: the evidence is the "
+                "integral of the likelihood over the whole support of the prior's density, and it "
+                "changes with the unit in which each of these parameters is expressed."
+            )
+        if self.uniform:
+            notes.append(
+                f"The Uniform priors of {self.uniform} have a log volume of "
+                f"{self.log_volume:.2f}: halving the support of one scalar adds log 2 as long as "
+                "the posterior stays inside."
+            )
+        return " ".join(notes)
 
     def __repr__(self) -> str:
         held = "" if self.noise == "none" else f", noise={self.noise!r}"
+        improper = f", improper={self.improper!r}" if self.improper else ""
         return (
             f"Evidence(log_evidence={self.log_evidence:.3f} ± {self.se:.3f}, "
-            f"estimator={self.estimator!r}, k={self.n_parameters}, J={self.n_observations}{held})"
+            f"estimator={self.estimator!r}, k={self.n_parameters}, "
+            f"J={self.n_observations}{held}{improper})"
         )
 
     def _repr_html_(self) -> str:
@@ -141,11 +176,12 @@ def stored_evidence(idata: xr.DataTree, name: str) -> Evidence:
             f"{name!r} holds the evidence of several estimators, {estimators}: "
             "pass the Evidence that you mean"
         )
-    record = {
-        field.name: group[field.name].values[0].item()
-        if hasattr(group[field.name].values[0], "item")
-        else group[field.name].values[0]
+    found = {
+        field.name: group[field.name].values[0]
         for field in fields(Evidence)
-        if field.name != "estimator"
+        if field.name in group and field.name != "estimator"  # an older group lacks some
+    }
+    record = {
+        key: value.item() if hasattr(value, "item") else value for key, value in found.items()
     }
     return Evidence(estimator=estimators[0], **record)
