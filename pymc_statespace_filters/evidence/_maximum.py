@@ -1,0 +1,134 @@
+"""The largest value of a smooth function near the draws: Newton's method on differences."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.posterior import Posterior
+
+STEP = 0.01  # of the differences, in standard deviations of the draws
+MAX_GRADIENT = 1e-4  # nats per standard deviation
+MAX_ITERATIONS = 100
+
+Array = NDArray[np.float64]
+Rows = Callable[[Array], Array]
+
+
+class Whitened(NamedTuple):
+    """Coordinates in which the draws have covariance one within chains: x = mean + chol z."""
+
+    mean: Array  # (k,)
+    chol: Array  # (k, k)
+
+    def unconstrained(self, z: Array) -> Array:
+        """Points x (m, k) of whitened points z (m, k)."""
+        return self.mean + z @ self.chol.T
+
+    def whitened(self, x: Array) -> Array:
+        """Whitened points of x (m, k)."""
+        return np.linalg.solve(self.chol, (x - self.mean).T).T
+
+
+class Top(NamedTuple):
+    """Where a climb ended."""
+
+    point: Array  # (k,)
+    value: float
+    at_edge: bool  # one difference step further there is no value
+
+
+class EdgeError(Exception):
+    """The function is minus infinity within one step of a point."""
+
+
+def whitened_by(posterior: Posterior) -> Whitened:
+    """Coordinates in which finite differences are well scaled.
+
+    The covariance is that within chains: chains in separate modes would blur the width of each.
+    """
+    draws = posterior.draws
+    k = draws.shape[-1]
+    about_mean = (draws - draws.mean(axis=1, keepdims=True)).reshape(-1, k)
+    try:
+        chol = np.linalg.cholesky(about_mean.T @ about_mean / len(about_mean))
+    except np.linalg.LinAlgError:
+        raise ModelError(
+            "idata must hold draws that vary in every direction; the covariance of "
+            f"{len(about_mean)} draws of {k} unconstrained parameters is singular"
+        ) from None
+    return Whitened(draws.mean(axis=(0, 1)), chol)
+
+
+def best_of_chains(values: Array, n_best: int) -> NDArray[np.int64]:
+    """Flat indices of the best draw of each chain, the best `n_best` of them, best first."""
+    flat = values.argmax(axis=1) + np.arange(len(values)) * values.shape[1]
+    return flat[np.argsort(-values.ravel()[flat], kind="stable")][:n_best]
+
+
+def derivatives(function: Rows, point: Array, step: float) -> tuple[Array, Array]:
+    """Gradient (k,) and Hessian (k, k) by central differences; k (k + 1) + 1 points in one call.
+
+    The mixed ones need the two diagonal neighbours alone, f(x + h e_i + h e_j) and f(x - h e_i - h
+    e_j), because the neighbours along the axes are there already.
+
+    Raises
+    ------
+    EdgeError
+        If the function is minus infinity at one of the points.
+    """
+    k = len(point)
+    axes = step * np.eye(k)
+    i, j = np.triu_indices(k, 1)
+    diagonals = axes[i] + axes[j]
+    offsets = np.concatenate([np.zeros((1, k)), axes, -axes, diagonals, -diagonals])
+    values = function(point + offsets)
+    if not np.isfinite(values).all():
+        raise EdgeError
+    centre, up, down, *_ = np.split(values, np.cumsum([1, k, k]))
+    forth, back = np.split(values[2 * k + 1 :], 2)
+    hessian = np.diag((up + down - 2 * centre) / step**2)
+    along = up + down
+    hessian[i, j] = hessian[j, i] = (forth + back + 2 * centre - along[i] - along[j]) / (
+        2 * step**2
+    )
+    return (up - down) / (2 * step), hessian
+
+
+def climb(function: Rows, start: Array) -> Top:
+    """Go up from `start` (k,) until the gradient vanishes, or until one step leads off an edge.
+
+    A trust region bears with minus infinity, which is a step too far, with Hessians of any sign,
+    and with functions that level off towards infinity, where it stops.
+    """
+    known: dict[bytes, tuple[Array, Array]] = {}
+    best = Top(start, -np.inf, at_edge=False)
+
+    def descent(z: Array) -> float:
+        nonlocal best
+        value = float(function(z[np.newaxis])[0])
+        if value > best.value:
+            best = Top(z.copy(), value, at_edge=False)
+        return -value
+
+    def differences(z: Array) -> tuple[Array, Array]:
+        if z.tobytes() not in known:  # gradient and Hessian are asked for one after the other
+            known.clear()
+            known[z.tobytes()] = derivatives(function, z, STEP)
+        return known[z.tobytes()]
+
+    try:
+        minimize(
+            descent,
+            start,
+            jac=lambda z: -differences(z)[0],
+            hess=lambda z: -differences(z)[1],
+            method="trust-exact",
+            options={"gtol": MAX_GRADIENT, "maxiter": MAX_ITERATIONS},
+        )
+    except EdgeError:
+        return best._replace(at_edge=True)
+    return best
