@@ -1,20 +1,22 @@
 """Model probabilities from evidences (thesis, 3.1.2)."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import log_softmax
 from scipy.stats import norm
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.result import Evidence, stored_evidence
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence._probabilities import check_ci_prob, prior_of, probabilities
+from pymc_statespace_filters.evidence._rivals import Given, evidences_of_rivals
+from pymc_statespace_filters.evidence.result import Evidence
 
-N_NORMALS = 50_000
+# Kass and Raftery (1995), 3.2: twice the log Bayes factor at which each word begins.
+STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.0: "very strong"}
 
 Array = NDArray[np.float64]
 
@@ -57,43 +59,87 @@ class DimensionCorrection:
 
 
 def compare_evidence(
-    evidences: Mapping[str, Evidence | xr.DataTree],
+    evidences: Mapping[str, Given],
     *,
     prior: Mapping[str, float] | None = None,
     correction: DimensionCorrection | None = None,
     ci_prob: float = 0.95,
+    estimator: str | None = None,
 ) -> pd.DataFrame:
     """Turn evidences into model probabilities, with what their errors leave open (Eq. 3.3).
 
     Parameters
     ----------
-    evidences : mapping of str to Evidence or xarray.DataTree
-        Rival models of one record. A DataTree gives its group ``evidence``.
+    evidences : mapping of str to Evidence, xarray.DataTree, or mapping of str to Evidence
+        Rival models of one record. A DataTree gives its group ``evidence``; the third is what
+        `estimate_evidence` returns.
     prior : mapping of str to float, optional
         Positive prior weight of every model, normalised here; equal by default.
     correction : DimensionCorrection, optional
         A further factor of the prior, reported as its own column.
     ci_prob : float
         Probability of the intervals.
+    estimator : str, optional
+        Whose evidences to compare, as ``"bridge"``, where the models have several.
 
     Returns
     -------
     pandas.DataFrame
-        Index ``model``, most probable first. Columns: ``log_evidence`` and ``se`` (as estimated,
-        without prior and correction); ``correction`` (what it adds); ``prob``; ``prob_low`` and
-        ``prob_high``, the central interval over normal errors of the log-evidences (50 000 fixed
-        draws, so that the same evidences give the same table); ``log_bayes_factor`` (log-evidence
-        less that of the first row); ``n_parameters``; ``n_observations``; ``bic`` = -2 max ln
-        p(D|phi) + k ln J, missing if J = 0; ``undecided``: the errors leave it open, at level
-        `ci_prob`, whether this row or the first is more probable (for the first row: whether any
-        other is).
+        Index ``model``, most probable first. Columns:
+
+        ``log_evidence``, ``se``
+            As estimated, without prior and correction.
+        ``correction``
+            What it adds to the log-evidence.
+        ``prob``, ``prob_low``, ``prob_high``
+            With the central interval over normal errors of the log-evidences (50 000 fixed draws,
+            so that the same evidences give the same table).
+        ``log_bayes_factor``
+            Log-evidence less that of the first row.
+        ``n_parameters``, ``n_observations``
+            k and J.
+        ``bic``
+            -2 max ln p(D|phi) + k ln J; missing if J = 0.
+        ``undecided``
+            The errors leave it open, at level `ci_prob`, whether this row or the first is more
+            probable (for the first row: whether any other is).
+        ``aic``
+            -2 max ln p(D|phi) + 2 k.
+        ``log_evidence_flat``
+            What the log-evidence would be if each Uniform prior had the density one on the same
+            support: the thesis's number (Eq. 3.7). It changes with the units of the parameters.
+        ``prior``
+            Weight of the model before correction; ``prob`` is in proportion to it.
+        ``strength``
+            Kass and Raftery's word for the evidence of the first row against this one: "barely
+            worth mentioning", "positive", "strong" or "very strong" as twice the log Bayes factor
+            passes 2, 6 and 10. The factor is taken at the weaker end of its interval, but not
+            below 1, so that the word holds in spite of the errors. "negative" if the evidence
+            favours this row, and only prior or correction put it below the first. Empty for the
+            first row.
+        ``warning``
+            The number came with doubts, without an error, or from an improper prior.
+
+        Where an estimator has no error (``se`` is NaN, as Laplace's), the probabilities are still
+        those of the estimates; but all intervals are NaN, since each holds every evidence, what
+        is compared with that model is undecided, and its ``strength`` that of the bare estimate.
 
     Raises
     ------
     ModelError
-        If an argument is wrong.
+        If an argument is wrong, or a model has several evidences and none is chosen.
     DataMismatchError
         If the models were given different data.
+
+    Warns
+    -----
+    EvidenceWarning
+        If priors are improper: the probabilities then depend on the units of the parameters.
+
+    References
+    ----------
+    R. E. Kass and A. E. Raftery, Bayes factors. Journal of the American Statistical Association
+    90 (1995), 773-795.
 
     Examples
     --------
@@ -103,94 +149,79 @@ def compare_evidence(
     >>> table = compare_evidence({"linear": linear, "cubic": cubic})
     >>> table["prob"].round(3).to_dict()
     {'cubic': 0.881, 'linear': 0.119}
+    >>> table.loc["linear", "strength"]
+    'positive'
     """
-    found = _evidences(evidences)
-    if not (isinstance(ci_prob, int | float) and 0 < ci_prob < 1):
-        raise ModelError(f"ci_prob must be a number between 0 and 1, got {ci_prob!r}")
+    found = evidences_of_rivals(evidences, estimator)
+    check_ci_prob(ci_prob)
     if not (correction is None or isinstance(correction, DimensionCorrection)):
         raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")
+    names, rivals = list(found), list(found.values())
+    weights = prior_of(prior, names)
+    _warn_of_improper(found)
 
-    names = list(found)
-    log_evidence = np.array([found[name].log_evidence for name in names])
-    se = np.array([found[name].se for name in names])
-    added = np.array([correction.log_prior(found[name]) if correction else 0.0 for name in names])
-    log_weight = log_evidence + added + _log_prior(prior, names)
-
-    prob = np.exp(log_softmax(log_weight))
-    low, high = _intervals(log_weight, se, ci_prob)
+    log_evidence = np.array([rival.log_evidence for rival in rivals])
+    se = np.array([rival.se for rival in rivals])
+    added = np.array([correction.log_prior(rival) if correction else 0.0 for rival in rivals])
+    log_weight = log_evidence + added + np.log(weights)
+    probs = probabilities(log_weight, se, ci_prob)
     best = int(np.argmax(log_weight))
+    error = norm.ppf((1 + ci_prob) / 2) * np.hypot(se, se[best])  # of a difference from the best
+    log_bayes_factor = log_evidence - log_evidence[best]
     table = pd.DataFrame(
         {
             "log_evidence": log_evidence,
             "se": se,
             "correction": added,
-            "prob": prob,
-            "prob_low": np.minimum(low, prob),
-            "prob_high": np.maximum(high, prob),
-            "log_bayes_factor": log_evidence - log_evidence[best],
-            "n_parameters": [found[name].n_parameters for name in names],
-            "n_observations": [found[name].n_observations for name in names],
-            "bic": [_bic(found[name]) for name in names],
-            "undecided": _undecided(log_weight, se, best, ci_prob),
+            "prob": probs.prob,
+            "prob_low": probs.low,
+            "prob_high": probs.high,
+            "log_bayes_factor": log_bayes_factor,
+            "n_parameters": [rival.n_parameters for rival in rivals],
+            "n_observations": [rival.n_observations for rival in rivals],
+            "bic": [_bic(rival) for rival in rivals],
+            "undecided": _undecided(log_weight[best] - log_weight, error, best),
+            "aic": [2 * (rival.n_parameters - rival.max_log_likelihood) for rival in rivals],
+            "log_evidence_flat": [rival.log_evidence + rival.log_volume for rival in rivals],
+            "prior": weights,
+            "strength": _strength(-log_bayes_factor, error, best),
+            "warning": [
+                bool(rival.doubts or rival.improper or math.isnan(rival.se)) for rival in rivals
+            ],
         },
         index=pd.Index(names, name="model"),
     )
     return table.iloc[np.argsort(-log_weight, kind="stable")]
 
 
-def _evidences(evidences: Mapping[str, Evidence | xr.DataTree]) -> dict[str, Evidence]:
-    if not isinstance(evidences, Mapping) or not evidences:
-        raise ModelError(
-            "evidences must be a mapping of model names to Evidence or DataTree with at least one "
-            f"entry, got {evidences!r}"
+def _warn_of_improper(found: Mapping[str, Evidence]) -> None:
+    improper = [f"{name!r} ({one.improper})" for name, one in found.items() if one.improper]
+    if improper:
+        warnings.warn(
+            f"improper or unnormalised priors in {', '.join(improper)}: the model probabilities "
+            "depend on the units of these parameters; give them proper priors",
+            EvidenceWarning,
+            stacklevel=3,
         )
-    found = {}
-    for name, given in evidences.items():
-        if isinstance(given, xr.DataTree):
-            given = stored_evidence(given, name)
-        if not isinstance(given, Evidence):
-            raise ModelError(
-                f"evidences[{name!r}] must be an Evidence or a DataTree, got {given!r}"
-            )
-        found[name] = given
-
-    by_data: dict[str, list[str]] = {}
-    for name, evidence in found.items():
-        by_data.setdefault(evidence.data_fingerprint, []).append(name)
-    if len(by_data) > 1:
-        groups = " | ".join(", ".join(map(repr, names)) for names in by_data.values())
-        raise DataMismatchError(
-            f"evidences of different data cannot be compared; models that share data: {groups}"
-        )
-    return found
 
 
-def _log_prior(prior: Mapping[str, float] | None, names: list[str]) -> Array:
-    if prior is None:
-        return np.zeros(len(names))
-    if not isinstance(prior, Mapping) or set(prior) != set(names):
-        raise ModelError(f"prior must give a weight to exactly the models {names}, got {prior!r}")
-    weights = np.array([prior[name] for name in names], dtype=np.float64)
-    if not (np.isfinite(weights).all() and (weights > 0).all()):
-        raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
-    return np.log(weights / weights.sum())
-
-
-def _intervals(log_weight: Array, se: Array, ci_prob: float) -> tuple[Array, Array]:
-    """Central intervals of the probabilities under independent normal errors."""
-    normals = np.random.default_rng(0).standard_normal((N_NORMALS, len(se)))
-    probs = np.exp(log_softmax(log_weight + se * normals, axis=1))
-    low, high = np.quantile(probs, [(1 - ci_prob) / 2, (1 + ci_prob) / 2], axis=0)
-    return low, high
-
-
-def _undecided(log_weight: Array, se: Array, best: int, ci_prob: float) -> NDArray[np.bool_]:
-    """Whether the interval of the log-odds against the best model contains zero."""
-    behind = log_weight[best] - log_weight
-    undecided = behind <= norm.ppf((1 + ci_prob) / 2) * np.hypot(se, se[best])
+def _undecided(behind: Array, error: Array, best: int) -> NDArray[np.bool_]:
+    """Whether the interval of the log-odds against the best model contains zero, or is unknown."""
+    undecided = ~(behind > error)
     undecided[best] = False
     undecided[best] = undecided.any()
     return undecided
+
+
+def _strength(log_bayes_factor: Array, error: Array, best: int) -> list[str]:
+    """Words for the evidence of the best model against each."""
+    surely = np.maximum(log_bayes_factor - np.nan_to_num(error), 0)
+    begun = np.searchsorted(list(STRENGTHS), 2 * surely, side="right") - 1
+    words = [list(STRENGTHS.values())[i] for i in begun]
+    return [
+        "" if i == best else "negative" if log_bayes_factor[i] < 0 else word
+        for i, word in enumerate(words)
+    ]
 
 
 def _bic(evidence: Evidence) -> float:

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, fields
 from html import escape
 
-import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
@@ -145,24 +144,25 @@ def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, f
     idata[GROUP] = xr.DataTree(new)
 
 
-def stored_evidence(idata: xr.DataTree, name: str) -> Evidence:
-    """Read the one evidence that `idata` carries.
+def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
+    """Read the evidences that `idata` carries.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Has the group ``evidence``, as an estimator left it.
+        Has the group ``evidence``, as estimators left it.
     name : str
         What to call `idata` in an error.
 
     Returns
     -------
-    Evidence
+    dict of str to Evidence
+        By estimator.
 
     Raises
     ------
     ModelError
-        If there is no such group, or if several estimators wrote into it.
+        If there is no such group.
     """
     if GROUP not in idata.children:
         raise ModelError(
@@ -170,18 +170,12 @@ def stored_evidence(idata: xr.DataTree, name: str) -> Evidence:
             f"its groups are {sorted(idata.children)}"
         )
     group = idata[GROUP].to_dataset()
-    estimators = [str(estimator) for estimator in np.atleast_1d(group["estimator"].values)]
-    if len(estimators) != 1:
-        raise ModelError(
-            f"{name!r} holds the evidence of several estimators, {estimators}: "
-            "pass the Evidence that you mean"
-        )
-    found = {
-        field.name: group[field.name].values[0]
-        for field in fields(Evidence)
-        if field.name in group and field.name != "estimator"  # an older group lacks some
-    }
-    record = {
-        key: value.item() if hasattr(value, "item") else value for key, value in found.items()
-    }
-    return Evidence(estimator=estimators[0], **record)
+    known = [
+        field.name for field in fields(Evidence) if field.name in group
+    ]  # old groups lack some
+    found = {}
+    for i, estimator in enumerate(map(str, group["estimator"].values)):
+        values = {key: group[key].values[i] for key in known if key != "estimator"}
+        record = {key: v.item() if hasattr(v, "item") else v for key, v in values.items()}
+        found[estimator] = Evidence(estimator=estimator, **record)
+    return found

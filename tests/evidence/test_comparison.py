@@ -1,12 +1,13 @@
 """Model probabilities: Eq. 3.3 by hand, intervals, the correction, and what is refused."""
 
 import math
+from dataclasses import replace
 
 import arviz as az
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, compare_evidence
 from pymc_statespace_filters.evidence.result import store_evidence
 
@@ -22,6 +23,11 @@ COLUMNS = [
     "n_observations",
     "bic",
     "undecided",
+    "aic",
+    "log_evidence_flat",
+    "prior",
+    "strength",
+    "warning",
 ]
 
 
@@ -128,13 +134,119 @@ def test_an_idata_without_the_group_says_what_to_call():
         compare_evidence({"a": idata})
 
 
-def test_an_idata_with_two_estimators_is_ambiguous():
+def bridge(log_evidence):
+    return replace(evidence(log_evidence), estimator="bridge")
+
+
+def both(log_evidence):
+    """What `estimate_evidence` leaves, in the draws and in hand."""
+    estimates = {e.estimator: e for e in (evidence(log_evidence), bridge(log_evidence + 0.5))}
     idata = az.from_dict({"posterior": {"x": np.zeros((1, 4))}})
-    store_evidence(idata, evidence(-8), {"scale": 1.0})
-    store_evidence(idata, Evidence(-8.0, 0.1, "bridge", 2, 21, -5.0, "same"), {"n_iterations": 7})
-    assert list(idata["evidence"]["estimator"].values) == ["chib_jeliazkov", "bridge"]
-    with pytest.raises(ModelError, match="several estimators"):
-        compare_evidence({"a": idata})
+    for one in estimates.values():
+        store_evidence(idata, one, {})
+    return idata, estimates
+
+
+def test_one_of_several_estimators_is_chosen():
+    (stored, _), (_, in_hand) = both(-8), both(-9)
+    table = compare_evidence({"a": stored, "b": in_hand}, estimator="bridge")
+    assert list(table["log_evidence"]) == [-7.5, -8.5]
+    table = compare_evidence({"a": stored, "b": in_hand}, estimator="chib_jeliazkov")
+    assert list(table["log_evidence"]) == [-8, -9]
+
+
+def test_several_estimators_are_ambiguous():
+    for given in both(-8):
+        with pytest.raises(ModelError, match=r"'a' holds .* several .*'chib_jeliazkov', 'bridge'"):
+            compare_evidence({"a": given})
+        with pytest.raises(ModelError, match=r"'a' has no evidence by 'laplace', only by \['chib_"):
+            compare_evidence({"a": given}, estimator="laplace")
+    with pytest.raises(ModelError, match=r"'b' has no evidence by 'chib_jeliazkov', only by"):
+        compare_evidence({"a": evidence(-8), "b": bridge(-8)}, estimator="chib_jeliazkov")
+    # Different estimators for different models are nobody's mistake.
+    assert len(compare_evidence({"a": evidence(-8), "b": bridge(-8)})) == 2
+
+
+def test_aic_and_the_integral_under_a_density_of_one():
+    table = compare_evidence({"a": replace(evidence(-8, k=3), log_volume=4.5)})
+    assert table.loc["a", "aic"] == 10 + 6
+    assert table.loc["a", "log_evidence_flat"] == -3.5
+
+
+@pytest.mark.parametrize(
+    ("twice", "word"),
+    [
+        (0.0, "barely worth mentioning"),
+        (1.99, "barely worth mentioning"),
+        (2.01, "positive"),
+        (5.99, "positive"),
+        (6.01, "strong"),
+        (9.99, "strong"),
+        (10.01, "very strong"),
+        (900.0, "very strong"),
+    ],
+)
+def test_words_of_kass_and_raftery(twice, word):
+    table = compare_evidence({"a": evidence(-8, se=0), "b": evidence(-8 - twice / 2, se=0)})
+    assert table["strength"].to_dict() == {"a": "", "b": word}
+
+
+def test_words_hold_in_spite_of_the_errors():
+    """2 ln B = 7 +- 2 * 1.96 * 0.5: from strong down to positive; an error alone is no evidence."""
+    rivals = {
+        "a": evidence(-8, se=0.3),
+        "b": evidence(-11.5, se=0.4),
+        "c": evidence(-8.1, se=2),
+        "unknown": evidence(-11.5, se=math.nan),
+    }
+    words = compare_evidence(rivals)["strength"]
+    assert words["b"] == "positive"
+    assert words["c"] == "barely worth mentioning"
+    assert words["unknown"] == "strong"
+    assert compare_evidence(rivals, ci_prob=0.5)["strength"]["b"] == "strong"
+
+
+def test_evidence_that_the_prior_outweighs_is_negative():
+    table = compare_evidence({"a": evidence(-8), "b": evidence(-10)}, prior={"a": 1, "b": 100})
+    assert table["strength"].to_dict() == {"b": "", "a": "negative"}
+    assert table["prior"].to_dict() == pytest.approx({"b": 100 / 101, "a": 1 / 101})
+
+
+def test_without_an_error_the_intervals_are_unknown():
+    rivals = {"a": evidence(-8), "b": evidence(-9, se=math.nan), "c": evidence(-30)}
+    table = compare_evidence(rivals)
+    known = compare_evidence(rivals | {"b": evidence(-9)})
+    np.testing.assert_array_equal(table["prob"], known["prob"])
+    assert table[["prob_low", "prob_high"]].isna().all(axis=None)
+    assert table["undecided"].to_dict() == {"a": True, "b": True, "c": False}
+    # If it is the best, nothing is decided.
+    best = compare_evidence(rivals | {"b": evidence(-7, se=math.nan)})
+    assert best["undecided"].all()
+
+
+def test_what_deserves_a_look_is_marked():
+    rivals = {
+        "sound": evidence(-8),
+        "doubtful": replace(evidence(-9), doubts="the chains disagree"),
+        "laplace": evidence(-10, se=math.nan),
+    }
+    marked = compare_evidence(rivals)["warning"]
+    assert marked.to_dict() == {"sound": False, "doubtful": True, "laplace": True}
+    assert marked.dtype == bool
+
+
+def test_improper_priors_are_named_once():
+    rivals = {
+        "a": replace(evidence(-8), improper="beta"),
+        "b": evidence(-9),
+        "c": replace(evidence(-9), improper="beta, gamma"),
+    }
+    with pytest.warns(EvidenceWarning) as said:
+        table = compare_evidence(rivals)
+    assert len(said) == 1
+    assert "in 'a' (beta), 'c' (beta, gamma):" in str(said[0].message)
+    assert said[0].filename == __file__
+    assert table["warning"].to_dict() == {"a": True, "b": False, "c": True}
 
 
 def test_different_data_raise_and_name_the_models():
@@ -166,7 +278,7 @@ def test_bad_correction():
         DimensionCorrection(exponent=float("nan"))
 
 
-@pytest.mark.parametrize("evidences", [{}, [evidence(-8)], {"a": -8.0}])
+@pytest.mark.parametrize("evidences", [{}, [evidence(-8)], {"a": -8.0}, {"a": {"bridge": -8.0}}])
 def test_bad_evidences(evidences):
     with pytest.raises(ModelError, match="evidences"):
         compare_evidence(evidences)

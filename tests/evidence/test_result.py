@@ -10,7 +10,7 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
-from pymc_statespace_filters.evidence.result import store_evidence, stored_evidence
+from pymc_statespace_filters.evidence.result import store_evidence, stored_evidences
 
 EVIDENCE = Evidence(-8.0, 0.1, "bridge", 2, 21, -5.0, "0c5f")
 TOLD = replace(EVIDENCE, log_volume=5.3, uniform="a, b", improper="c")
@@ -24,7 +24,7 @@ def empty():
 def test_what_is_stored_is_read(evidence):
     idata = empty()
     store_evidence(idata, evidence, {"scale": 1.0})
-    assert stored_evidence(idata, "a") == evidence
+    assert stored_evidences(idata, "a") == {evidence.estimator: evidence}
 
 
 def test_a_group_of_an_earlier_version_is_read():
@@ -32,7 +32,7 @@ def test_a_group_of_an_earlier_version_is_read():
     store_evidence(idata, TOLD, {})
     older = idata["evidence"].to_dataset().drop_vars(["log_volume", "uniform", "improper"])
     idata["evidence"] = xr.DataTree(older)
-    assert stored_evidence(idata, "a") == EVIDENCE
+    assert stored_evidences(idata, "a") == {EVIDENCE.estimator: EVIDENCE}
 
 
 def test_every_field_is_in_the_group():
