@@ -10,12 +10,15 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
+from pymc_statespace_filters.evidence.bridge import Bridge
 from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.report import Estimator, evidences_of
 from pymc_statespace_filters.evidence.result import Evidence
 
 ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),
+    "bridge": Bridge(),
+    "warp_bridge": Bridge(warped=True),
 }
 
 
