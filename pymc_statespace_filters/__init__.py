@@ -18,6 +18,7 @@ from pymc_statespace_filters.evidence import (
     chib_jeliazkov,
     compare_evidence,
     estimate_evidence,
+    marginal_modes,
 )
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
@@ -56,6 +57,7 @@ __all__ = [
     "freeplay",
     "hysteresis",
     "log_likelihood",
+    "marginal_modes",
     "nearest_steps",
     "sample_dram",
     "simulate",

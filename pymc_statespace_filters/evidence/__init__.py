@@ -4,6 +4,7 @@ from pymc_statespace_filters.evidence.averaging import average_models
 from pymc_statespace_filters.evidence.chib_jeliazkov import chib_jeliazkov
 from pymc_statespace_filters.evidence.comparison import DimensionCorrection, compare_evidence
 from pymc_statespace_filters.evidence.estimators import EvidenceEstimates, estimate_evidence
+from pymc_statespace_filters.evidence.marginal_modes import marginal_modes
 from pymc_statespace_filters.evidence.result import Evidence
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "chib_jeliazkov",
     "compare_evidence",
     "estimate_evidence",
+    "marginal_modes",
 ]
