@@ -13,6 +13,8 @@ from pymc_statespace_filters.evidence.posterior import Posterior
 STEP = 0.01  # of the differences, in standard deviations of the draws
 MAX_GRADIENT = 1e-4  # nats per standard deviation
 MAX_ITERATIONS = 100
+# Steps in a row that gain next to nothing end a climb: on a ridge the gradient may never vanish.
+MIN_GAIN, MAX_IDLE = 1e-7, 5
 
 Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]
@@ -106,6 +108,7 @@ def climb(function: Rows, start: Array) -> Top:
     """
     known: dict[bytes, tuple[Array, Array]] = {}
     best = Top(start, -np.inf, at_edge=False)
+    before, n_idle = -np.inf, 0
 
     def descent(z: Array) -> float:
         nonlocal best
@@ -120,6 +123,13 @@ def climb(function: Rows, start: Array) -> Top:
             known[z.tobytes()] = derivatives(function, z, STEP)
         return known[z.tobytes()]
 
+    def stop_if_idle(_: Array) -> None:
+        nonlocal before, n_idle
+        n_idle = n_idle + 1 if best.value < before + MIN_GAIN else 0
+        before = best.value
+        if n_idle == MAX_IDLE:
+            raise StopIteration
+
     try:
         minimize(
             descent,
@@ -127,6 +137,7 @@ def climb(function: Rows, start: Array) -> Top:
             jac=lambda z: -differences(z)[0],
             hess=lambda z: -differences(z)[1],
             method="trust-exact",
+            callback=stop_if_idle,
             options={"gtol": MAX_GRADIENT, "maxiter": MAX_ITERATIONS},
         )
     except EdgeError:

@@ -21,6 +21,7 @@ ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),
     "bridge": Bridge(),
     "warp_bridge": Bridge(warped=True),
+    "laplace": Laplace(),
 }
 
 

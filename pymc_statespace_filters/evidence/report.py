@@ -76,7 +76,7 @@ def evidences_of(
             announce(name, estimator.n_evaluations(posterior))
             estimates[name] = estimator.estimate(posterior, rng=stream(name))
         announce(MAXIMUM, N_EVALUATIONS)
-        largest = max_log_likelihood(posterior, stream(MAXIMUM))
+        largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
     found = {}
     for name, estimate in estimates.items():
