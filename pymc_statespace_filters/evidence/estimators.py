@@ -11,7 +11,6 @@ import xarray as xr
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
 from pymc_statespace_filters.evidence.bridge import Bridge
-from pymc_statespace_filters.evidence.bridge import Bridge
 from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.laplace import Laplace
 from pymc_statespace_filters.evidence.report import Estimator, evidences_of

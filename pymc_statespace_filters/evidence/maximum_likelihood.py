@@ -7,6 +7,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from pymc_statespace_filters.evidence._factors import (
+    evaluate_factors,
+    log_likelihood_of,
+    prior_of,
+)
 from pymc_statespace_filters.evidence._maximum import (
     Rows,
     best_of_chains,
@@ -67,26 +72,17 @@ def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> Maximu
     -------
     MaximumLikelihood
     """
-    prior = posterior.prior
-    assert prior is not None
     coordinates = whitened_by(posterior)
 
     def log_likelihood(z: Array) -> Array:
-        x = coordinates.unconstrained(z)
-        return _less(posterior.evaluate(x, rng), prior.log_density(x))
+        return evaluate_factors(posterior, coordinates.unconstrained(z), rng)[1]
 
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-    log_prior = prior.log_density(draws).reshape(posterior.log_density.shape)
-    at_draws = _less(posterior.log_density, log_prior)
+    log_prior = prior_of(posterior).log_density(draws).reshape(posterior.log_density.shape)
+    at_draws = log_likelihood_of(posterior.log_density, log_prior)
     find = _estimated if posterior.is_noisy else _climbed
     value, z = find(log_likelihood, coordinates.whitened(draws), at_draws)
     return MaximumLikelihood(value, coordinates.unconstrained(z[np.newaxis])[0])
-
-
-def _less(log_density: Array, log_prior: Array) -> Array:
-    """Log-likelihood; minus infinity where there is no density, whatever the prior is there."""
-    there = np.isfinite(log_density)
-    return np.subtract(log_density, log_prior, out=np.full_like(log_density, -np.inf), where=there)
 
 
 def _climbed(log_likelihood: Rows, draws: Array, at_draws: Array) -> tuple[float, Array]:
