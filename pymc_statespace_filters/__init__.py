@@ -25,6 +25,12 @@ from pymc_statespace_filters.integrators import EulerMaruyama
 from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
+from pymc_statespace_filters.plots import (
+    plot_average,
+    plot_evidence,
+    plot_model_probabilities,
+    plot_prior_sensitivity,
+)
 from pymc_statespace_filters.records import nearest_steps
 from pymc_statespace_filters.sampling import DRAM, sample_dram, suggest_particles
 from pymc_statespace_filters.simulation import simulate
@@ -59,6 +65,10 @@ __all__ = [
     "log_likelihood",
     "marginal_modes",
     "nearest_steps",
+    "plot_average",
+    "plot_evidence",
+    "plot_model_probabilities",
+    "plot_prior_sensitivity",
     "sample_dram",
     "simulate",
     "suggest_particles",

@@ -188,10 +188,14 @@ def _arrays(
         except Exception as error:
             error.add_note(f"raised by function with the posterior of model {name!r}")
             raise
-        if not (isinstance(array, xr.DataArray) and set(SAMPLE_DIMS) <= set(array.dims)):
+        if not (
+            isinstance(array, xr.DataArray)
+            and set(SAMPLE_DIMS) <= set(array.dims)
+            and "model" not in array.dims
+        ):
             raise ModelError(
-                "function must return a DataArray with dims 'chain' and 'draw', for model "
-                f"{name!r} it returned {array!r}"
+                "function must return a DataArray with dims 'chain' and 'draw' and without 'model',"
+                f" for model {name!r} it returned {array!r}"
             )
         arrays[name] = array
 
@@ -217,9 +221,9 @@ def _difference(one: xr.DataArray, other: xr.DataArray) -> str:
 
 def _form(arrays: Mapping[str, xr.DataArray]) -> tuple[str, tuple, dict]:
     """Return name, dims and coordinates of the average."""
-    labels = {array.name for array in arrays.values()}
-    label = labels.pop() if len(labels) == 1 else None
     reference = _without_samples(next(iter(arrays.values())))
+    labels = {array.name for array in arrays.values()} - set(reference.coords)
+    label = labels.pop() if len(labels) == 1 else None
     return str(label or "average"), reference.dims, dict(reference.coords)
 
 

@@ -1,0 +1,116 @@
+"""What the plots share: a figure of the right size, rows with names, curves and bands."""
+
+import math
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_base import rcParams
+from arviz_plots import PlotCollection
+from arviz_plots.plot_collection import backend_from_object
+
+BOUND = "ci_bound"
+PANELS_IN_LINE = 4
+
+
+def canvas(
+    data: xr.Dataset,
+    *,
+    backend: str | None,
+    pc_kwargs: Mapping[str, Any],
+    aes: Mapping[str, list[str]],
+    height: float = 2.5,
+    n_panels: int = 1,
+    legend: bool = False,
+    **defaults: Any,
+) -> PlotCollection:
+    """Make an empty figure for `data`; what the user gave in `pc_kwargs` goes before our defaults.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+    backend : str or None
+    pc_kwargs : mapping
+        Of the public function.
+    aes : mapping of str to list of str
+        Aesthetics by dimension.
+    height : float
+        Of a panel, in rows as ``scale_fig_size`` of arviz_plots counts them.
+    n_panels : int
+    legend : bool
+        Leave room for one beside the panels.
+    **defaults
+        Of `PlotCollection.wrap`.
+    """
+    backend = rcParams["plot.backend"] if backend is None else backend
+    drawing = import_module(f"arviz_plots.backend.{backend}")
+    figure = dict(pc_kwargs.get("figure_kwargs", {}))
+    if "figsize" not in figure:
+        n_lines = math.ceil(n_panels / PANELS_IN_LINE)
+        n_columns = min(n_panels, PANELS_IN_LINE) + (0.5 if legend else 0.0)
+        figure["figsize"] = drawing.scale_fig_size(None, rows=height * n_lines, cols=n_columns)
+        figure["figsize_units"] = "dots"
+    if backend == "matplotlib":  # it alone must be told to keep room for a legend
+        figure.setdefault("layout", "constrained")
+    given = {
+        "col_wrap": PANELS_IN_LINE,
+        **defaults,
+        **pc_kwargs,
+        "figure_kwargs": figure,
+        "backend": backend,
+    }
+    given["aes"] = {**aes, **pc_kwargs.get("aes", {})}
+    return PlotCollection.wrap(data, **given)
+
+
+def canvas_of_rows(
+    data: xr.Dataset, *, backend: str | None, pc_kwargs: Mapping[str, Any]
+) -> PlotCollection:
+    """Make a figure with one named row for each entry of the only dimension, the first on top."""
+    (dim,) = map(str, data.dims)
+    places = np.arange(data.sizes[dim])[::-1]
+    collection = canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={"y": [dim]},
+        height=0.6 + 0.3 * len(places),
+        y=places,
+    )
+    names = [str(name) for name in data[dim].values]
+    collection.map(name_rows, ignore_aes="all", places=places, names=names, store_artist=False)
+    return collection
+
+
+def name_rows(da: xr.DataArray, target: Any, *, places: np.ndarray, names: list[str]) -> None:
+    """Write the names of the rows at the y axis, and leave room above and below."""
+    drawing = backend_from_object(target)
+    drawing.ylim((-0.5, len(names) - 0.3), target)
+    drawing.yticks(places, names, target)
+
+
+def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
+    """Draw values against the coordinate of their only dimension."""
+    (dim,) = da.dims
+    return backend_from_object(target).line(da[dim].values, da.values, target, **kwargs)
+
+
+def band(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
+    """Fill the space between two curves, the ends of the dimension `BOUND`."""
+    (dim,) = (dim for dim in da.dims if dim != BOUND)
+    low, high = da.transpose(BOUND, dim).values
+    return backend_from_object(target).fill_between_y(da[dim].values, low, high, target, **kwargs)
+
+
+def interval(low: xr.Dataset, high: xr.Dataset) -> xr.Dataset:
+    """Lay two ends side by side along the dimension `BOUND`."""
+    return xr.concat([low, high], dim=BOUND).assign_coords({BOUND: ["lower", "upper"]})
+
+
+def written(prob: float) -> str:
+    """Write a probability with the digits that matter, near zero and near one too."""
+    if prob < 0.01:
+        return f"{prob:.1g}"
+    return f"{prob:.2f}" if prob < 0.99 else f"{prob:.4f}"

@@ -1,0 +1,171 @@
+"""An average over models beside what each model says alone (thesis, Figs. 15, 19 and 23)."""
+
+import math
+from collections.abc import Hashable
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_base import rcParams
+from arviz_base.labels import MapLabeller, NoVarLabeller
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots._canvas import BOUND, band, canvas, curve, written
+
+AVERAGE = "average"
+N_GRID = 512
+PROB_SHOWN = 1e-3  # the x axis of densities is that of models with this probability
+
+
+def plot_average(
+    average: xr.DataTree, *, backend: str | None = None, **pc_kwargs: Any
+) -> PlotCollection:
+    """Draw an average over models and its members.
+
+    A curve (one dimension with numbers as coordinate) is drawn as mean and interval, a scalar as
+    density; the densities of the members carry the weights of their models and add up to that of
+    the average. Other dimensions become panels.
+
+    Parameters
+    ----------
+    average : xarray.DataTree
+        Of `average_models`.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``. Kind and probability of the
+        intervals are those of ``arviz.rcParams`` too.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``curve``, ``band``, ``lower`` and ``upper``, or ``density``, along ``model``: the
+        members, and the average after them.
+
+    Raises
+    ------
+    ModelError
+        If it is no such average, or has more than one dimension with numbers.
+
+    Examples
+    --------
+    >>> import arviz as az
+    >>> import numpy as np
+    >>> from pymc_statespace_filters import average_models, plot_average
+    >>> rng = np.random.default_rng(1)
+    >>> soft = az.from_dict({"posterior": {"k": rng.normal(2.0, 0.3, (4, 500))}})
+    >>> stiff = az.from_dict({"posterior": {"k": rng.normal(4.0, 0.3, (4, 500))}})
+    >>> average = average_models(
+    ...     {"soft": soft, "stiff": stiff},
+    ...     {"soft": 0.3, "stiff": 0.7},
+    ...     lambda posterior: posterior["k"],
+    ...     random_seed=2,
+    ... )
+    >>> collection = plot_average(average)
+    >>> collection.savefig("stiffness.png")  # doctest: +SKIP
+    """
+    if not (isinstance(average, xr.DataTree) and {"posterior", "members"} <= set(average.children)):
+        raise ModelError(f"average must be a DataTree of average_models, got {average!r}")
+    mixture = average["posterior"].to_dataset().drop_vars("model")
+    members = average["members"].to_dataset()
+    (name,) = mixture.data_vars
+    along = _numeric_dims(mixture[name])
+    if len(along) > 1:
+        raise ModelError(
+            f"average must have at most one dimension with numbers, got {along}: give the others "
+            "names as coordinates, or select from them"
+        )
+
+    data = _means(members, mixture) if along else _densities(members)
+    panels = [dim for dim in members[name].dims if dim not in ("model", "chain", "draw", *along)]
+    n_members = members.sizes["model"]
+    collection = canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={"color": ["model"], "width": ["model"]},
+        n_panels=math.prod(members.sizes[dim] for dim in panels),
+        legend=True,
+        cols=panels,
+        color=[*(f"C{i % 10}" for i in range(n_members)), "B1"],
+        width=[*[1.5] * n_members, 3],
+    )
+    if panels:
+        collection.map(
+            labelled_title, "title", ignore_aes="all", subset_info=True, labeller=NoVarLabeller()
+        )
+    if along:
+        _draw_curves(collection, members, mixture)
+    else:
+        collection.map(line_xy, "density")
+    x_label, y_label = (along[0], name) if along else (name, "density")
+    collection.map(labelled_x, "x_label", ignore_aes="all", text=str(x_label))
+    collection.map(labelled_y, "y_label", ignore_aes="all", text=str(y_label))
+    collection.add_legend("model", aes=["color", "width"], labeller=_with_probabilities(members))
+    return collection
+
+
+def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Dataset) -> None:
+    """Draw means; intervals of the members as bands, that of the average by its ends."""
+    of_members, of_average = (
+        getattr(draws.azstats, rcParams["stats.ci_kind"])() for draws in (members, mixture)
+    )
+    styled = {"ignore_aes": {"width"}, "width": 1.5, "linestyle": "C1"}
+    collection.map(band, "band", data=of_members, ignore_aes={"width"}, alpha=0.2)
+    collection.map(curve, "curve")
+    for end in ("lower", "upper"):
+        ends = of_average.sel({BOUND: end}).expand_dims(model=[AVERAGE])
+        collection.map(curve, end, data=ends, **styled)
+
+
+def _numeric_dims(array: xr.DataArray) -> list[Hashable]:
+    return [
+        dim
+        for dim in array.dims
+        if dim not in ("chain", "draw") and array[dim].dtype.kind in "iufM"
+    ]
+
+
+def _means(members: xr.Dataset, mixture: xr.Dataset) -> xr.Dataset:
+    """Return the means under each model, and after them that of the average."""
+    of_average = mixture.azstats.mean().expand_dims(model=[AVERAGE])
+    return xr.concat([members.azstats.mean().drop_vars("prob"), of_average], "model")
+
+
+def _densities(members: xr.Dataset) -> xr.Dataset:
+    """Return densities of the members times their weights, and of the average: the sum of these."""
+
+    def weighted(x: np.ndarray, y: np.ndarray, prob: np.ndarray) -> np.ndarray:
+        shown = x[prob >= min(PROB_SHOWN, prob.max())]
+        grid = np.linspace(shown.min(), shown.max(), N_GRID)
+        each = [
+            weight * np.interp(grid, at, density, left=0, right=0)
+            for at, density, weight in zip(x, y, prob, strict=True)
+        ]
+        return np.stack([[grid, density] for density in (*each, np.sum(each, axis=0))], axis=1)
+
+    (kernel_densities,) = members.azstats.kde().data_vars.values()
+    densities = xr.apply_ufunc(
+        weighted,
+        kernel_densities.sel(plot_axis="x", drop=True),
+        kernel_densities.sel(plot_axis="y", drop=True),
+        members["prob"],
+        input_core_dims=[["model", "kde_dim"], ["model", "kde_dim"], ["model"]],
+        output_core_dims=[["plot_axis", "model", "grid"]],
+        exclude_dims={"model"},
+        vectorize=True,
+    )
+    coords = {"plot_axis": ["x", "y"], "model": [*members["model"].values, AVERAGE]}
+    return densities.assign_coords(coords).to_dataset(name=kernel_densities.name)
+
+
+def _with_probabilities(members: xr.Dataset) -> MapLabeller:
+    probs = zip(members["model"].values, members["prob"].values, strict=True)
+    return MapLabeller(
+        coord_map={
+            "model": {name: f"{name} ({written(prob)})" for name, prob in probs}
+            | {AVERAGE: AVERAGE}
+        }
+    )

@@ -1,0 +1,84 @@
+"""Log-evidences with their errors, of rival models or of several estimators."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+import xarray as xr
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import labelled_x, line_x, scatter_x
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence import Evidence
+from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval
+
+
+def plot_evidence(
+    idata_or_table: xr.DataTree | pd.DataFrame | Mapping[str, Evidence],
+    *,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    """Draw log-evidences with one and two standard errors.
+
+    Parameters
+    ----------
+    idata_or_table : pandas.DataFrame, xarray.DataTree or mapping of str to Evidence
+        The table of `compare_evidence` (a row for each model), or the result of
+        `estimate_evidence` or draws with a group ``evidence`` (a row for each estimator). An
+        estimate without error has no bar.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``, as ``figure_kwargs={"figsize": (6, 3)}``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``point``, ``one_se``, ``two_se``, ``x_label``.
+
+    Raises
+    ------
+    ModelError
+        If there are no log-evidences in what was given.
+
+    Examples
+    --------
+    >>> from pymc_statespace_filters import Evidence, compare_evidence, plot_evidence
+    >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
+    >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
+    >>> table = compare_evidence({"linear": linear, "cubic": cubic})
+    >>> collection = plot_evidence(table)
+    >>> collection.savefig("evidence.png")  # doctest: +SKIP
+    """
+    table = _table(idata_or_table)
+    points = table[["log_evidence"]]
+    collection = canvas_of_rows(points, backend=backend, pc_kwargs=pc_kwargs)
+    for label, n_errors, width in (("two_se", 2, 1.5), ("one_se", 1, 4)):
+        bars = interval(points - n_errors * table["se"], points + n_errors * table["se"])
+        collection.map(line_x, label, data=bars, width=width, color="C0")
+    collection.map(scatter_x, "point", color="C0")
+    text = "log-evidence (nats), 1 and 2 standard errors"
+    collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
+    return collection
+
+
+def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dataset:
+    """Return log_evidence and se along one dimension, whatever they were given in."""
+    if isinstance(given, xr.DataTree) and "evidence" in given.children:
+        return given["evidence"].to_dataset()[["log_evidence", "se"]]
+    if isinstance(given, Mapping) and not isinstance(given, xr.DataTree):
+        of_evidence = {
+            name: {"log_evidence": found.log_evidence, "se": found.se}
+            for name, found in given.items()
+            if isinstance(found, Evidence)
+        }
+        if of_evidence and len(of_evidence) == len(given):
+            given = pd.DataFrame.from_dict(of_evidence, orient="index").rename_axis("estimator")
+    if isinstance(given, pd.DataFrame) and {"log_evidence", "se"} <= set(given.columns):
+        named = given.rename_axis(given.index.name or "model")
+        return named[["log_evidence", "se"]].to_xarray()
+    raise ModelError(
+        "idata_or_table must be a table of compare_evidence, a result of estimate_evidence or a "
+        f"DataTree with a group 'evidence', got {given!r}"
+    )

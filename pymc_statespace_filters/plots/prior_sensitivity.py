@@ -1,0 +1,133 @@
+"""Probabilities of rival models against what was assumed before the data."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from arviz_base import rcParams
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import labelled_x, labelled_y, set_xticks, set_ylim
+from scipy.special import softmax
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots._canvas import band, canvas, curve, interval
+
+EXPONENTS = np.linspace(0, 4, 81)
+N_NORMALS = 4000
+LABELS = {
+    "prob": "exponent α of the correction",
+    "width_prob": "width of the priors (factor)",
+}
+
+
+def plot_prior_sensitivity(
+    table: pd.DataFrame | xr.Dataset, *, backend: str | None = None, **pc_kwargs: Any
+) -> PlotCollection:
+    """Draw how the probabilities of rival models depend on the prior.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame or xarray.Dataset
+        The table of `compare_evidence`: one panel, the probabilities against the exponent of
+        `DimensionCorrection`, whatever exponent was in the table. Or the result of
+        `prior_sensitivity`: a second panel, against the width of the priors, if it has one.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``curve``, ``band``.
+
+    Raises
+    ------
+    ModelError
+        If it is neither.
+
+    Examples
+    --------
+    >>> from pymc_statespace_filters import Evidence, compare_evidence, plot_prior_sensitivity
+    >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
+    >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
+    >>> collection = plot_prior_sensitivity(compare_evidence({"linear": linear, "cubic": cubic}))
+    >>> collection.savefig("sensitivity.png")  # doctest: +SKIP
+    """
+    found = _sensitivity(table)
+    panels = [name for name in LABELS if name in found]
+    if "width_prob" in panels:  # not every backend of arviz_plots has a logarithmic axis
+        found = found.assign_coords(width=np.log10(found["width"]))
+    probs = found[panels]
+    low, high = (
+        found[[f"{name}_{end}" for name in panels]].rename(
+            {f"{name}_{end}": name for name in panels}
+        )
+        for end in ("low", "high")
+    )
+    collection = canvas(
+        probs,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={"color": ["model"]},
+        n_panels=len(panels),
+        legend=True,
+        cols=["__variable__"],
+    )
+    collection.map(band, "band", data=interval(low, high), alpha=0.25)
+    collection.map(curve, "curve", width=2)
+    _label_axes(collection, probs)
+    collection.add_legend("model")
+    return collection
+
+
+def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
+    settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
+    for name in probs:
+        collection.map(labelled_x, data=probs[[name]], text=LABELS[str(name)], **settings)
+        collection.map(labelled_y, data=probs[[name]], text="probability of the model", **settings)
+    collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
+    if "width_prob" in probs:
+        ticks = _logarithmic_ticks(probs["width"].values)
+        collection.map(set_xticks, data=probs[["width_prob"]], **ticks, **settings)
+
+
+def _logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
+    """Return ticks in decades, or finer where there are few decades."""
+    low, high = logs.min() - 1e-9, logs.max() + 1e-9
+    digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    values = [digit * 10.0**decade for decade in decades for digit in digits]
+    shown = [value for value in values if low <= math.log10(value) <= high]
+    return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
+
+
+def _sensitivity(table: pd.DataFrame | xr.Dataset) -> xr.Dataset:
+    if isinstance(table, xr.Dataset) and {"prob", "prob_low", "prob_high"} <= set(table):
+        return table
+    needed = {"log_evidence", "se", "prior", "n_parameters", "n_observations"}
+    if isinstance(table, pd.DataFrame) and needed <= set(table.columns):
+        return _against_exponent(table)
+    raise ModelError(
+        f"table must be one of compare_evidence or a result of prior_sensitivity, got {table!r}"
+    )
+
+
+def _against_exponent(table: pd.DataFrame) -> xr.Dataset:
+    """Give the table corrections of many exponents α: k α / 2 ln J is subtracted (Eq. 3.7)."""
+    log_evidence, prior, k, n_observations, se = (
+        table[name].to_numpy(dtype=np.float64)
+        for name in ("log_evidence", "prior", "n_parameters", "n_observations", "se")
+    )
+    penalties = EXPONENTS[:, None] * k / 2 * np.log(n_observations)
+    log_weights = log_evidence + np.log(prior) - penalties
+    errors = se * np.random.default_rng(0).standard_normal((N_NORMALS, 1, len(se)))
+    outside = (1 - rcParams["stats.ci_prob"]) / 2
+    low, high = np.quantile(softmax(log_weights + errors, axis=-1), [outside, 1 - outside], axis=0)
+    probs = {"prob": softmax(log_weights, axis=-1), "prob_low": low, "prob_high": high}
+    return xr.Dataset(
+        {name: (("exponent", "model"), values) for name, values in probs.items()},
+        coords={"exponent": EXPONENTS, "model": table.index.to_numpy()},
+    )

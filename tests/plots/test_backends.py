@@ -1,0 +1,68 @@
+"""Every plot is drawn by every backend, and handed what is meant for the backend."""
+
+import matplotlib.pyplot as plt
+import pytest
+from arviz_plots import PlotCollection
+
+from pymc_statespace_filters import (
+    plot_average,
+    plot_evidence,
+    plot_model_probabilities,
+    plot_prior_sensitivity,
+)
+from pymc_statespace_filters.plots.prior_sensitivity import _sensitivity
+
+PLOTS = [
+    (plot_evidence, "table"),
+    (plot_evidence, "estimates"),
+    (plot_model_probabilities, "table"),
+    (plot_prior_sensitivity, "table"),
+    (plot_prior_sensitivity, "sensitivity"),
+    (plot_average, "curve_average"),
+    (plot_average, "scalar_average"),
+    (plot_average, "average_in_panels"),
+]
+
+
+@pytest.fixture
+def sensitivity(table):
+    # What a table gives against the exponent, and something of the same form against the width.
+    found = _sensitivity(table)
+    of_widths = found.rename({name: f"width_{name}" for name in found}).rename(exponent="width")
+    return found.merge(of_widths.assign_coords(width=10 ** (of_widths["width"] - 2)))
+
+
+@pytest.mark.parametrize("backend", ["none", "matplotlib", "plotly", "bokeh"])
+@pytest.mark.parametrize(("plot", "result"), PLOTS)
+def test_every_backend(plot, result, backend, request):
+    collection = plot(request.getfixturevalue(result), backend=backend)
+    assert isinstance(collection, PlotCollection)
+    assert collection.backend == backend
+
+
+@pytest.mark.parametrize(("plot", "result"), PLOTS)
+def test_the_default_backend_and_the_size_of_the_figure(plot, result, request):
+    figure_kwargs = {"figsize": (7, 3)}
+    collection = plot(request.getfixturevalue(result), figure_kwargs=figure_kwargs)
+    figure = collection.viz["figure"].item()
+    assert isinstance(figure, plt.Figure)
+    assert tuple(figure.get_size_inches()) == (7, 3)
+    assert figure_kwargs == {"figsize": (7, 3)}
+
+
+def test_colours_of_the_user(curve_average):
+    colours = ["#111111", "#222222", "#333333"]
+    collection = plot_average(curve_average, backend="none", color=colours)
+    drawn = [curve.item()["color"] for curve in collection.viz["curve"]["force"]]
+    assert drawn == colours
+
+
+def test_nothing_in_a_picture_overlaps(table):
+    figure = plot_model_probabilities(table).viz["figure"].item()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    boxes = [text.get_window_extent() for text in (*axes.texts, *axes.get_yticklabels())]
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+        assert figure.bbox.containsx(box.x0)
+        assert figure.bbox.containsx(box.x1)

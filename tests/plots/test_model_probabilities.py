@@ -1,0 +1,53 @@
+"""Probabilities, their intervals and the mark of what is undecided, as drawn."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pymc_statespace_filters import ModelError, plot_model_probabilities
+from tests.plots.drawn import drawn
+
+
+def test_points_and_intervals(table):
+    collection = plot_model_probabilities(table, backend="none")
+    for name, row in table.iterrows():
+        bar = drawn(collection, "interval")[name]["x"]
+        np.testing.assert_array_equal(bar, [row["prob_low"], row["prob_high"]])
+        text = drawn(collection, "text")[name]
+        assert text["x"].item() == row["prob"]
+
+
+def test_undecided_models_have_open_marks_and_a_word(table):
+    assert dict(table["undecided"]) == {"cubic": True, "quintic": True, "linear": False}
+    collection = plot_model_probabilities(table, backend="none")
+    for name, undecided in table["undecided"].items():
+        marked, plain = (drawn(collection, kind)[name] for kind in ("undecided", "decided"))
+        assert (marked is None, plain is None) == (not undecided, undecided)
+        mark = marked or plain
+        assert mark["x"].item() == table.loc[name, "prob"]
+        assert mark["facecolor"] == ("B0" if undecided else "C0")
+        assert ("undecided" in drawn(collection, "text")[name]["string"]) == undecided
+
+
+@pytest.mark.parametrize(
+    ("prob", "text"),
+    [(0.4, "0.40"), (0.98765, "0.99"), (0.9975, "0.9975"), (0.0098, "0.01"), (7.6e-10, "8e-10")],
+)
+def test_the_number(prob, text):
+    one = pd.DataFrame(
+        {"prob": [prob], "prob_low": [prob], "prob_high": [prob], "undecided": [False]}, index=["a"]
+    )
+    collection = plot_model_probabilities(one, backend="none")
+    assert drawn(collection, "text")["a"]["string"] == text
+
+
+def test_unknown_intervals_are_not_drawn(table):
+    unknown = table.assign(prob_low=np.nan, prob_high=np.nan)
+    collection = plot_model_probabilities(unknown, backend="none")
+    assert set(drawn(collection, "interval").values()) == {None}
+    assert drawn(collection, "decided")["linear"] is not None
+
+
+def test_what_is_refused():
+    with pytest.raises(ModelError, match="table must be one of compare_evidence, got"):
+        plot_model_probabilities(pd.DataFrame({"prob": [1.0]}))
