@@ -100,6 +100,7 @@ def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
 def band(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
     """Fill the space between two curves, the ends of the dimension `BOUND`."""
     (dim,) = (dim for dim in da.dims if dim != BOUND)
+    da = da.dropna(dim)  # a backend that fills a polygon cannot have gaps in it
     low, high = da.transpose(BOUND, dim).values
     return backend_from_object(target).fill_between_y(da[dim].values, low, high, target, **kwargs)
 

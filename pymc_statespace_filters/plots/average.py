@@ -89,7 +89,7 @@ def plot_average(
         n_panels=math.prod(members.sizes[dim] for dim in panels),
         legend=True,
         cols=panels,
-        color=[*(f"C{i % 10}" for i in range(n_members)), "B1"],
+        color=[*(f"C{i}" for i in range(n_members)), "B1"],
         width=[*[1.5] * n_members, 3],
     )
     if panels:

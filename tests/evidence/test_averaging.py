@@ -157,6 +157,11 @@ def test_dims_in_another_order():
     xr.testing.assert_equal(average, average_models(TWO, {"a": 1, "b": 1}, line, random_seed=1))
 
 
+def test_a_name_that_is_taken():
+    average = average_models(TWO, {"a": 1, "b": 1}, lambda p: line(p).rename("x"), random_seed=1)
+    assert list(average["posterior"].data_vars) == ["average"]
+
+
 def test_arviz_takes_it_and_it_can_be_stored(tmp_path):
     average = average_models(TWO, {"a": 1, "b": 3}, line, random_seed=1)
     assert list(az.summary(average)["mean"].index) == [f"average[{x}]" for x in (-1.0, 0.5, 2.0)]
@@ -183,6 +188,7 @@ def test_arviz_takes_it_and_it_can_be_stored(tmp_path):
         ({"function": {"a": slope}}, r"function must be given for exactly the models"),
         ({"function": lambda posterior: 3.0}, "must return a DataArray.*'a' it returned 3.0"),
         ({"function": lambda posterior: posterior["k"].mean("chain")}, "'chain' and 'draw'"),
+        ({"function": lambda posterior: posterior["k"].expand_dims(model=1)}, "without 'model'"),
         ({"function": {"a": slope, "b": line}}, "for 'a' and 'b' arrays of different dims"),
         ({"function": {"a": line, "b": lambda p: line(p)[..., 1:]}}, "length along 'x', 3, 2"),
         (
