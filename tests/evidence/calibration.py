@@ -1,0 +1,203 @@
+"""Are the errors of the estimators what they say? Replications where the truth is known."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pymc as pm
+from scipy.stats import chi2, norm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior import posterior_of
+from tests.evidence.targets import (
+    Banana,
+    Regression,
+    StateSpace,
+    TwoModes,
+    bounded,
+    gamma_distributed,
+    half_normally_distributed,
+)
+
+CORRELATION = 0.8  # of neighbouring draws: nine of them are worth one
+SQUARES = (0.7, 1.4)  # where the mean squared z is to lie
+MOST_FOR_THE_PRIOR = 4  # parameters
+BIAS = 0.25  # how far the mean z may be from zero
+
+
+class Drawn:
+    """Draws made of normals, 4 chains."""
+
+    def __init__(self, target, n_draws, noise_sd=0.0):
+        self._target, self._n_draws, self._noise_sd = target, n_draws, noise_sd
+        self.log_evidence = target.log_evidence
+
+    def posterior(self, run):
+        return self._target.posterior(
+            (4, self._n_draws),
+            np.random.default_rng([2013, run]),
+            correlation=CORRELATION,
+            noise_sd=self._noise_sd,
+        )
+
+
+class Sampled:
+    """The same state-space model in PyMC, sampled by ``sample_dram`` with a particle filter."""
+
+    def __init__(self, n_draws, n_particles):
+        target = StateSpace()
+        self.log_evidence = target.log_evidence
+        self._n_draws = n_draws
+        with pm.Model() as self._model:
+            pm.Normal("phi", target.PHI.mean(), target.PHI.std())
+            pm.LogNormal("spread", np.log(target.SPREAD.median()), target.SPREAD.args[0])
+            psf.StateSpace(
+                "d",
+                target.SYSTEM,
+                psf.BootstrapPF(n_particles),
+                steps=target.steps,
+                observed=target.record,
+            )
+        self._density = ModelDensity(self._model)
+
+    def posterior(self, run):
+        idata = psf.sample_dram(
+            self._n_draws,
+            tune=1000,
+            chains=4,
+            model=self._model,
+            random_seed=run,
+            progressbar=False,
+        )
+        return posterior_of(idata, self._density)[0]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A target, how it is drawn, and how often.
+
+    Attributes
+    ----------
+    make : callable
+        The target with its draws, made when it is first asked for.
+    n_parameters : int
+    n_runs : int
+    """
+
+    make: Callable[[], Any]
+    n_parameters: int
+    n_runs: int = 200
+
+    @property
+    def source(self):
+        return _made(self.make)
+
+
+@cache
+def _made(make):
+    return make()
+
+
+def regression(k):
+    return Regression(k, 3 * k + 10, np.random.default_rng([2013, k]))
+
+
+CASES = {
+    "regression, 2": Case(lambda: Drawn(regression(2), 1000), 2),
+    "regression, 4": Case(lambda: Drawn(regression(4), 1000), 4),
+    "regression, 12": Case(lambda: Drawn(regression(12), 2500), 12),
+    "regression, 20": Case(lambda: Drawn(regression(20), 5000), 20),
+    "two modes": Case(lambda: Drawn(TwoModes(2), 1000), 2),
+    "half-normal, log": Case(lambda: Drawn(half_normally_distributed(), 1000), 1),
+    "Gamma, log": Case(lambda: Drawn(gamma_distributed(), 1000), 1),
+    "uniform, at its bound": Case(lambda: Drawn(bounded(), 1000), 1),
+    "banana": Case(lambda: Drawn(Banana(12), 2500), 12),
+    "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4),
+    "state space, EKF": Case(lambda: Drawn(StateSpace(), 1000), 2, 20),
+    "state space, BootstrapPF": Case(lambda: Sampled(5000, 50), 2, 20),
+}
+
+
+class Calibration(NamedTuple):
+    """What replications of an estimator gave.
+
+    Attributes
+    ----------
+    n_runs : int
+    bias : float
+        Mean error.
+    reported : float
+        Root mean square of the standard errors that were reported.
+    actual : float
+        Standard deviation of the estimates.
+    mean_z, mean_square : float
+        Of errors divided by their reported standard errors.
+    doubted : float
+        Share of the replications in which the estimator itself raised a doubt.
+    n_evaluations : float
+        Of the log-density, on average.
+    """
+
+    n_runs: int
+    bias: float
+    reported: float
+    actual: float
+    mean_z: float
+    mean_square: float
+    doubted: float
+    n_evaluations: float
+
+    @property
+    def is_right(self):
+        """Whether the mean squared z and the mean z lie where they are to lie.
+
+        Right errors of 200 replications are outside once in two thousand times; of 20 often, so
+        that the limits are then so wide that right errors are outside as rarely.
+        """
+        low, high, furthest = *SQUARES, BIAS
+        if self.n_runs < 200:
+            low, high = chi2.ppf([0.00025, 0.99975], self.n_runs) / self.n_runs
+            furthest = norm.isf(0.00025) / self.n_runs**0.5
+        return low <= self.mean_square <= high and abs(self.mean_z) <= furthest
+
+
+def calibrate(estimator, source, n_runs):
+    """Replicate 0, 1, ..., each with draws, and a stream for the estimator, of its own."""
+    errors, reported, doubted, n_evaluations = [], [], [], []
+    for run in range(n_runs):
+        posterior, count = _counted(source.posterior(run))
+        found = estimator.estimate(posterior, rng=np.random.default_rng([3, run]))
+        errors.append(found.log_evidence - source.log_evidence)
+        reported.append(found.se)
+        doubted.append(bool(found.doubts))
+        n_evaluations.append(count())
+    z = np.divide(errors, reported)
+    return Calibration(
+        n_runs,
+        bias=np.mean(errors),
+        reported=np.mean(np.square(reported)) ** 0.5,
+        actual=np.std(errors),
+        mean_z=np.mean(z),
+        mean_square=np.mean(z**2),
+        doubted=np.mean(doubted),
+        n_evaluations=np.mean(n_evaluations),
+    )
+
+
+def _counted(posterior):
+    """The posterior, and a function that tells how many points were evaluated."""
+    n_points = [0]
+
+    def evaluate(x, rng):
+        n_points[0] += len(x)
+        return posterior.evaluate(x, rng)
+
+    return replace(posterior, evaluate=evaluate), lambda: n_points[0]
+
+
+def applies(estimator, case):
+    """Whether an estimator is asked about a target: an average over the prior is for few."""
+    return estimator != "prior_monte_carlo" or case.n_parameters <= MOST_FOR_THE_PRIOR
