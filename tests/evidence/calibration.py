@@ -6,16 +6,16 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import pymc as pm
 from scipy.stats import chi2, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior import posterior_of
+from tests.evidence import double_well
+from tests.evidence.state_space import StateSpace
 from tests.evidence.targets import (
     Banana,
     Regression,
-    StateSpace,
     TwoModes,
     bounded,
     gamma_distributed,
@@ -45,34 +45,26 @@ class Drawn:
 
 
 class Sampled:
-    """The same state-space model in PyMC, sampled by ``sample_dram`` with a particle filter."""
+    """Draws of a PyMC model by ``sample_dram``, 4 chains, as a user has them."""
 
-    def __init__(self, n_draws, n_particles):
-        target = StateSpace()
-        self.log_evidence = target.log_evidence
-        self._n_draws = n_draws
-        with pm.Model() as self._model:
-            pm.Normal("phi", target.PHI.mean(), target.PHI.std())
-            pm.LogNormal("spread", np.log(target.SPREAD.median()), target.SPREAD.args[0])
-            psf.StateSpace(
-                "d",
-                target.SYSTEM,
-                psf.BootstrapPF(n_particles),
-                steps=target.steps,
-                observed=target.record,
-            )
-        self._density = ModelDensity(self._model)
+    def __init__(self, model, log_evidence, n_draws):
+        self._model, self._n_draws = model, n_draws
+        self.log_evidence = log_evidence
+        self._density = ModelDensity(model)
+        self._posteriors = {}
 
     def posterior(self, run):
-        idata = psf.sample_dram(
-            self._n_draws,
-            tune=1000,
-            chains=4,
-            model=self._model,
-            random_seed=run,
-            progressbar=False,
-        )
-        return posterior_of(idata, self._density)[0]
+        if run not in self._posteriors:
+            idata = psf.sample_dram(
+                self._n_draws,
+                tune=1000,
+                chains=4,
+                model=self._model,
+                random_seed=run,
+                progressbar=False,
+            )
+            self._posteriors[run] = posterior_of(idata, self._density)[0]
+        return self._posteriors[run]
 
 
 @dataclass(frozen=True)
@@ -85,11 +77,13 @@ class Case:
         The target with its draws, made when it is first asked for.
     n_parameters : int
     n_runs : int
+    is_noisy : bool
     """
 
     make: Callable[[], Any]
     n_parameters: int
     n_runs: int = 200
+    is_noisy: bool = False
 
     @property
     def source(self):
@@ -105,6 +99,16 @@ def regression(k):
     return Regression(k, 3 * k + 10, np.random.default_rng([2013, k]))
 
 
+def pseudo_marginal():
+    """The target of the row above, now sampled with a particle filter."""
+    target = StateSpace()
+    return Sampled(target.model(psf.BootstrapPF(50)), target.log_evidence, 5000)
+
+
+def pseudo_marginal_double_well():
+    return Sampled(double_well.model(psf.BootstrapPF(50)), double_well.LOG_EVIDENCE, 5000)
+
+
 CASES = {
     "regression, 2": Case(lambda: Drawn(regression(2), 1000), 2),
     "regression, 4": Case(lambda: Drawn(regression(4), 1000), 4),
@@ -115,9 +119,10 @@ CASES = {
     "Gamma, log": Case(lambda: Drawn(gamma_distributed(), 1000), 1),
     "uniform, at its bound": Case(lambda: Drawn(bounded(), 1000), 1),
     "banana": Case(lambda: Drawn(Banana(12), 2500), 12),
-    "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4),
+    "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4, is_noisy=True),
     "state space, EKF": Case(lambda: Drawn(StateSpace(), 1000), 2, 20),
-    "state space, BootstrapPF": Case(lambda: Sampled(5000, 50), 2, 20),
+    "state space, BootstrapPF": Case(pseudo_marginal, 2, 20, is_noisy=True),
+    "double well, BootstrapPF": Case(pseudo_marginal_double_well, 2, 20, is_noisy=True),
 }
 
 
@@ -199,5 +204,7 @@ def _counted(posterior):
 
 
 def applies(estimator, case):
-    """Whether an estimator is asked about a target: an average over the prior is for few."""
+    """Whether an estimator is for such a target: Laplace's approximation needs a curvature."""
+    if estimator == "laplace":
+        return not case.is_noisy
     return estimator != "prior_monte_carlo" or case.n_parameters <= MOST_FOR_THE_PRIOR

@@ -9,15 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
-from scipy.interpolate import PchipInterpolator, RectBivariateSpline
+from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solve
 from scipy.signal import lfilter
 from scipy.special import expit, log_expit, logit
-from scipy.stats import gamma, halfnorm, lognorm, multivariate_normal, norm, uniform
+from scipy.stats import gamma, halfnorm, multivariate_normal, norm, uniform
 
-import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.posterior import Posterior
-from tests.sampling.autoregression import autoregression
 
 
 def autoregressive(shape, correlation, rng):
@@ -255,43 +253,3 @@ class Banana(Target):
         shrinkage = self.SCALE[1] ** 2 / (self.SCALE[1] ** 2 + self.SD**2)
         others = shrinkage * seen + self.SD * np.sqrt(shrinkage) * z[..., 1:]
         return np.concatenate([first[..., None], others], axis=-1)
-
-
-class StateSpace(Target):
-    """An autoregression seen with noise, phi and spread unknown; the EKF's likelihood is exact.
-
-    Truth by quadrature in two dimensions; draws by quantiles of x_1, then of x_2 given x_1.
-    """
-
-    SYSTEM = autoregression()
-    PHI, SPREAD = norm(0.5, 0.3), lognorm(0.5, scale=0.7)
-    N_STEPS = 30
-    ENDS = ((-1.0, 2.0), (-4.5, 2.5))
-
-    def __init__(self, n_points=241):
-        self.n_normals = 2
-        self.prior = Independent((self.PHI, REAL), (self.SPREAD, POSITIVE))
-        self.steps = np.arange(1, self.N_STEPS + 1)
-        truth = {"phi": 0.8, "spread": 0.6}
-        record = psf.simulate(self.SYSTEM, truth, steps=self.steps, random_seed=3)
-        self.record = record["observations"].values
-
-        x, y = (np.linspace(*ends, n_points) for ends in self.ENDS)
-        grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-        log_joint = self.log_density(grid.reshape(-1, 2)).reshape(n_points, n_points)
-        along = RectBivariateSpline(x, y, log_joint)
-        lines = [Line(lambda t, x=x: along.ev(x, t), *self.ENDS[1], 2001) for x in x]
-        log_marginal = np.array([line.log_integral for line in lines])
-        self._line = Line(PchipInterpolator(x, log_marginal), *self.ENDS[0])
-        self.log_evidence = self._line.log_integral
-        z = np.linspace(-7.0, 7.0, 281)
-        self._given = RectBivariateSpline(x, z, [line.quantile(z) for line in lines])
-
-    def log_likelihood(self, x):
-        params = {"phi": x[:, 0], "spread": np.exp(x[:, 1])}
-        terms = psf.log_likelihood(self.SYSTEM, psf.EKF(), params, self.record, steps=self.steps)
-        return terms.sum(axis=-1)
-
-    def transport(self, z):
-        first = self._line.quantile(z[..., 0])
-        return np.stack([first, self._given.ev(first, z[..., 1])], axis=-1)

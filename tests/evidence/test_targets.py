@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from tests.evidence.state_space import StateSpace
 from tests.evidence.targets import (
     Banana,
     Regression,
-    StateSpace,
     TwoModes,
     bounded,
     gamma_distributed,
