@@ -99,6 +99,11 @@ def regression(k):
     return Regression(k, 3 * k + 10, np.random.default_rng([2013, k]))
 
 
+def sampled_regression(k):
+    target = regression(k)
+    return Sampled(target.model(), target.log_evidence, 10_000)
+
+
 def pseudo_marginal():
     """The target of the row above, now sampled with a particle filter."""
     target = StateSpace()
@@ -123,6 +128,15 @@ CASES = {
     "state space, EKF": Case(lambda: Drawn(StateSpace(), 1000), 2, 20),
     "state space, BootstrapPF": Case(pseudo_marginal, 2, 20, is_noisy=True),
     "double well, BootstrapPF": Case(pseudo_marginal_double_well, 2, 20, is_noisy=True),
+}
+
+
+# How small an error 4 x 10 000 draws give.
+LONG_CHAINS = {
+    "regression, 4, autoregressive": Case(lambda: Drawn(regression(4), 10_000), 4, 20),
+    "regression, 4, sample_dram": Case(lambda: sampled_regression(4), 4, 20),
+    "regression, 12, autoregressive": Case(lambda: Drawn(regression(12), 10_000), 12, 20),
+    "regression, 12, sample_dram": Case(lambda: sampled_regression(12), 12, 20),
 }
 
 

@@ -11,14 +11,15 @@ import numpy as np
 import pandas as pd
 
 from pymc_statespace_filters.evidence.estimators import ESTIMATORS
-from tests.evidence.calibration import CASES, Calibration, applies, calibrate
+from tests.evidence.calibration import CASES, LONG_CHAINS, Calibration, applies, calibrate
 
 STATIC = Path(__file__).parents[2] / "docs" / "_static"
-RESULTS, TABLE = STATIC / "evidence_calibration.csv", STATIC / "evidence_calibration.inc"
+RESULTS = STATIC / "evidence_calibration.csv"
+TABLE, LONG_TABLE = STATIC / "evidence_calibration.inc", STATIC / "evidence_long_chains.inc"
 KEYS = ["target", "estimator"]
 HEADS = (
-    "target", "estimator", "bias", "reported error", "actual error", "mean z", "mean z²",
-    "doubted", "evaluations", "verdict",
+    "target (replications)", "estimator", "bias", "reported error", "actual error",
+    "mean z", "mean z²", "doubted", "evaluations", "verdict",
 )  # fmt: skip
 
 
@@ -31,27 +32,27 @@ def verdict(result):
     return "doubted" if result.doubted > 0.5 else "WRONG"
 
 
-def table(results):
+def table(cases, results):
     """Markdown, a row for each pair, in the order of targets and estimators."""
     lines = [f"| {' | '.join(HEADS)} |", "| --- " * len(HEADS) + "|"]
-    for target, case in CASES.items():
-        title = target if case.n_runs == 200 else f"{target} ({case.n_runs} replications)"
+    for target, case in cases.items():
+        title = f"{target} ({case.n_runs})"
         for estimator in ESTIMATORS:
             if (target, estimator) not in results:
                 continue
             r = results[target, estimator]
             numbers = f"{r.bias:+.4f} | {r.reported:.4f} | {r.actual:.4f}"
             scores = f"{r.mean_z:+.2f} | {r.mean_square:.2f} | {r.doubted:.0%}"
-            count = f"{r.n_evaluations:.0f}"
             lines.append(
-                f"| {title} | {estimator} | {numbers} | {scores} | {count} | {verdict(r)} |"
+                f"| {title} | {estimator} | {numbers} | {scores} | {r.n_evaluations:.0f} "
+                f"| {verdict(r)} |"
             )
             title = ""
     return "\n".join(lines) + "\n"
 
 
 def kept():
-    """Results of earlier runs."""
+    """Results of earlier runs, by target and estimator."""
     if not RESULTS.exists():
         return {}
     rows = pd.read_csv(RESULTS).set_index(KEYS)
@@ -60,16 +61,16 @@ def kept():
 
 def main(names):
     results = kept()
-    for target, case in CASES.items():
+    for target, case in (CASES | LONG_CHAINS).items():
         for name, estimator in ESTIMATORS.items():
-            if applies(name, case) and (not names or {target, name} & set(names)):
-                results[target, name] = calibrate(estimator, case.source, case.n_runs)
-                frame = pd.DataFrame(
-                    [dict(zip(KEYS, key, strict=True)) | r._asdict() for key, r in results.items()]
-                )
-                frame.to_csv(RESULTS, index=False, float_format="%.6g")
-    TABLE.write_text(table(kept()))
+            if not applies(name, case) or (names and not {target, name} & names):
+                continue
+            results[target, name] = calibrate(estimator, case.source, case.n_runs)
+            rows = [dict(zip(KEYS, key, strict=True)) | r._asdict() for key, r in results.items()]
+            pd.DataFrame(rows).to_csv(RESULTS, index=False, float_format="%.6g")
+    for cases, path in ((CASES, TABLE), (LONG_CHAINS, LONG_TABLE)):
+        path.write_text(table(cases, kept()))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(set(sys.argv[1:]))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import pymc as pm
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solve
@@ -119,6 +120,13 @@ class Regression(Target):
         self.log_evidence = multivariate_normal(np.zeros(n), marginal).logpdf(self.y)
         self.prior = Independent(*[(norm(0, scale), REAL)] * k)
         self.n_normals = k
+
+    def model(self):
+        """The same in PyMC."""
+        with pm.Model() as model:
+            w = pm.Normal("w", 0, self.scale, shape=self.n_normals)
+            pm.Normal("y", self.x @ w, self.sd, observed=self.y)
+        return model
 
     def log_likelihood(self, x):
         return norm.logpdf(self.y, x @ self.x.T, self.sd).sum(axis=-1)
