@@ -49,11 +49,14 @@ def average_models(
     Returns
     -------
     xarray.DataTree
-        ``posterior``: the mixture, named as the function names its array (``average`` if it does
-        not, or not alike), dims chain (1), draw (`n_draws`) and the function's own; coordinate
-        ``model`` (chain, draw): where a draw is from. ``members``: the same under each model alone,
-        dims model, chain (1), draw (as many for each, none twice, `n_draws` at most) and the
-        function's own; coordinate ``prob`` (model): the share of the mixture that was aimed at.
+        ``posterior``
+            The mixture, named as the arrays are, or else as the function is (``average`` if both
+            have no name). Dims chain (1), draw (`n_draws`) and the function's own; coordinate
+            ``model`` (chain, draw): where a draw is from.
+        ``members``
+            The same under each model alone. Dims model, chain (1), draw (as many for each, none
+            twice, `n_draws` at most) and the function's own; coordinate ``prob`` (model): the share
+            of the mixture that was aimed at.
 
     Raises
     ------
@@ -105,14 +108,15 @@ def average_models(
     n_alone = min(n_draws, *(len(sample) for sample in samples.values()))
     alone = np.stack([sample[_spread(len(sample), n_alone, rng)] for sample in samples.values()])
 
-    label, dims, coords = _form(arrays)
+    label = _label(arrays, function)
+    own = _without_samples(next(iter(arrays.values())))
     posterior = xr.Dataset(
-        {label: ((*SAMPLE_DIMS, *dims), np.concatenate(chosen)[order][None])},
-        coords={"chain": [0], "draw": np.arange(n_draws), **coords},
+        {label: ((*SAMPLE_DIMS, *own.dims), np.concatenate(chosen)[order][None])},
+        coords={"chain": [0], "draw": np.arange(n_draws), **own.coords},
     ).assign_coords(model=(SAMPLE_DIMS, origin[order][None]))
     members = xr.Dataset(
-        {label: (("model", *SAMPLE_DIMS, *dims), alone[:, None])},
-        coords={"model": names, "chain": [0], "draw": np.arange(n_alone), **coords},
+        {label: (("model", *SAMPLE_DIMS, *own.dims), alone[:, None])},
+        coords={"model": names, "chain": [0], "draw": np.arange(n_alone), **own.coords},
     ).assign_coords(prob=("model", prob))
     return xr.DataTree.from_dict({"posterior": posterior, "members": members})
 
@@ -219,12 +223,15 @@ def _difference(one: xr.DataArray, other: xr.DataArray) -> str:
     return ""
 
 
-def _form(arrays: Mapping[str, xr.DataArray]) -> tuple[str, tuple, dict]:
-    """Return name, dims and coordinates of the average."""
-    reference = _without_samples(next(iter(arrays.values())))
-    labels = {array.name for array in arrays.values()} - set(reference.coords)
-    label = labels.pop() if len(labels) == 1 else None
-    return str(label or "average"), reference.dims, dict(reference.coords)
+def _label(arrays: Mapping[str, xr.DataArray], function: Function | Mapping[str, Function]) -> str:
+    """Name the average as its arrays are named, or else as the function is."""
+    own = {array.name for array in arrays.values()}
+    of_function = getattr(function, "__name__", "<mapping>")
+    taken = set(next(iter(arrays.values())).coords)
+    for label in (own.pop() if len(own) == 1 else None, of_function):
+        if label and label not in taken and not str(label).startswith("<"):
+            return str(label)
+    return "average"
 
 
 def _own(array: xr.DataArray) -> tuple:

@@ -110,8 +110,31 @@ def interval(low: xr.Dataset, high: xr.Dataset) -> xr.Dataset:
     return xr.concat([low, high], dim=BOUND).assign_coords({BOUND: ["lower", "upper"]})
 
 
+def note(
+    da: xr.DataArray,
+    target: Any,
+    *,
+    y: Any,
+    texts: xr.DataArray,
+    middle: float,
+    **kwargs: Any,
+) -> Any:
+    """Write a text above the point of a row, from there towards the middle of the panel."""
+    return backend_from_object(target).text(
+        da.item(),
+        np.asarray(y).item() + 0.15,
+        texts.item(),
+        target,
+        horizontal_align="right" if da.item() > middle else "left",
+        vertical_align="bottom",
+        **kwargs,
+    )
+
+
 def written(prob: float) -> str:
     """Write a probability with the digits that matter, near zero and near one too."""
+    if prob < 1e-6:
+        return "< 1e-6"
     if prob < 0.01:
         return f"{prob:.1g}"
     return f"{prob:.2f}" if prob < 0.99 else f"{prob:.4f}"

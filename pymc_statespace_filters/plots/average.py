@@ -42,7 +42,7 @@ def plot_average(
     -------
     arviz_plots.PlotCollection
         Visuals ``curve``, ``band``, ``lower`` and ``upper``, or ``density``, along ``model``: the
-        members, and the average after them.
+        average, and then its members, whose lines lie upon it.
 
     Raises
     ------
@@ -89,8 +89,8 @@ def plot_average(
         n_panels=math.prod(members.sizes[dim] for dim in panels),
         legend=True,
         cols=panels,
-        color=[*(f"C{i}" for i in range(n_members)), "B1"],
-        width=[*[1.5] * n_members, 3],
+        color=["B1", *(f"C{i}" for i in range(n_members))],
+        width=[4, *[1.5] * n_members],
     )
     if panels:
         collection.map(
@@ -129,13 +129,13 @@ def _numeric_dims(array: xr.DataArray) -> list[Hashable]:
 
 
 def _means(members: xr.Dataset, mixture: xr.Dataset) -> xr.Dataset:
-    """Return the means under each model, and after them that of the average."""
+    """Return the mean of the average, and after it those under each model."""
     of_average = mixture.azstats.mean().expand_dims(model=[AVERAGE])
-    return xr.concat([members.azstats.mean().drop_vars("prob"), of_average], "model")
+    return xr.concat([of_average, members.azstats.mean().drop_vars("prob")], "model")
 
 
 def _densities(members: xr.Dataset) -> xr.Dataset:
-    """Return densities of the members times their weights, and of the average: the sum of these."""
+    """Return the density of the average, and those of its members times weight: its summands."""
 
     def weighted(x: np.ndarray, y: np.ndarray, prob: np.ndarray) -> np.ndarray:
         shown = x[prob >= min(PROB_SHOWN, prob.max())]
@@ -144,7 +144,7 @@ def _densities(members: xr.Dataset) -> xr.Dataset:
             weight * np.interp(grid, at, density, left=0, right=0)
             for at, density, weight in zip(x, y, prob, strict=True)
         ]
-        return np.stack([[grid, density] for density in (*each, np.sum(each, axis=0))], axis=1)
+        return np.stack([[grid, density] for density in (np.sum(each, axis=0), *each)], axis=1)
 
     (kernel_densities,) = members.azstats.kde().data_vars.values()
     densities = xr.apply_ufunc(
@@ -157,7 +157,7 @@ def _densities(members: xr.Dataset) -> xr.Dataset:
         exclude_dims={"model"},
         vectorize=True,
     )
-    coords = {"plot_axis": ["x", "y"], "model": [*members["model"].values, AVERAGE]}
+    coords = {"plot_axis": ["x", "y"], "model": [AVERAGE, *members["model"].values]}
     return densities.assign_coords(coords).to_dataset(name=kernel_densities.name)
 
 

@@ -1,5 +1,6 @@
 """Log-evidences with their errors, of rival models or of several estimators."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval
+from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval, note
 
 
 def plot_evidence(
@@ -35,7 +36,7 @@ def plot_evidence(
     Returns
     -------
     arviz_plots.PlotCollection
-        Visuals ``point``, ``one_se``, ``two_se``, ``x_label``.
+        Visuals ``point``, ``one_se``, ``two_se``, ``text``, ``x_label``.
 
     Raises
     ------
@@ -58,6 +59,10 @@ def plot_evidence(
         bars = interval(points - n_errors * table["se"], points + n_errors * table["se"])
         collection.map(line_x, label, data=bars, width=width, color="C0")
     collection.map(scatter_x, "point", color="C0")
+    values = table["log_evidence"]
+    texts = xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object])
+    middle = (values.min() + values.max()).item() / 2
+    collection.map(note, "text", texts=texts, middle=middle, color="B2")
     text = "log-evidence (nats), 1 and 2 standard errors"
     collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
     return collection
@@ -82,3 +87,7 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dat
         "idata_or_table must be a table of compare_evidence, a result of estimate_evidence or a "
         f"DataTree with a group 'evidence', got {given!r}"
     )
+
+
+def _text(log_evidence: float, se: float) -> str:
+    return f"{log_evidence:.2f}" if math.isnan(se) else f"{log_evidence:.2f} ± {se:.2f}"

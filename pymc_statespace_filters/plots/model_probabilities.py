@@ -2,15 +2,13 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval, written
+from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval, note, written
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 
@@ -67,24 +65,12 @@ def plot_model_probabilities(
         edgecolor="C0",
         width=1.5,
     )
-    collection.map(_probability, "text", undecided=undecided, color="B2")
+    texts = xr.apply_ufunc(_text, data["prob"], undecided, vectorize=True, output_dtypes=[object])
+    collection.map(note, "text", texts=texts, middle=0.5, color="B2")
     collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
     collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the model")
     return collection
 
 
-def _probability(
-    da: xr.DataArray, target: Any, *, y: float, undecided: xr.DataArray, **kwargs: Any
-) -> Any:
-    """Write the number above its mark, towards the middle of the panel."""
-    side = "right" if da.item() > 0.5 else "left"
-    text = written(da.item()) + (", undecided" if undecided.item() else "")
-    return backend_from_object(target).text(
-        da.item(),
-        np.asarray(y).item() + 0.15,
-        text,
-        target,
-        horizontal_align=side,
-        vertical_align="bottom",
-        **kwargs,
-    )
+def _text(prob: float, undecided: bool) -> str:
+    return written(prob) + (", undecided" if undecided else "")

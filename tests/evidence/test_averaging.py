@@ -49,9 +49,9 @@ def test_moments_are_those_of_the_mixture():
 def test_form_of_the_result():
     average = average_models(TWO, {"a": 1, "b": 1}, line, n_draws=70, random_seed=1)
     mixture, members = average["posterior"], average["members"]
-    assert dict(mixture["average"].sizes) == {"chain": 1, "draw": 70, "x": 3}
+    assert dict(mixture["line"].sizes) == {"chain": 1, "draw": 70, "x": 3}
     assert mixture["model"].dims == ("chain", "draw")
-    assert dict(members["average"].sizes) == {"model": 2, "chain": 1, "draw": 50, "x": 3}
+    assert dict(members["line"].sizes) == {"model": 2, "chain": 1, "draw": 50, "x": 3}
     assert list(members["model"].values) == ["a", "b"]
     for group in (mixture, members):
         xr.testing.assert_equal(group["x"], X["x"])
@@ -63,7 +63,7 @@ def test_every_draw_is_a_whole_one_of_the_model_that_it_names():
         one = average.sel(chain=0, draw=draw)
         source = TWO[one["model"].item()]["posterior"]["k"].values
         curves = source.reshape(-1, 1) * X.values
-        assert (curves == one["average"].values).all(axis=1).sum() == 1
+        assert (curves == one["line"].values).all(axis=1).sum() == 1
 
 
 def test_models_are_mingled():
@@ -154,18 +154,30 @@ def test_dims_in_another_order():
         {"a": line, "b": lambda posterior: line(posterior).transpose("x", "draw", "chain")},
         random_seed=1,
     )
-    xr.testing.assert_equal(average, average_models(TWO, {"a": 1, "b": 1}, line, random_seed=1))
+    same = average_models(TWO, {"a": 1, "b": 1}, {"a": line, "b": line}, random_seed=1)
+    xr.testing.assert_equal(average, same)
 
 
-def test_a_name_that_is_taken():
-    average = average_models(TWO, {"a": 1, "b": 1}, lambda p: line(p).rename("x"), random_seed=1)
-    assert list(average["posterior"].data_vars) == ["average"]
+def test_names():
+    def name_of(function):
+        average = average_models(TWO, {"a": 1, "b": 1}, function, random_seed=1)
+        (name,) = average["posterior"].data_vars
+        assert list(average["members"].data_vars) == [name]
+        return name
+
+    assert name_of(slope) == "k"  # as the array
+    assert name_of(line) == "line"  # as the function, if the array has no name
+    assert name_of(lambda posterior: line(posterior).rename("force")) == "force"
+    assert name_of(lambda posterior: line(posterior)) == "average"
+    assert name_of({"a": line, "b": line}) == "average"
+    assert name_of({"a": slope, "b": lambda posterior: slope(posterior).rename("c")}) == "average"
+    assert name_of(lambda posterior: line(posterior).rename("x")) == "average"  # it is taken
 
 
 def test_arviz_takes_it_and_it_can_be_stored(tmp_path):
     average = average_models(TWO, {"a": 1, "b": 3}, line, random_seed=1)
-    assert list(az.summary(average)["mean"].index) == [f"average[{x}]" for x in (-1.0, 0.5, 2.0)]
-    assert az.hdi(average)["average"].sizes["ci_bound"] == 2
+    assert list(az.summary(average)["mean"].index) == [f"line[{x}]" for x in (-1.0, 0.5, 2.0)]
+    assert az.hdi(average)["line"].sizes["ci_bound"] == 2
     az.plot_forest(average, backend="none")
     average.to_netcdf(tmp_path / "average.nc")
     xr.testing.assert_equal(xr.open_datatree(tmp_path / "average.nc").load(), average)

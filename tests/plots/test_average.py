@@ -13,7 +13,7 @@ def test_a_curve_has_means_and_intervals(curve_average):
     collection = plot_average(curve_average, backend="none")
     force = curve_average["posterior"]["force"]
     curves = drawn(collection, "curve")
-    assert list(curves) == ["linear", "cubic", "average"]
+    assert list(curves) == ["average", "linear", "cubic"]
     np.testing.assert_allclose(curves["average"]["y"], force.mean(["chain", "draw"]))
     np.testing.assert_array_equal(curves["average"]["x"], force["displacement"])
     members = curve_average["members"]["force"].mean(["chain", "draw"])
@@ -62,7 +62,7 @@ def test_names_become_panels(average_in_panels):
 def test_the_legend_tells_the_probabilities(curve_average):
     figure = plot_average(curve_average).viz["figure"].item()
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["linear (0.25)", "cubic (0.75)", "average"]
+    assert labels == ["average", "linear (0.25)", "cubic (0.75)"]
 
 
 def test_two_dimensions_with_numbers_are_refused(draws):

@@ -57,8 +57,9 @@ def test_colours_of_the_user(curve_average):
     assert drawn == colours
 
 
-def test_nothing_in_a_picture_overlaps(table):
-    figure = plot_model_probabilities(table).viz["figure"].item()
+@pytest.mark.parametrize("plot", [plot_evidence, plot_model_probabilities])
+def test_nothing_in_a_picture_overlaps(plot, table):
+    figure = plot(table).viz["figure"].item()
     figure.canvas.draw()
     (axes,) = figure.axes
     boxes = [text.get_window_extent() for text in (*axes.texts, *axes.get_yticklabels())]

@@ -24,6 +24,14 @@ def test_points_and_bars(table):
             )
 
 
+def test_numbers_beside_the_points(table, estimates):
+    text = drawn(plot_evidence(table, backend="none"), "text")
+    assert text["cubic"]["string"] == "-5.00 ± 0.30"
+    assert text["cubic"]["horizontal_align"] == "right"
+    assert text["linear"]["horizontal_align"] == "left"
+    assert drawn(plot_evidence(estimates, backend="none"), "text")["laplace"]["string"] == "-5.30"
+
+
 def test_an_estimate_without_error_has_no_bar(estimates):
     collection = plot_evidence(estimates, backend="none")
     assert drawn(collection, "point")["laplace"] is not None

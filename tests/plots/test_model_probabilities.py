@@ -31,7 +31,14 @@ def test_undecided_models_have_open_marks_and_a_word(table):
 
 @pytest.mark.parametrize(
     ("prob", "text"),
-    [(0.4, "0.40"), (0.98765, "0.99"), (0.9975, "0.9975"), (0.0098, "0.01"), (7.6e-10, "8e-10")],
+    [
+        (0.4, "0.40"),
+        (0.98765, "0.99"),
+        (0.9975, "0.9975"),
+        (0.0098, "0.01"),
+        (7.6e-5, "8e-05"),
+        (0.0, "< 1e-6"),
+    ],
 )
 def test_the_number(prob, text):
     one = pd.DataFrame(
