@@ -12,6 +12,7 @@ from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
 from pymc_statespace_filters.evidence.bridge import Bridge
 from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.importance import Importance
 from pymc_statespace_filters.evidence.laplace import Laplace
 from pymc_statespace_filters.evidence.report import Estimator, evidences_of
 from pymc_statespace_filters.evidence.result import Evidence
@@ -20,6 +21,7 @@ ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),
     "bridge": Bridge(),
     "warp_bridge": Bridge(warped=True),
+    "importance": Importance(),
     "laplace": Laplace(),
 }
 

@@ -1,0 +1,130 @@
+"""Importance sampling on posteriors of known evidence, and the ways of being subtly wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pymc_statespace_filters.errors import DataMismatchError
+from pymc_statespace_filters.evidence.importance import Importance, _pareto_k
+from tests.evidence.analytic import gaussian, half_normal
+from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
+
+LOG_EVIDENCE = -3.7  # of `gaussian`
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, 12])
+def test_evidence_of_a_normal_posterior(k):
+    rng = np.random.default_rng([50, k])
+    found = Importance().estimate(gaussian(k, (4, 2500), rng, correlation=0.5), rng=rng)
+    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.04
+    assert not found.doubts
+
+
+def test_evidence_of_a_conjugate_regression():
+    rng = np.random.default_rng(51)
+    regression = Regression(20, 50, rng)
+    found = Importance().estimate(regression.posterior((4, 2500), rng), rng=rng)
+    assert abs(found.log_evidence - regression.log_evidence) < 4 * found.se < 0.05
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Banana(12), lambda: TwoModes(3), half_normally_distributed, bounded]
+)
+def test_posteriors_unlike_a_normal_law(make):
+    target, rng = make(), np.random.default_rng(52)
+    found = Importance().estimate(target.posterior((4, 2500), rng, correlation=0.8), rng=rng)
+    assert abs(found.log_evidence - target.log_evidence) < 4 * found.se < 0.06
+    assert not found.doubts
+
+
+def test_proposals_without_density_count_as_zeros():
+    rng = np.random.default_rng(53)
+    found = Importance().estimate(half_normal((4, 2500), rng), rng=rng)
+    assert abs(found.log_evidence - 0.5 * np.log(np.pi / 2)) < 4 * found.se < 0.02
+    assert found.settings["zero_density"] > 0.01
+
+
+# For 200 independent standard normal scores the mean is within 0.25 of zero and the mean square
+# within [0.7, 1.4] with probability above 0.9995; seeds are fixed.
+@pytest.mark.parametrize(
+    ("make", "n_draws", "correlation", "noise_sd"),
+    [
+        (lambda: TwoModes(1), 100, 0.0, 1.0),
+        pytest.param(lambda: TwoModes(2), 500, 0.8, 0.0, marks=pytest.mark.slow),
+        pytest.param(lambda: Regression(4, 20, np.random.default_rng(0)), 500, 0.9, 1.0,
+                     marks=pytest.mark.slow),
+        pytest.param(lambda: Banana(12), 1000, 0.0, 0.0, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_standard_errors_are_calibrated(make, n_draws, correlation, noise_sd):
+    target, scores = make(), []
+    for run in range(200):
+        rng = np.random.default_rng([54, run])
+        posterior = target.posterior((4, n_draws), rng, correlation=correlation, noise_sd=noise_sd)
+        found = Importance().estimate(posterior, rng=rng)
+        scores.append((found.log_evidence - target.log_evidence) / found.se)
+    assert abs(np.mean(scores)) < 0.25
+    assert 0.7 < np.mean(np.square(scores)) < 1.4
+
+
+def test_a_noisy_likelihood_gives_the_evidence_of_its_expectation():
+    rng = np.random.default_rng(55)
+    posterior = gaussian(2, (4, 5000), rng, noise_sd=1.0)
+    seen = []
+
+    def evaluate(x, rng):
+        seen.append(x)
+        return posterior.evaluate(x, rng)
+
+    importance = Importance()
+    found = importance.estimate(replace(posterior, evaluate=evaluate), rng=rng)
+    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.06
+    # Fresh points alone, each evaluated once.
+    points = {tuple(x) for x in np.concatenate(seen)}
+    assert len(points) == importance.n_evaluations(posterior)
+    assert points.isdisjoint(map(tuple, posterior.draws.reshape(-1, 2)))
+
+
+@pytest.mark.parametrize("wrong", [-2.0, 2.0])
+def test_draws_only_say_where_to_look(wrong):
+    """Draws that are too narrow or too wide cost precision, not truth."""
+    rng = np.random.default_rng(56)
+    posterior = gaussian(2, (4, 2500), rng)
+    mean = posterior.draws.mean(axis=(0, 1))
+    posterior = replace(posterior, draws=mean + (posterior.draws - mean) * 2 ** (wrong / 4))
+    found = Importance().estimate(posterior, rng=rng)
+    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.05
+
+
+def test_tail_of_the_weights():
+    """Weights u^-k have the tail k, zeros among them or not; 4 of its errors at most."""
+    u = np.random.default_rng(57).uniform(size=20_000)
+    for k in (0.3, 0.9):
+        assert _pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.25)
+        assert _pareto_k(np.where(u > 0.9, -np.inf, -k * np.log(u))) == pytest.approx(k, abs=0.25)
+
+
+def test_weights_of_heavy_tail_are_doubted():
+    """Log-noise of standard deviation 3: a few estimates of 1000 outweigh all others."""
+    rng = np.random.default_rng(58)
+    found = Importance().estimate(gaussian(2, (4, 250), rng, noise_sd=3.0), rng=rng)
+    assert found.settings["pareto_k"] > 0.7
+    few, tail = found.doubts
+    assert "independent draws, fewer than 100" in few
+    assert "heavy tail (Pareto k" in tail
+
+
+def test_same_seed_same_number():
+    posterior = gaussian(2, (2, 500), np.random.default_rng(60))
+    one, other = (Importance().estimate(posterior, rng=np.random.default_rng(1)) for _ in range(2))
+    assert one.log_evidence == other.log_evidence
+
+
+def test_no_density_where_the_draws_are():
+    rng = np.random.default_rng(61)
+    posterior = replace(
+        gaussian(2, (2, 500), rng), evaluate=lambda x, rng: np.full(len(x), -np.inf)
+    )
+    with pytest.raises(DataMismatchError, match="another model"):
+        Importance().estimate(posterior, rng=rng)
