@@ -19,6 +19,7 @@ from pymc_statespace_filters.evidence import (
     compare_evidence,
     estimate_evidence,
     marginal_modes,
+    prior_sensitivity,
 )
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
@@ -69,6 +70,7 @@ __all__ = [
     "plot_evidence",
     "plot_model_probabilities",
     "plot_prior_sensitivity",
+    "prior_sensitivity",
     "sample_dram",
     "simulate",
     "suggest_particles",

@@ -6,6 +6,7 @@ from pymc_statespace_filters.evidence.comparison import DimensionCorrection, com
 from pymc_statespace_filters.evidence.estimators import EvidenceEstimates, estimate_evidence
 from pymc_statespace_filters.evidence.marginal_modes import marginal_modes
 from pymc_statespace_filters.evidence.result import Evidence
+from pymc_statespace_filters.evidence.sensitivity import prior_sensitivity
 
 __all__ = [
     "DimensionCorrection",
@@ -16,4 +17,5 @@ __all__ = [
     "compare_evidence",
     "estimate_evidence",
     "marginal_modes",
+    "prior_sensitivity",
 ]
