@@ -6,16 +6,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from arviz_base import rcParams
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, labelled_y, set_xticks, set_ylim
-from scipy.special import softmax
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence import prior_sensitivity
 from pymc_statespace_filters.plots._canvas import band, canvas, curve, interval
 
-EXPONENTS = np.linspace(0, 4, 81)
-N_NORMALS = 4000
 LABELS = {
     "prob": "exponent α of the correction",
     "width_prob": "width of the priors (factor)",
@@ -105,29 +102,10 @@ def _logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
 
 
 def _sensitivity(table: pd.DataFrame | xr.Dataset) -> xr.Dataset:
+    if isinstance(table, pd.DataFrame):
+        return prior_sensitivity(table)
     if isinstance(table, xr.Dataset) and {"prob", "prob_low", "prob_high"} <= set(table):
         return table
-    needed = {"log_evidence", "se", "prior", "n_parameters", "n_observations"}
-    if isinstance(table, pd.DataFrame) and needed <= set(table.columns):
-        return _against_exponent(table)
     raise ModelError(
         f"table must be one of compare_evidence or a result of prior_sensitivity, got {table!r}"
-    )
-
-
-def _against_exponent(table: pd.DataFrame) -> xr.Dataset:
-    """Give the table corrections of many exponents α: k α / 2 ln J is subtracted (Eq. 3.7)."""
-    log_evidence, prior, k, n_observations, se = (
-        table[name].to_numpy(dtype=np.float64)
-        for name in ("log_evidence", "prior", "n_parameters", "n_observations", "se")
-    )
-    penalties = EXPONENTS[:, None] * k / 2 * np.log(n_observations)
-    log_weights = log_evidence + np.log(prior) - penalties
-    errors = se * np.random.default_rng(0).standard_normal((N_NORMALS, 1, len(se)))
-    outside = (1 - rcParams["stats.ci_prob"]) / 2
-    low, high = np.quantile(softmax(log_weights + errors, axis=-1), [outside, 1 - outside], axis=0)
-    probs = {"prob": softmax(log_weights, axis=-1), "prob_low": low, "prob_high": high}
-    return xr.Dataset(
-        {name: (("exponent", "model"), values) for name, values in probs.items()},
-        coords={"exponent": EXPONENTS, "model": table.index.to_numpy()},
     )

@@ -9,14 +9,13 @@ from pymc_statespace_filters import (
     plot_evidence,
     plot_model_probabilities,
     plot_prior_sensitivity,
+    prior_sensitivity,
 )
-from pymc_statespace_filters.plots.prior_sensitivity import _sensitivity
 
 PLOTS = [
     (plot_evidence, "table"),
     (plot_evidence, "estimates"),
     (plot_model_probabilities, "table"),
-    (plot_prior_sensitivity, "table"),
     (plot_prior_sensitivity, "sensitivity"),
     (plot_average, "curve_average"),
     (plot_average, "scalar_average"),
@@ -24,10 +23,10 @@ PLOTS = [
 ]
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def sensitivity(table):
-    # What a table gives against the exponent, and something of the same form against the width.
-    found = _sensitivity(table)
+    # The curves against the exponent, and something of the same form against the width.
+    found = prior_sensitivity(table, exponents=[0, 1, 2])
     of_widths = found.rename({name: f"width_{name}" for name in found}).rename(exponent="width")
     return found.merge(of_widths.assign_coords(width=10 ** (of_widths["width"] - 2)))
 
