@@ -14,14 +14,18 @@ from pymc_statespace_filters.evidence.bridge import Bridge
 from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.importance import Importance
 from pymc_statespace_filters.evidence.laplace import Laplace
+from pymc_statespace_filters.evidence.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.report import Estimator, evidences_of
 from pymc_statespace_filters.evidence.result import Evidence
+from pymc_statespace_filters.evidence.tempered_smc import TemperedSMC
 
 ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),
     "bridge": Bridge(),
     "warp_bridge": Bridge(warped=True),
     "importance": Importance(),
+    "tempered_smc": TemperedSMC(),
+    "prior_monte_carlo": PriorMonteCarlo(),
     "laplace": Laplace(),
 }
 

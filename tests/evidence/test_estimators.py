@@ -2,6 +2,7 @@
 
 import warnings
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -71,6 +72,24 @@ def test_a_single_name_will_do(idata, model):
 def test_unknown_names(idata, model, names):
     with pytest.raises(ModelError, match=r"estimators must name at least one of \['chib_j"):
         psf.estimate_evidence(idata, model, estimators=names)
+
+
+def test_a_missing_mode_is_found_by_whoever_needs_no_draws():
+    rng = np.random.default_rng(3)
+    with pm.Model() as model:
+        x = pm.Normal("x", 0, 3)
+        pm.Normal("y", abs(x), 0.3, observed=3.0)
+    one_mode = rng.normal(2.97, 0.2985, (4, 1000))  # conjugate: precision 1/9 + 1/0.09
+    idata = az.from_dict({"posterior": {"x": one_mode}})
+    with pytest.warns(EvidenceWarning) as caught:
+        found = psf.estimate_evidence(
+            idata, model, estimators=("chib_jeliazkov", "tempered_smc"), random_seed=4
+        )
+    assert "not visited all of the posterior" in str(caught[-1].message)
+    assert not found.agreement
+    assert found.agreement.difference == pytest.approx(np.log(2), abs=0.1)
+    assert "disagree: tempered_smc is 0." in repr(found)
+    assert "disagree" in found._repr_html_()
 
 
 def evidence(name, log_evidence, se):
