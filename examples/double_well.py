@@ -7,10 +7,11 @@ made by ``dx = (4 x - 4 x^3) dt + 0.6 dW``; three models compete for it:
     M2: dx = (alpha x + beta x^3) dt + 0.6 dW + sigma_m dW_m
     M3: dx = (alpha x + beta x^3 + gamma x^5) dt + 0.6 dW + sigma_m dW_m
 
-For each, the posterior is sampled by DRAM and the evidence computed by the method of Chib and
-Jeliazkov; the table of model probabilities, with what the noise of the computation leaves open,
-and pictures go to ``out/``. A record of your own, two columns time and value, takes the place of
-the simulated one with ``--csv``.
+For each, the posterior is sampled by DRAM and the evidence estimated twice, by the method of Chib
+and Jeliazkov and by bridge sampling. The table of model probabilities, with what the noise of the
+computation leaves open, and pictures go to ``out/``; one of them is the drift as a curve, averaged
+over the models. A record of your own, two columns time and value, takes the place of the simulated
+one with ``--csv``.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pymc as pm
+import xarray as xr
 
 import pymc_statespace_filters as psf
 
@@ -104,7 +106,7 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
     if args.csv is None:
         simulated_record(path)
     steps, values = read_record(path)
-    results, summaries = {}, {}
+    results, summaries, estimates = {}, {}, {}
     for name, coefficients in RIVALS.items():
         model = rival(coefficients, filters(args.particles)[args.filter], steps, values)
         with model:
@@ -115,16 +117,29 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
                 random_seed=args.seed,
                 progressbar=args.progressbar,
             )
-            psf.chib_jeliazkov(
-                idata, n_proposals=2000, random_seed=args.seed, progressbar=args.progressbar
+            found = psf.estimate_evidence(
+                idata, random_seed=args.seed, progressbar=args.progressbar
             )
         results[name] = idata
+        estimates[name] = found.to_dataframe()
         summaries[name] = az.summary(idata, var_names=[*coefficients, "sigma_m"])
-    table = psf.compare_evidence(results)
+    table = psf.compare_evidence(results, estimator="chib_jeliazkov")
     table.to_csv(args.out / "model_probabilities.csv")
+    pd.concat(estimates, names=["model"]).to_csv(args.out / "evidences.csv")
     pd.concat(summaries, names=["model", "parameter"]).to_csv(args.out / "parameters.csv")
     draw(steps * DT, values, results, table, args.out / "double_well.png")
+    average = psf.average_models(results, table, drift_curve, random_seed=args.seed)
+    psf.plot_average(average).savefig(args.out / "drift.png")
     return table
+
+
+def drift_curve(posterior: xr.Dataset) -> xr.DataArray:
+    """The deterministic part of the motion at places between and around the wells."""
+    places = np.linspace(-1.6, 1.6, 81)
+    x = xr.DataArray(places, dims="position", coords={"position": places})
+    powers = {"alpha": 1, "beta": 3, "gamma": 5}
+    drift = sum(posterior[name] * x**n for name, n in powers.items() if name in posterior)
+    return drift.rename("drift")
 
 
 def draw(times, values, results: dict, table: pd.DataFrame, path: Path) -> None:
