@@ -75,8 +75,9 @@ def prior_sensitivity(
         (of the weights' tail) and ``width_beyond`` (below).
 
         NaN, and no guess, is what stands where the draws do not know the answer: if they are worth
-        less than 100, if Pareto's k is above 0.7, or if more than 2 per cent of the evidence may
-        lie beyond the bounds of an actual prior, where there are no draws. Of that share
+        less than 100, if Pareto's k is above 0.5 (the posterior is nearly as wide as the prior, and
+        a mean of such weights has no standard error), or if more than 2 per cent of the evidence
+        may lie beyond the bounds of an actual prior, where there are no draws. Of that share
         ``width_beyond`` is an upper bound, from the draws in the outermost 5 per cent of a bounded
         support, if likelihood and prior do not rise outwards from there. The probabilities of all
         models are NaN where the evidence of one is.

@@ -34,7 +34,7 @@ from pymc_statespace_filters.evidence.support import has_law
 EDGE = 0.05  # of the length of a bounded support, at each end
 # Past these the draws do not know the evidence under the other priors.
 MIN_EFFECTIVE = 100
-MAX_PARETO_K = 0.7
+MAX_PARETO_K = 0.5  # from there on the weights have no variance, and their mean no standard error
 MAX_BEYOND = 0.02
 CONSTANT = 1e-9
 NEGLIGIBLE = 700.0  # nats below the largest weight
@@ -52,7 +52,7 @@ class Reweighted(NamedTuple):
     n_effective : float
         What the draws are worth there, in independent terms of relative variance one.
     pareto_k : float
-        Shape of the upper tail of the weights: their variance is infinite from 0.5 on.
+        Shape of the upper tail of the weights.
     beyond : float
         Upper bound of the share of Z_w that lies where the actual prior is zero.
     """
