@@ -17,7 +17,7 @@ the h it implies is where
 
 Autocorrelated draws count in n_1 by their effective number. The variance is that of the two means
 under this h (Fruehwirth-Schnatter 2004): any h gives the same p(D), so that what is uncertain in h
-does not matter to first order. The terms are bounded, hence no tail of q can ruin the error.
+does not matter to first order. The terms are bounded, so that no tail of q makes it infinite.
 
 Warp-III (Meng and Schilling 2002) brings the posterior nearer to q: it is standardised by the mean
 m and covariance of the draws and reflected at random about m, so that its kernel becomes the

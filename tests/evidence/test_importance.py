@@ -54,7 +54,7 @@ def test_proposals_without_density_count_as_zeros():
         pytest.param(lambda: TwoModes(2), 500, 0.8, 0.0, marks=pytest.mark.slow),
         pytest.param(lambda: Regression(4, 20, np.random.default_rng(0)), 500, 0.9, 1.0,
                      marks=pytest.mark.slow),
-        pytest.param(lambda: Banana(12), 1000, 0.0, 0.0, marks=pytest.mark.slow),
+        pytest.param(lambda: Banana(4), 500, 0.0, 0.0, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_standard_errors_are_calibrated(make, n_draws, correlation, noise_sd):
