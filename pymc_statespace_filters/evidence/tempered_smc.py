@@ -51,7 +51,7 @@ from pymc_statespace_filters.evidence.posterior import Posterior
 MIN_RUNS, MIN_PARTICLES = 8, 50
 SHARE = 0.6  # of the effective number that a step of the temperature leaves
 # Move until the squared distance from the start grows by less than a share of itself.
-MIN_MOVES, MAX_MOVES, MIN_GAIN = 2, 50, 0.05
+MIN_MOVES, MAX_MOVES, MIN_GAIN = 2, 50, 0.1
 ACCEPTANCE = 0.25  # of random walks
 SCALES = (0.1, 2.0)  # least and largest of random walks, in the optimal one for a Gaussian
 MIN_ACCEPTANCE = 0.02

@@ -16,12 +16,12 @@ from pymc_statespace_filters.evidence._particles import (
 )
 from pymc_statespace_filters.evidence.bridge import Bridge
 from pymc_statespace_filters.evidence.tempered_smc import TemperedSMC, raised_from
+from tests.evidence.state_space import StateSpace
 from tests.evidence.targets import (
     REAL,
     Banana,
     Independent,
     Regression,
-    StateSpace,
     TwoModes,
     bounded,
     half_normally_distributed,
@@ -128,7 +128,7 @@ def test_standard_errors_are_calibrated_with_the_default_settings(target, noise_
 
 @pytest.mark.slow
 def test_a_linear_state_space_model():
-    target = StateSpace(121)
+    target = StateSpace()
     found = smc(draws_of(target))
     assert found.se < 0.05
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
