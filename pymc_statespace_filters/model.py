@@ -127,6 +127,7 @@ class StateSpaceModel:
         shapes: Mapping[str, Sequence[int]] | None = None,
         carried: Sequence[str] = (),
     ) -> None:
+        given = {name: value for name, value in locals().items() if name != "self"}
         step = _transition(transition, process_noise, dt)
         seen = read_observation(observation, observation_noise, observation_dist, observation_logp)
         noise = _covariance("process_noise", process_noise)
@@ -196,6 +197,8 @@ class StateSpaceModel:
             ),
         )
         self._set(carried=carried_names(carried, self.states))
+        # No part of what a system is: neither compared nor pickled.
+        self._set(_given=given)
 
     # Attributes are set once, here; the class annotations are what a system is made of.
     parameters: tuple[str, ...]
@@ -252,6 +255,20 @@ class StateSpaceModel:
             f"StateSpaceModel(states={list(self.states)}, observables={list(self.observables)}, "
             f"parameters={list(self.parameters)}, dt={self.dt:g})"
         )
+
+    @property
+    def integrator(self) -> Any:
+        """The integrator behind the transition.
+
+        None for a transition that is a function, and for a system out of a pickle, which holds the
+        traced equations alone.
+        """
+        transition = self.__dict__.get("_given", {}).get("transition")
+        return transition if hasattr(transition, "step") else None
+
+    def with_integrator(self, integrator: Any) -> "StateSpaceModel":
+        """The same system by another integrator; only where it has one."""
+        return StateSpaceModel(**self.__dict__["_given"] | {"transition": integrator})
 
     @property
     def n_theta(self) -> int:

@@ -30,6 +30,11 @@ def observation_count(model: pm.Model) -> int:
     )
 
 
+def scalar_count(model: pm.Model) -> int:
+    """Count the numbers that a model observed and that are not missing."""
+    return sum(int((~np.isnan(values)).sum()) for values, _ in _observed(model))
+
+
 def data_fingerprint(model: pm.Model) -> str:
     """Hash the observed values of a model.
 

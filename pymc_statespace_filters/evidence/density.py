@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import noise_seeds, smooth_filters, with_filter
@@ -56,14 +57,14 @@ _evaluate_rows = kept(
 )
 
 
-class ModelDensity:
-    """The compiled log-density of a model over one flat vector, noise seeds as arguments.
+class RowFunction:
+    """A number that depends on the free variables of a model, compiled over one flat vector.
 
     Parameters
     ----------
     model : pymc.Model
-    moved : bool
-        Whether the draws' noise was moved along the chain, by the smooth versions of the filters.
+    output : TensorVariable
+        A scalar graph of the model's value variables; the noise seeds become arguments.
 
     Attributes
     ----------
@@ -75,30 +76,16 @@ class ModelDensity:
         Told, in the main thread, how many points were evaluated since it was last told.
     """
 
-    def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
-        if model.discrete_value_vars:
-            names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
-            raise ModelError(
-                f"model must have continuous free variables only; {names} are discrete: "
-                "sum them out of the likelihood first"
-            )
-        if not model.free_RVs:
-            raise ModelError("model must have at least one free variable, it has none")
-        self.model = model
-        self.moved = moved
+    def __init__(self, model: pm.Model, output: TensorVariable) -> None:
         shared = noise_seeds(model)
         self.seed_names = tuple(shared)
         self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
         self.watch: Callable[[int], None] = lambda count: None
-        log_density = model.logp()
-        if moved:
-            (log_density,) = with_filter([log_density], model, smooth_filters(model))
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
         start = model.initial_point()
-        (output,), joined = join_nonshared_inputs(start, [log_density], values, seeds)
-        inputs = [joined, *seeds.values()]
-        function = compile_pymc(inputs, [output], on_unused_input="ignore")
+        (output,), joined = join_nonshared_inputs(start, [output], values, seeds)
+        function = compile_pymc([joined, *seeds.values()], output, on_unused_input="ignore")
         function.trust_input = True
         self._start = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
         self._native = NativeFunction(function, self._inputs(self._start, self.model_seeds))
@@ -108,9 +95,14 @@ class ModelDensity:
         """Arguments of the compiled function; the seeds are views."""
         return [point, *(seed[i : i + 1].reshape(()) for i in range(seed.size))]
 
-    def log_density(self, x: Array, seeds: NDArray[np.int64]) -> Array:
-        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf."""
+    def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
+        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.
+
+        Without seeds every point has the model's own.
+        """
         points = np.ascontiguousarray(x, dtype=np.float64)
+        if seeds is None:
+            seeds = np.broadcast_to(self.model_seeds, (len(points), self.model_seeds.size))
         seeds = np.ascontiguousarray(seeds, dtype=np.int64)
         values = np.full(len(points), -np.inf)
         n_threads = min(available_cores(), max(1, len(points)))
@@ -119,7 +111,7 @@ class ModelDensity:
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
         with ThreadPoolExecutor(n_threads) as pool:
             futures = [
-                pool.submit(self._evaluate, points[part], seeds[part], values[part], told[i])
+                pool.submit(self._evaluate_part, points[part], seeds[part], values[part], told[i])
                 for i, part in enumerate(parts)
             ]
             try:
@@ -128,7 +120,7 @@ class ModelDensity:
                 told[:, _STOP] = True
         return np.where(np.isnan(values), -np.inf, values)
 
-    def _evaluate(
+    def _evaluate_part(
         self, points: Array, seeds: NDArray[np.int64], values: Array, told: NDArray[np.int64]
     ) -> None:
         point, seed = self._start.copy(), self.model_seeds.copy()
@@ -147,3 +139,34 @@ class ModelDensity:
             n_done = int(told[:, _N_DONE].sum())
             self.watch(n_done - n_told)
             n_told = n_done
+
+
+class ModelDensity(RowFunction):
+    """The compiled log-density of a model.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    moved : bool
+        Whether the draws' noise was moved along the chain, by the smooth versions of the filters.
+    """
+
+    def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
+        if model.discrete_value_vars:
+            names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
+            raise ModelError(
+                f"model must have continuous free variables only; {names} are discrete: "
+                "sum them out of the likelihood first"
+            )
+        if not model.free_RVs:
+            raise ModelError("model must have at least one free variable, it has none")
+        self.model = model
+        self.moved = moved
+        log_density = model.logp()
+        if moved:
+            (log_density,) = with_filter([log_density], model, smooth_filters(model))
+        super().__init__(model, log_density)
+
+    def log_density(self, x: Array, seeds: NDArray[np.int64]) -> Array:
+        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf."""
+        return self.evaluate(x, seeds)

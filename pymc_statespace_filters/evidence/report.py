@@ -13,6 +13,7 @@ from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
 from pymc_statespace_filters.evidence.density import ModelDensity
 from pymc_statespace_filters.evidence.diagnostics import doubts_of_draws
+from pymc_statespace_filters.evidence.discretisation import doubts_of_steps
 from pymc_statespace_filters.evidence.estimate import Estimate
 from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from pymc_statespace_filters.evidence.posterior import Posterior, noise_was_moved, posterior_of
@@ -63,7 +64,11 @@ def evidences_of(
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
     support = Support.of(density.model)
-    of_all = (*support.doubts(), *doubts_of_draws(posterior))
+    of_all = (
+        *support.doubts(),
+        *doubts_of_draws(posterior),
+        *doubts_of_steps(density.model, idata, posterior.draws),
+    )
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2)
 
     def stream(name: str) -> np.random.Generator:
