@@ -63,7 +63,7 @@ def test_the_mirror_mode_of_a_linear_state(substeps, mirror):
 
 
 def test_other_filters_are_judged_by_the_ekf():
-    model = linear_model(linear(), size=20, filter=psf.BootstrapPF(20))
+    model = linear_model(linear(), filter=psf.BootstrapPF(20))
     (doubt,) = doubts(model, near(-1.0, -19.0, -19.0, -19.0))
     assert re.match(r"[678]\d% of the draws \(a in -19", doubt)
 
