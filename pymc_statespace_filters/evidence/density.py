@@ -85,7 +85,8 @@ class RowFunction:
         seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
         start = model.initial_point()
         (output,), joined = join_nonshared_inputs(start, [output], values, seeds)
-        function = compile_pymc([joined, *seeds.values()], output, on_unused_input="ignore")
+        inputs = [joined, *seeds.values()]
+        function = compile_pymc(inputs, [output], on_unused_input="ignore")
         function.trust_input = True
         self._start = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
         self._native = NativeFunction(function, self._inputs(self._start, self.model_seeds))
