@@ -63,7 +63,34 @@ def resampled(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]
     return (index + n_particles * np.arange(n_runs)[:, np.newaxis]).ravel()
 
 
-def learnt_from(x: Array) -> Whitened:
+class Learnt(NamedTuple):
+    """Whitened coordinates for either half of the runs, learnt from the other half.
+
+    Proposals fitted to the very particles that they move would not keep their law: in 12 dimensions
+    and with 1600 particles the evidence was too large by 0.07 nats.
+    """
+
+    first: Whitened
+    second: Whitened
+
+    def whitened(self, x: Array) -> Array:
+        """Whitened points of all particles x (runs * particles, k)."""
+        first, second = np.split(x, 2)
+        return np.concatenate([self.first.whitened(first), self.second.whitened(second)])
+
+    def unconstrained(self, z: Array) -> Array:
+        """Points of all particles from whitened ones z (runs * particles, k)."""
+        first, second = np.split(z, 2)
+        return np.concatenate([self.first.unconstrained(first), self.second.unconstrained(second)])
+
+
+def learnt_from(x: Array) -> Learnt:
+    """Learn from the particles of each half of the runs what the other is to be moved by."""
+    first, second = np.split(x, 2)
+    return Learnt(_fitted(second), _fitted(first))
+
+
+def _fitted(x: Array) -> Whitened:
     """Coordinates in which the particles have mean zero and covariance one."""
     k = x.shape[1]
     try:
@@ -78,7 +105,7 @@ def learnt_from(x: Array) -> Whitened:
 def metropolis(
     particles: Particles,
     temperature: float,
-    coordinates: Whitened,
+    coordinates: Learnt,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,

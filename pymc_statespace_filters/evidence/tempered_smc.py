@@ -10,8 +10,8 @@ product of the mean weights,
     \hat p(D) = \prod_t \frac{1}{N} \sum_{i=1}^N L(x_i)^{\beta_{t+1} - \beta_t},
 
 without bias whatever the moves (Del Moral, Doucet and Jasra 2006). Several runs go side by side
-under the same temperatures and with the same proposals, which are learnt from all their particles.
-Their evidences are averaged, and never the logarithms; the spread between them is the error.
+under the same temperatures, chosen for all particles together; proposals are learnt from those of
+other runs. Their evidences are averaged, and never the logarithms; their spread is the error.
 
 The temperature is raised until the effective number of the weighted particles has fallen to a share
 (Jasra, Stephens, Doucet and Tsagaris 2011), and the particles are moved until one move more brings
@@ -78,7 +78,8 @@ class TemperedSMC:
     n_particles : int
         In each run; at least 50.
     n_runs : int
-        Independent but for what they learn together; at least 8, so that their spread is an error.
+        Independent but for what they learn from each other; even, because either half learns from
+        the other, and at least 8, so that their spread is an error.
 
     Examples
     --------
@@ -91,10 +92,13 @@ class TemperedSMC:
     n_runs: int = 16
 
     def __post_init__(self) -> None:
-        for name, least in (("n_particles", MIN_PARTICLES), ("n_runs", MIN_RUNS)):
-            given = getattr(self, name)
-            if not (isinstance(given, int | np.integer) and given >= least):
-                raise ModelError(f"{name} must be an integer of at least {least}, got {given!r}")
+        particles, runs = self.n_particles, self.n_runs
+        if not (isinstance(particles, int | np.integer) and particles >= MIN_PARTICLES):
+            raise ModelError(
+                f"n_particles must be an integer of at least {MIN_PARTICLES}, got {particles!r}"
+            )
+        if not (isinstance(runs, int | np.integer) and runs >= MIN_RUNS and runs % 2 == 0):
+            raise ModelError(f"n_runs must be an even integer of at least {MIN_RUNS}, got {runs!r}")
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """A guess: the number of temperatures and of moves is found on the way."""

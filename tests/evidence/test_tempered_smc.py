@@ -127,6 +127,14 @@ def test_standard_errors_are_calibrated_with_the_default_settings(target, noise_
 
 
 @pytest.mark.slow
+def test_few_particles_in_many_dimensions_are_not_biased():
+    """Proposals fitted to the particles that they move would give a mean score of 0.7."""
+    z = scores(Regression(12, 46, np.random.default_rng(12)), 0.0, n_particles=100)
+    assert abs(z.mean()) < 0.25
+    assert 0.7 < (z**2).mean() < 1.4
+
+
+@pytest.mark.slow
 def test_a_linear_state_space_model():
     target = StateSpace()
     found = smc(draws_of(target))
@@ -174,6 +182,15 @@ class TestParts:
         log_weights[1] = -np.inf
         index = resampled(log_weights, np.random.default_rng(88))
         np.testing.assert_array_equal(np.sort(index), np.arange(100))
+
+    def test_no_run_is_moved_by_what_it_has_taught(self):
+        x = np.random.default_rng(92).standard_normal((100, 3))
+        changed = x.copy()
+        changed[:50] *= 2
+        one, other = (learnt_from(points).whitened(np.ones((100, 3))) for points in (x, changed))
+        np.testing.assert_array_equal(one[:50], other[:50])
+        assert not np.isclose(one[50:], other[50:]).any()
+        np.testing.assert_allclose(learnt_from(x).unconstrained(one), 1.0)
 
     @pytest.mark.parametrize("noise_sd", [0.0, 1.0])
     def test_moves_keep_the_tempered_law(self, noise_sd):
@@ -247,7 +264,8 @@ def test_an_improper_prior_says_so_itself():
     [
         ({"n_particles": 49}, "n_particles must be an integer of at least 50, got 49"),
         ({"n_particles": 1e3}, "n_particles must be an integer of at least 50, got 1000.0"),
-        ({"n_runs": 7}, "n_runs must be an integer of at least 8, got 7"),
+        ({"n_runs": 6}, "n_runs must be an even integer of at least 8, got 6"),
+        ({"n_runs": 9}, "n_runs must be an even integer of at least 8, got 9"),
     ],
 )
 def test_settings(settings, message):
