@@ -21,23 +21,38 @@ class LogMean(NamedTuple):
         return self.error**-2
 
 
-def log_mean_of_chains(log_terms: Array) -> LogMean:
-    """Average autocorrelated terms, shape (chain, draw).
+def log_mean(log_terms: Array) -> float:
+    """Log of the mean of all terms; terms of -inf are zeros, and they count."""
+    peak = log_terms.max()
+    return float(peak + np.log(np.exp(log_terms - peak).mean())) if peak > -np.inf else -np.inf
 
-    The error is ArviZ's, from Geyer's initial monotone sequence over split chains: it counts the
+
+def error_of_chains(terms: Array) -> float:
+    """Standard error of the mean of autocorrelated terms, shape (chain, draw).
+
+    It is ArviZ's, from Geyer's initial monotone sequence over split chains: it counts the
     disagreement between chains as well as the autocorrelation within them.
     """
-    peak = log_terms.max()
-    terms = np.exp(log_terms - peak)
-    mean = terms.mean()
-    return LogMean(float(peak + np.log(mean)), float(az.mcse(terms, method="mean") / mean))
+    return float(az.mcse(terms, method="mean"))
+
+
+def error_of_walkers(terms: Array) -> float:
+    """Standard error of the mean over many independent short chains, shape (chain, draw).
+
+    The spread of the chains' means, whatever the autocorrelation within them.
+    """
+    return float(terms.mean(axis=1).std(ddof=1) / len(terms) ** 0.5)
+
+
+def log_mean_of_chains(log_terms: Array) -> LogMean:
+    """Average autocorrelated terms, shape (chain, draw)."""
+    value = log_mean(log_terms)
+    return LogMean(value, error_of_chains(np.exp(log_terms - value)))
 
 
 def log_mean_of_independent(log_terms: Array) -> LogMean:
     """Average independent terms, shape (m,); terms of -inf are zeros, and they count."""
-    peak = log_terms.max()
-    if np.isneginf(peak):
+    value = log_mean(log_terms)
+    if np.isneginf(value):
         return LogMean(-np.inf, np.inf)
-    terms = np.exp(log_terms - peak)
-    mean = terms.mean()
-    return LogMean(float(peak + np.log(mean)), float(terms.std() / mean / len(terms) ** 0.5))
+    return LogMean(value, float(np.exp(log_terms - value).std() / len(log_terms) ** 0.5))
