@@ -102,7 +102,7 @@ class TemperedSMC:
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """A guess: the number of temperatures and of moves is found on the way."""
-        return self.n_runs * self.n_particles * (1 + 6 * (4 + posterior.draws.shape[-1]))
+        return self.n_runs * self.n_particles * (1 + 5 * (2 + posterior.draws.shape[-1]))
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from draws of the prior.
