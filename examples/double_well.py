@@ -135,7 +135,7 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
 
 def drift_curve(posterior: xr.Dataset) -> xr.DataArray:
     """The deterministic part of the motion at places between and around the wells."""
-    places = np.linspace(-1.6, 1.6, 81)
+    places = np.linspace(-1.3, 1.3, 53)
     x = xr.DataArray(places, dims="position", coords={"position": places})
     powers = {"alpha": 1, "beta": 3, "gamma": 5}
     drift = sum(posterior[name] * x**n for name, n in powers.items() if name in posterior)
