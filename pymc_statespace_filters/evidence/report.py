@@ -1,7 +1,7 @@
 """From draws and a model to `Evidence`: what every estimator has in common."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 from zlib import crc32
 
@@ -59,12 +59,12 @@ def evidences_of(
     Warns
     -----
     EvidenceWarning
-        For each estimate with doubts, with all of them.
+        Once for what is doubtful whatever the estimator, and once for each estimate that is.
     """
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
     support = Support.of(density.model)
-    of_all = (
+    common = (
         *support.doubts(),
         *doubts_of_draws(posterior),
         *doubts_of_steps(density.model, idata, posterior.draws),
@@ -83,9 +83,14 @@ def evidences_of(
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
+    _warn("the log-evidence is less certain than its error says", common)
     found = {}
     for name, estimate in estimates.items():
-        doubts = (*of_all, *estimate.doubts)
+        _warn(
+            f"log-evidence {estimate.log_evidence:.2f} ({name}) is less certain than its error "
+            "says",
+            estimate.doubts,
+        )
         found[name] = Evidence(
             log_evidence=estimate.log_evidence,
             se=estimate.se,
@@ -95,18 +100,16 @@ def evidences_of(
             max_log_likelihood=largest,
             data_fingerprint=data_fingerprint(density.model),
             noise=noise,
-            doubts="; ".join(doubts),
+            doubts="; ".join((*common, *estimate.doubts)),
             log_volume=support.log_volume,
             uniform=support.uniform,
             improper=support.improper,
         )
-        if doubts:
-            warnings.warn(
-                f"log-evidence {estimate.log_evidence:.2f} ({name}) is less certain than its error "
-                f"says: {found[name].doubts}",
-                EvidenceWarning,
-                stacklevel=4,
-            )
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
     return found
+
+
+def _warn(message: str, doubts: Sequence[str]) -> None:
+    if doubts:
+        warnings.warn(f"{message}: {'; '.join(doubts)}", EvidenceWarning, stacklevel=4)

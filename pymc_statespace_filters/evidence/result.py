@@ -30,8 +30,9 @@ class Evidence:
     n_observations : int
         J, the observations that are not wholly missing.
     max_log_likelihood : float
-        Largest log-likelihood met, for the Bayesian information criterion. The likelihood is
-        everything in the model that is not the prior of a free variable, Potentials included.
+        Largest log-likelihood, searched for from the draws, for the information criteria. The
+        likelihood is everything in the model that is not the prior of a free variable, Potentials
+        included. A noisy one is averaged at the point that is found.
     data_fingerprint : str
         Hash of the observed values: equal for rival models of one record, different for other data.
     noise : {"none", "refreshed", "held"}
