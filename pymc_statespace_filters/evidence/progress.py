@@ -6,7 +6,7 @@ from time import perf_counter
 
 from pymc.progress_bar import create_simple_progress
 
-from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior import ModelDensity
 
 PATIENCE = 2.0  # seconds without a progress bar
 

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 from zlib import crc32
 
 import numpy as np
@@ -10,28 +9,19 @@ import pymc as pm
 import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
-from pymc_statespace_filters.evidence.density import ModelDensity
-from pymc_statespace_filters.evidence.diagnostics import doubts_of_draws
-from pymc_statespace_filters.evidence.discretisation import doubts_of_steps
-from pymc_statespace_filters.evidence.estimate import Estimate
-from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
-from pymc_statespace_filters.evidence.posterior import Posterior, noise_was_moved, posterior_of
+from pymc_statespace_filters.evidence.doubts import doubts_of_draws, doubts_of_steps
+from pymc_statespace_filters.evidence.estimators.estimate import Estimator
+from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
+    N_EVALUATIONS,
+    max_log_likelihood,
+)
+from pymc_statespace_filters.evidence.posterior import ModelDensity, noise_was_moved, posterior_of
+from pymc_statespace_filters.evidence.posterior.data import data_fingerprint, observation_count
+from pymc_statespace_filters.evidence.posterior.support import Support
 from pymc_statespace_filters.evidence.progress import watched
 from pymc_statespace_filters.evidence.result import Evidence, store_evidence
-from pymc_statespace_filters.evidence.support import Support
 
 MAXIMUM = "maximum likelihood"
-
-
-class Estimator(Protocol):
-    """The evidence from draws of a posterior, and a log-density that can be evaluated."""
-
-    def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
-        """Estimate the log-evidence."""
-
-    def n_evaluations(self, posterior: Posterior) -> int:
-        """About how many evaluations of the log-density it will take."""
 
 
 def evidences_of(

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior import posterior_of
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior.draws import posterior_of
 from tests.evidence import double_well
 from tests.evidence.state_space import StateSpace
 from tests.evidence.targets import (

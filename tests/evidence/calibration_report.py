@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pymc_statespace_filters.evidence.estimators import ESTIMATORS
+from pymc_statespace_filters.evidence.estimation import ESTIMATORS
 from tests.evidence.calibration import CASES, LONG_CHAINS, Calibration, applies, calibrate
 
 STATIC = Path(__file__).parents[2] / "docs" / "_static"

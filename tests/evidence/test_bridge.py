@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.bridge import MOST_TERMS, Bridge
+from pymc_statespace_filters.evidence.estimators.bridge import MOST_TERMS, Bridge
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes, half_normally_distributed
 

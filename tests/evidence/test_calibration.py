@@ -7,8 +7,8 @@ thousand, and for fewer the limits are as wide; seeds are fixed.
 
 import pytest
 
-from pymc_statespace_filters.evidence.estimate import Estimate
-from pymc_statespace_filters.evidence.estimators import ESTIMATORS
+from pymc_statespace_filters.evidence.estimation import ESTIMATORS
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from tests.evidence.calibration import CASES, LONG_CHAINS, Drawn, applies, calibrate
 from tests.evidence.targets import half_normally_distributed
 

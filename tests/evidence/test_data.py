@@ -8,7 +8,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
-from pymc_statespace_filters.evidence.data import data_fingerprint, observation_count
+from pymc_statespace_filters.evidence.posterior.data import data_fingerprint, observation_count
 
 RECORD = np.array([[0.1, 2.0], [np.nan, 1.0], [np.nan, np.nan], [0.4, -0.0]])
 
@@ -92,7 +92,7 @@ def test_order_of_the_variables_does_not_matter():
 def test_fingerprint_is_stable_across_processes():
     program = (
         "import pymc as pm\n"
-        "from pymc_statespace_filters.evidence.data import data_fingerprint\n"
+        "from pymc_statespace_filters.evidence.posterior.data import data_fingerprint\n"
         "with pm.Model() as model:\n"
         "    pm.Normal('y', 0, 1, observed=[1.0, 2.0])\n"
         "import sys; sys.stdout.write(data_fingerprint(model))\n"

@@ -13,8 +13,8 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence import density as module
-from pymc_statespace_filters.evidence.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior import density as module
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from tests.sampling.autoregression import autoregression
 
 DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])

@@ -11,9 +11,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.density import RowFunction
-from pymc_statespace_filters.evidence.discretisation import doubts_of_steps
-from pymc_statespace_filters.evidence.posterior import unconstrained_draws
+from pymc_statespace_filters.evidence.doubts.discretisation import doubts_of_steps
+from pymc_statespace_filters.evidence.posterior.density import RowFunction
+from pymc_statespace_filters.evidence.posterior.draws import unconstrained_draws
 from pymc_statespace_filters.inspection import densities_by_steps
 
 POSITION = {"observation": lambda x: [x[0]]}

@@ -10,7 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import agreement_of
-from pymc_statespace_filters.evidence.estimators import ESTIMATORS, EvidenceEstimates
+from pymc_statespace_filters.evidence.estimation import ESTIMATORS, EvidenceEstimates
 from tests.evidence.test_models import REGRESSION, exact_draws
 
 ALL = tuple(ESTIMATORS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.importance import Importance, _pareto_k
+from pymc_statespace_filters.evidence.estimators.importance import Importance, _pareto_k
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pymc_statespace_filters.evidence.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
+    N_EVALUATIONS,
+    max_log_likelihood,
+)
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.targets import (
     Banana,
     Regression,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence import multi_block
-from pymc_statespace_filters.evidence._proposal import plan_proposal
-from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.multi_block import estimate_in_blocks
+from pymc_statespace_filters.evidence.estimators import multi_block
+from pymc_statespace_filters.evidence.estimators._proposal import plan_proposal
+from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.multi_block import estimate_in_blocks
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence import chib_jeliazkov, density
+from pymc_statespace_filters.evidence import chib_jeliazkov
+from pymc_statespace_filters.evidence.posterior import density
 
 SD = 1.2
 Y = 0.7

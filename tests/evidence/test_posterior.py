@@ -6,9 +6,9 @@ import pymc as pm
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior import posterior_of, unconstrained_draws
-from pymc_statespace_filters.evidence.prior import ModelPrior
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior.draws import posterior_of, unconstrained_draws
+from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
 
 DATA = np.array([0.3, 1.2, 0.8])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from tests.evidence.targets import Regression, TwoModes, bounded, half_normally_distributed
 
 TARGETS = {

@@ -7,15 +7,15 @@ import pytest
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence import tempered_smc
-from pymc_statespace_filters.evidence._particles import (
+from pymc_statespace_filters.evidence.estimators import tempered_smc
+from pymc_statespace_filters.evidence.estimators._particles import (
     learnt_from,
     metropolis,
     particles_of_prior,
     resampled,
 )
-from pymc_statespace_filters.evidence.bridge import Bridge
-from pymc_statespace_filters.evidence.tempered_smc import TemperedSMC, raised_from
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, raised_from
 from tests.evidence.state_space import StateSpace
 from tests.evidence.targets import (
     REAL,

@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from pymc_statespace_filters.evidence._factors import (
+from pymc_statespace_filters.evidence.estimators._factors import (
     evaluate_factors,
     log_likelihood_of,
     prior_of,
 )
-from pymc_statespace_filters.evidence._maximum import (
+from pymc_statespace_filters.evidence.estimators._maximum import (
     Rows,
     best_of_chains,
     climb,
     whitened_by,
 )
-from pymc_statespace_filters.evidence._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.linalg import solve_triangular
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence._means import log_mean, log_mean_of_chains
+from pymc_statespace_filters.errors import DataMismatchError
+from pymc_statespace_filters.evidence.estimators._means import log_mean, log_mean_of_chains
+from pymc_statespace_filters.evidence.estimators._moments import moments
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
@@ -111,8 +112,7 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
     """Points in the bulk of the draws, densest first, each with its constant log-density."""
     k = posterior.draws.shape[-1]
     draws = posterior.draws.reshape(-1, k)
-    mean = draws.mean(axis=0)
-    chol = _cholesky(draws)
+    mean, chol = moments(draws)
     few = draws[:: -(-len(draws) // N_CLUSTERED)]
     whitened = solve_triangular(chol, (few - mean).T, lower=True).T
     centres, _ = kmeans2(whitened, N_CLUSTERS, minit="++", rng=rng)
@@ -151,7 +151,8 @@ def _pilot(posterior: Posterior, rng: np.random.Generator) -> float:
     The iteration of Meng and Wong (1996); no centre x* is chosen yet, and this needs none.
     """
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-    normal = Proposal(draws.mean(axis=0), 0.0, _cholesky(draws))
+    mean, chol = moments(draws)
+    normal = Proposal(mean, 0.0, chol)
     sampled = normal.sample(N_PILOT, rng)
     ratio_drawn = posterior.log_density.ravel() - normal.log_q(draws)
     ratio_sampled = posterior.evaluate(sampled, rng) - normal.log_q(sampled)
@@ -163,17 +164,6 @@ def _pilot(posterior: Posterior, rng: np.random.Generator) -> float:
         lower = -np.logaddexp(ratio_drawn, log_evidence)
         log_evidence = log_mean(upper) - log_mean(lower)
     return log_evidence
-
-
-def _cholesky(draws: Array) -> Array:
-    k = draws.shape[1]
-    try:
-        return np.linalg.cholesky(np.cov(draws, rowvar=False).reshape(k, k))
-    except np.linalg.LinAlgError:
-        raise ModelError(
-            "idata must hold draws that vary in every direction; the covariance of "
-            f"{len(draws)} draws of {k} unconstrained parameters is singular"
-        ) from None
 
 
 def _predicted_variances(

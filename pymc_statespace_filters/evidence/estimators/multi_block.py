@@ -44,8 +44,12 @@ from scipy.linalg import solve_triangular
 from scipy.special import softmax
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence._means import error_of_chains, error_of_walkers, log_mean
-from pymc_statespace_filters.evidence._proposal import Proposal
+from pymc_statespace_filters.evidence.estimators._means import (
+    error_of_chains,
+    error_of_walkers,
+    log_mean,
+)
+from pymc_statespace_filters.evidence.estimators._proposal import Proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_WALKERS = 64

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
-from pymc_statespace_filters.evidence.data import scalar_count
-from pymc_statespace_filters.evidence.density import RowFunction
+from pymc_statespace_filters.evidence.posterior import RowFunction
+from pymc_statespace_filters.evidence.posterior.data import scalar_count
 from pymc_statespace_filters.inspection import densities_by_steps, step_multipliers
 
 N_DRAWS = 100

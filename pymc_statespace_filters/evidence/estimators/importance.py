@@ -23,9 +23,9 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence._means import log_mean_of_independent
-from pymc_statespace_filters.evidence._mixture import choose_mixture
-from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators._mixture import choose_mixture
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000
@@ -43,7 +43,7 @@ class Importance:
 
     Examples
     --------
-    >>> from pymc_statespace_filters.evidence.importance import Importance
+    >>> from pymc_statespace_filters.evidence.estimators.importance import Importance
     >>> Importance()
     Importance()
     """

@@ -28,8 +28,8 @@ from pytensor.graph.replace import clone_replace, vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence._means import log_mean_of_chains
-from pymc_statespace_filters.evidence.support import has_law
+from pymc_statespace_filters.evidence.estimators._means import log_mean_of_chains
+from pymc_statespace_filters.evidence.posterior.support import has_law
 
 EDGE = 0.05  # of the length of a bounded support, at each end
 # Past these the draws do not know the evidence under the other priors.

@@ -38,14 +38,14 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence._particles import (
+from pymc_statespace_filters.evidence.estimators._particles import (
     Particles,
     learnt_from,
     metropolis,
     particles_of_prior,
     resampled,
 )
-from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
@@ -83,7 +83,7 @@ class TemperedSMC:
 
     Examples
     --------
-    >>> from pymc_statespace_filters.evidence.tempered_smc import TemperedSMC
+    >>> from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
     >>> TemperedSMC(n_particles=500)
     TemperedSMC(n_particles=500, n_runs=16)
     """

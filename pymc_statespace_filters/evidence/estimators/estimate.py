@@ -2,6 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from pymc_statespace_filters.evidence.posterior import Posterior
 
 
 @dataclass(frozen=True)
@@ -23,3 +28,13 @@ class Estimate:
     se: float
     settings: Mapping[str, float] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
+
+
+class Estimator(Protocol):
+    """The evidence from draws of a posterior, and a log-density that can be evaluated."""
+
+    def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
+        """Estimate the log-evidence."""
+
+    def n_evaluations(self, posterior: Posterior) -> int:
+        """About how many evaluations of the log-density it will take."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pymc.model.transform_values import unconstrain_values
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.density import ModelDensity
-from pymc_statespace_filters.evidence.prior import ModelPrior
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
-from pymc_statespace_filters.evidence._moments import moments
+from pymc_statespace_filters.evidence.estimators._moments import moments
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 DEGREES_OF_FREEDOM = 5.0

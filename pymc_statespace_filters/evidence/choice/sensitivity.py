@@ -14,11 +14,19 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence._probabilities import check_ci_prob, prior_of, probabilities
-from pymc_statespace_filters.evidence._rivals import Given
-from pymc_statespace_filters.evidence.comparison import DimensionCorrection, compare_evidence
+from pymc_statespace_filters.evidence.choice._probabilities import (
+    check_ci_prob,
+    prior_of,
+    probabilities,
+)
+from pymc_statespace_filters.evidence.choice._rivals import Given
+from pymc_statespace_filters.evidence.choice.comparison import DimensionCorrection, compare_evidence
+from pymc_statespace_filters.evidence.choice.stretched_prior import (
+    UNCHANGED,
+    Reweighted,
+    StretchedPrior,
+)
 from pymc_statespace_filters.evidence.posterior import unconstrained_draws
-from pymc_statespace_filters.evidence.stretched_prior import UNCHANGED, Reweighted, StretchedPrior
 
 EXPONENTS = np.linspace(0, 4, 41)
 WIDTHS = np.geomspace(0.25, 4, 17)

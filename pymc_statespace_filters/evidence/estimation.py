@@ -1,4 +1,4 @@
-"""Several estimators on the same draws, and whether they agree."""
+"""What a user calls: one estimator, or several on the same draws and whether they agree."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -10,14 +10,17 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
-from pymc_statespace_filters.evidence.bridge import Bridge
-from pymc_statespace_filters.evidence.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.importance import Importance
-from pymc_statespace_filters.evidence.laplace import Laplace
-from pymc_statespace_filters.evidence.prior_monte_carlo import PriorMonteCarlo
-from pymc_statespace_filters.evidence.report import Estimator, evidences_of
+from pymc_statespace_filters.evidence.estimators import (
+    Bridge,
+    ChibJeliazkov,
+    Estimator,
+    Importance,
+    Laplace,
+    PriorMonteCarlo,
+    TemperedSMC,
+)
+from pymc_statespace_filters.evidence.report import evidences_of
 from pymc_statespace_filters.evidence.result import Evidence
-from pymc_statespace_filters.evidence.tempered_smc import TemperedSMC
 
 ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),
@@ -28,6 +31,90 @@ ESTIMATORS: Mapping[str, Estimator] = {
     "prior_monte_carlo": PriorMonteCarlo(),
     "laplace": Laplace(),
 }
+
+
+def chib_jeliazkov(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    n_proposals: int | None = None,
+    n_blocks: int | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+    progressbar: bool = True,
+) -> Evidence:
+    """Estimate the evidence of a model from draws of its posterior (thesis, 3.3.2 and Eq. 3.44).
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Posterior draws by any sampler (NUTS, nutpie, DRAM, ...), warm-up removed. If `model` has a
+        noisy likelihood, ``sample_stats`` must hold ``lp`` or the noise seed of each draw, as DRAM
+        leaves them.
+    model : pymc.Model, optional
+        The model that was sampled; by default that of the ``with`` block. Everything in it counts:
+        priors, observed variables, Potentials.
+    n_proposals : int, optional
+        Evaluations of the log-density around a central point. By default so many that their error
+        is a third of that of the draws, or that the whole is below 0.01 nats; but no more than
+        there are draws, and at most 20 000. With several blocks, those in every mean, 5000 by
+        default; in all they are about 3 n_blocks - 2 times as many.
+    n_blocks : int, optional
+        Blocks of neighbouring parameters whose ordinates are estimated one after the other. One by
+        default; with ten parameters or more, and if one block promises an error above 0.1 nats,
+        blocks of about ten.
+    random_seed : int or numpy.random.Generator, optional
+        For the proposals and the noise of their likelihoods.
+    extend_inferencedata : bool
+        Also store the result as the group ``evidence`` of `idata`.
+    progressbar : bool
+        Show one if the evaluations take more than two seconds.
+
+    Returns
+    -------
+    Evidence
+        Its `se` counts the autocorrelation of the draws and the proposals' own error. If the chains
+        held one noise seed (``noise="held"``), this is the evidence under that seed and `se` lacks
+        the error of the filter.
+
+    Raises
+    ------
+    ModelError
+        If a free variable is discrete, or the draws are too few or do not vary.
+    DataMismatchError
+        If the draws lack free variables of the model or belong to another model or to other data.
+
+    Warns
+    -----
+    EvidenceWarning
+        If few terms dominate a mean, or the chains disagree.
+
+    Examples
+    --------
+    One parameter, three observations, and draws from the posterior that is known:
+
+    >>> import arviz as az
+    >>> import numpy as np
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> normals = np.random.default_rng(1).standard_normal((4, 1000))
+    >>> idata = az.from_dict({"posterior": {"mu": 4 / 13 + normals / np.sqrt(3.25)}})
+    >>> with pm.Model():
+    ...     mu = pm.Normal("mu", 0, 2)
+    ...     _ = pm.Normal("y", mu, 1, observed=[0.3, -0.4, 1.1])
+    ...     evidence = psf.chib_jeliazkov(idata, random_seed=2)
+    >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
+    True
+    """
+    found = evidences_of(
+        idata,
+        model,
+        {"chib_jeliazkov": ChibJeliazkov(n_proposals, n_blocks)},
+        random_seed=random_seed,
+        extend_inferencedata=extend_inferencedata,
+        progressbar=progressbar,
+    )
+    return found["chib_jeliazkov"]
 
 
 class EvidenceEstimates(dict[str, Evidence]):

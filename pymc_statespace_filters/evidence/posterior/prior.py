@@ -10,7 +10,7 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.support import has_law, is_restricted
+from pymc_statespace_filters.evidence.posterior.support import has_law, is_restricted
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence._maximum import (
+from pymc_statespace_filters.evidence.estimators._maximum import (
     EdgeError,
     Rows,
     best_of_chains,
@@ -27,7 +27,7 @@ from pymc_statespace_filters.evidence._maximum import (
     derivatives,
     whitened_by,
 )
-from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3
@@ -53,7 +53,7 @@ class Laplace:
 
     >>> import numpy as np
     >>> from scipy.stats import norm
-    >>> from pymc_statespace_filters.evidence.laplace import Laplace
+    >>> from pymc_statespace_filters.evidence.estimators.laplace import Laplace
     >>> from pymc_statespace_filters.evidence.posterior import Posterior
     >>> def log_density(x):
     ...     return (norm.logpdf(x) + norm.logpdf(x, 1.0)).sum(axis=-1)

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence._factors import evaluate_factors, prior_of
-from pymc_statespace_filters.evidence._means import log_mean_of_independent
-from pymc_statespace_filters.evidence.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators._factors import evaluate_factors, prior_of
+from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_DRAWS = 100
@@ -38,7 +38,7 @@ class PriorMonteCarlo:
 
     Examples
     --------
-    >>> from pymc_statespace_filters.evidence.prior_monte_carlo import PriorMonteCarlo
+    >>> from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
     >>> PriorMonteCarlo(n_draws=20_000)
     PriorMonteCarlo(n_draws=20000)
     """

@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence._probabilities import check_ci_prob, prior_of, probabilities
-from pymc_statespace_filters.evidence._rivals import Given, evidences_of_rivals
+from pymc_statespace_filters.evidence.choice._probabilities import (
+    check_ci_prob,
+    prior_of,
+    probabilities,
+)
+from pymc_statespace_filters.evidence.choice._rivals import Given, evidences_of_rivals
 from pymc_statespace_filters.evidence.result import Evidence
 
 # Kass and Raftery (1995), 3.2: twice the log Bayes factor at which each word begins.

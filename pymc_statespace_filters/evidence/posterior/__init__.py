@@ -1,0 +1,20 @@
+"""The posterior and the prior of a model as numbers: what estimators integrate."""
+
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity, RowFunction
+from pymc_statespace_filters.evidence.posterior.draws import (
+    Posterior,
+    Prior,
+    noise_was_moved,
+    posterior_of,
+    unconstrained_draws,
+)
+
+__all__ = [
+    "ModelDensity",
+    "Posterior",
+    "Prior",
+    "RowFunction",
+    "noise_was_moved",
+    "posterior_of",
+    "unconstrained_draws",
+]
