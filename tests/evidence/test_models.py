@@ -141,8 +141,9 @@ def test_potentials_and_several_observed_variables_count():
 
 
 def test_too_few_near_the_centre_is_a_warning(regression_model):
-    with pytest.warns(
-        EvidenceWarning, match=r"worth \d+ independent ones, fewer than 100: draw more"
+    with (
+        pytest.warns(EvidenceWarning, match="chains disagree"),
+        pytest.warns(EvidenceWarning, match=r"worth \d+ independent ones, fewer than 100"),
     ):
         chib_jeliazkov(
             exact_draws((2, 100), 0.95), regression_model, random_seed=1, n_proposals=400
@@ -159,7 +160,10 @@ def test_chains_that_disagree_are_a_warning(regression_model):
 def test_halves_that_disagree_are_a_warning(regression_model):
     idata = exact_draws((2, 1000))
     idata["posterior"]["w"][:, 500:] *= 0.5
-    with pytest.warns(EvidenceWarning, match="halves of the draws differ by"):
+    with (
+        pytest.warns(EvidenceWarning, match="chains disagree"),
+        pytest.warns(EvidenceWarning, match="halves of the draws differ by"),
+    ):
         chib_jeliazkov(idata, regression_model, random_seed=1)
 
 
