@@ -1,7 +1,7 @@
 """What the calibration gave: the tables of ``docs/evidence-calibration.md``.
 
 Run with ``python -m tests.evidence.calibration_report`` from the root of the repository; with names
-of estimators or targets behind it for their rows alone, the others being kept.
+of estimators, of targets or of both behind it for their rows alone, the others being kept.
 """
 
 import sys
@@ -10,15 +10,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pymc_statespace_filters.evidence.estimation import ESTIMATORS
-from tests.evidence.calibration import CASES, LONG_CHAINS, Calibration, applies, calibrate
+from tests.evidence.calibration import (
+    CALIBRATED,
+    CASES,
+    LONG_CHAINS,
+    Calibration,
+    applies,
+    calibrate,
+    replications,
+)
 
 STATIC = Path(__file__).parents[2] / "docs" / "_static"
 RESULTS = STATIC / "evidence_calibration.csv"
 TABLE, LONG_TABLE = STATIC / "evidence_calibration.inc", STATIC / "evidence_long_chains.inc"
 KEYS = ["target", "estimator"]
 HEADS = (
-    "target (replications)", "estimator", "bias", "reported error", "actual error",
+    "target", "estimator", "runs", "bias", "reported error", "actual error",
     "mean z", "mean z²", "doubted", "evaluations", "verdict",
 )  # fmt: skip
 
@@ -26,29 +33,34 @@ HEADS = (
 def verdict(result):
     """In a word or two, what a row says."""
     if np.isnan(result.reported):
-        return "no error"
+        return "approximation"
     if result.is_right:
         return "right"
-    return "doubted" if result.doubted > 0.5 else "WRONG"
+    return "doubted" if result.doubted > 0.5 else "outside"
 
 
 def table(cases, results):
     """Markdown, a row for each pair, in the order of targets and estimators."""
     lines = [f"| {' | '.join(HEADS)} |", "| --- " * len(HEADS) + "|"]
-    for target, case in cases.items():
-        title = f"{target} ({case.n_runs})"
-        for estimator in ESTIMATORS:
-            if (target, estimator) not in results:
-                continue
-            r = results[target, estimator]
-            numbers = f"{r.bias:+.4f} | {r.reported:.4f} | {r.actual:.4f}"
-            scores = f"{r.mean_z:+.2f} | {r.mean_square:.2f} | {r.doubted:.0%}"
-            lines.append(
-                f"| {title} | {estimator} | {numbers} | {scores} | {r.n_evaluations:.0f} "
-                f"| {verdict(r)} |"
-            )
-            title = ""
+    for target in cases:
+        title = target
+        for estimator in CALIBRATED:
+            if (target, estimator) in results:
+                lines.append(row(title, estimator, results[target, estimator]))
+                title = ""
     return "\n".join(lines) + "\n"
+
+
+def row(title, estimator, r):
+    """One of them; what has no error has no scores."""
+    cells = [title, estimator, r.n_runs, f"{r.bias:+.4f}"]
+    if np.isnan(r.reported):
+        cells += ["", f"{r.actual:.4f}", "", ""]
+    else:
+        scores = f"{r.mean_z:+.2f}", f"{r.mean_square:.2f}"
+        cells += [f"{r.reported:.4f}", f"{r.actual:.4f}", *scores]
+    cells += [f"{r.doubted:.0%}", f"{r.n_evaluations:.0f}", verdict(r)]
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def kept():
@@ -59,17 +71,24 @@ def kept():
     return {key: Calibration(**row) for key, row in rows.to_dict("index").items()}
 
 
+def keep(results):
+    rows = [dict(zip(KEYS, key, strict=True)) | r._asdict() for key, r in results.items()]
+    pd.DataFrame(rows).to_csv(RESULTS, index=False, float_format="%.6g")
+
+
 def main(names):
-    results = kept()
-    for target, case in (CASES | LONG_CHAINS).items():
-        for name, estimator in ESTIMATORS.items():
-            if not applies(name, case) or (names and not {target, name} & names):
-                continue
-            results[target, name] = calibrate(estimator, case.source, case.n_runs)
-            rows = [dict(zip(KEYS, key, strict=True)) | r._asdict() for key, r in results.items()]
-            pd.DataFrame(rows).to_csv(RESULTS, index=False, float_format="%.6g")
-    for cases, path in ((CASES, TABLE), (LONG_CHAINS, LONG_TABLE)):
-        path.write_text(table(cases, kept()))
+    cases = CASES | LONG_CHAINS
+    targets = names & cases.keys() or cases.keys()
+    estimators = names & CALIBRATED.keys() or CALIBRATED.keys()
+    if unknown := names - targets - estimators:
+        raise SystemExit(f"neither of {list(cases)} nor of {list(CALIBRATED)}: {unknown}")
+    for target, case in cases.items():
+        for name, estimator in CALIBRATED.items():
+            if target in targets and name in estimators and applies(name, case):
+                found = calibrate(estimator, case.source, replications(name, case))
+                keep(kept() | {(target, name): found})
+    TABLE.write_text(table(CASES, kept()))
+    LONG_TABLE.write_text(table(LONG_CHAINS, kept()))
 
 
 if __name__ == "__main__":

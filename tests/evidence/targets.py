@@ -47,6 +47,24 @@ def below(bound):
     )
 
 
+def log_normal(x, sd):
+    """Log-density of N(0, sd^2): SciPy's takes five times as long, and this is all that is done."""
+    return -0.5 * (x / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi)
+
+
+class Normals:
+    """A prior of independent normals, mean zero."""
+
+    def __init__(self, sd):
+        self._sd = np.asarray(sd)
+
+    def log_density(self, x):
+        return log_normal(x, self._sd).sum(axis=-1)
+
+    def sample(self, count, rng):
+        return self._sd * rng.standard_normal((count, len(self._sd)))
+
+
 class Independent:
     """A prior of independent parameters: laws of SciPy, each with its scale."""
 
@@ -118,7 +136,7 @@ class Regression(Target):
         self.chol = np.linalg.cholesky(np.linalg.inv(precision))
         marginal = scale**2 * self.x @ self.x.T + sd**2 * np.eye(n)
         self.log_evidence = multivariate_normal(np.zeros(n), marginal).logpdf(self.y)
-        self.prior = Independent(*[(norm(0, scale), REAL)] * k)
+        self.prior = Normals([scale] * k)
         self.n_normals = k
 
     def model(self):
@@ -129,7 +147,7 @@ class Regression(Target):
         return model
 
     def log_likelihood(self, x):
-        return norm.logpdf(self.y, x @ self.x.T, self.sd).sum(axis=-1)
+        return log_normal(self.y - x @ self.x.T, self.sd).sum(axis=-1)
 
     def transport(self, z):
         return self.mean + z @ self.chol.T
@@ -150,14 +168,14 @@ class TwoModes(Target):
     def __init__(self, k):
         self._centres = self.CENTRES[:, :k]
         marginal_sd = np.sqrt(self.SDS**2 + self.SCALE**2)[:, None]
-        self._log_each = np.log(self.WEIGHTS) + norm.logpdf(self._centres, 0, marginal_sd).sum(1)
+        self._log_each = np.log(self.WEIGHTS) + log_normal(self._centres, marginal_sd).sum(axis=1)
         self.log_evidence = np.logaddexp(*self._log_each)
-        self.prior = Independent(*[(norm(0, self.SCALE), REAL)] * k)
+        self.prior = Normals([self.SCALE] * k)
         self.n_normals = k + 1
 
     def log_likelihood(self, x):
         distances = x[:, None, :] - self._centres
-        log_each = norm.logpdf(distances, scale=self.SDS[:, None]).sum(axis=-1)
+        log_each = log_normal(distances, self.SDS[:, None]).sum(axis=-1)
         return np.logaddexp(*(np.log(self.WEIGHTS) + log_each).T)
 
     def transport(self, z):
@@ -207,7 +225,7 @@ class StandardDeviation(Target):
         self.n_normals = 1
 
     def log_likelihood(self, x):
-        return norm.logpdf(self.Y, scale=self._scale.value(x)).sum(axis=-1)
+        return log_normal(self.Y, self._scale.value(x)).sum(axis=-1)
 
     def transport(self, z):
         return self._line.quantile(z)
@@ -238,21 +256,21 @@ class Banana(Target):
         self.n_normals = k
         self._y = np.concatenate([[0.5], np.linspace(-2.0, 2.0, k - 2)])
         self._prior_sd = np.repeat(self.SCALE, [1, k - 1])
-        self.prior = Independent(*[(norm(0, sd), REAL) for sd in self._prior_sd])
+        self.prior = Normals(self._prior_sd)
         self._line = Line(self._log_marginal, -7.0, 7.0)
         self.log_evidence = self._line.log_integral
 
     def _log_marginal(self, first):
         """Log joint density of x_1 and the data."""
         sd = np.hypot(self.SD, self.SCALE[1])
-        log_density = norm.logpdf(first, 0, self.SCALE[0])
-        log_density += norm.logpdf(self._y[0] - first**2, 0, sd)
-        return log_density + norm.logpdf(self._y[1:], 0, sd).sum()
+        log_density = log_normal(first, self.SCALE[0])
+        log_density += log_normal(self._y[0] - first**2, sd)
+        return log_density + log_normal(self._y[1:], sd).sum()
 
     def log_likelihood(self, x):
         mean = x[:, 1:].copy()
         mean[:, 0] += x[:, 0] ** 2
-        return norm.logpdf(self._y, mean, self.SD).sum(axis=-1)
+        return log_normal(self._y - mean, self.SD).sum(axis=-1)
 
     def transport(self, z):
         first = self._line.quantile(z[..., 0])
