@@ -22,7 +22,7 @@ from numba.extending import intrinsic
 from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
-from pymc_statespace_filters.machine_code.keys import FAST_MATH
+from pymc_statespace_filters.machine_code.keys import FAST_MATH, digest
 
 NUMBERS = types.CPointer(types.float64)
 COUNTS = types.CPointer(types.int64)
@@ -46,9 +46,14 @@ _compiled: dict[str, Any] = {}
 def kept(function: Any, key: str) -> Any:
     """Keep a compiled function on PyTensor's disk cache, under a key that identifies its code."""
     if config.numba__cache:
-        CACHED_SRC_FUNCTIONS[function.py_func] = key
-        function._cache = _CacheByKey(function.py_func)
+        function._cache = _cache(function.py_func, key)
     return function
+
+
+def _cache(function: Callable, key: str) -> _CacheByKey:
+    # What is kept is loaded by way of its module, which may be another one tomorrow.
+    CACHED_SRC_FUNCTIONS[function] = digest(key, function.__module__)
+    return _CacheByKey(function)
 
 
 class Entry:
@@ -91,8 +96,7 @@ class Entry:
         options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
         compiled: Any = CFunc(self._function, (self._arguments, types.void), {}, options)
         if self.key is not None and config.numba__cache:
-            CACHED_SRC_FUNCTIONS[self._function] = self.key
-            compiled._cache = _CacheByKey(self._function)
+            compiled._cache = _cache(self._function, self.key)
         compiled.compile()
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled

@@ -5,12 +5,21 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from types import FunctionType
 
 import numpy as np
 from numba import carray, njit, types
+from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.machine_code import NUMBERS, Entry, address_of, call_address, entries
+from pymc_statespace_filters.machine_code import (
+    NUMBERS,
+    Entry,
+    address_of,
+    call_address,
+    entries,
+    kept,
+)
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
 ROOT = Path(__file__).parents[2]
@@ -120,3 +129,16 @@ def test_a_second_process_compiles_nothing(tmp_path):
     value, hits, compiled = answer()
     assert (hits, int(compiled) > 5) == ("0", True)
     assert answer() == [value, compiled, compiled]
+
+
+def test_code_is_kept_for_its_module():
+    """Kept code is loaded through its module: a file that moved must be compiled anew."""
+
+    def function(x):
+        return x + 1.0
+
+    keys = []
+    for module in ("here", "there"):
+        moved = FunctionType(function.__code__, {"__name__": module})
+        keys.append(CACHED_SRC_FUNCTIONS[kept(njit(moved), "key").py_func])
+    assert keys[0] != keys[1]

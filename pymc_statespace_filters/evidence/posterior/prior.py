@@ -7,9 +7,9 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
-from pymc.pytensorf import join_nonshared_inputs
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.support import has_law, is_restricted
 
 Array = NDArray[np.float64]
@@ -25,16 +25,11 @@ class ModelPrior:
 
     def __init__(self, model: pm.Model) -> None:
         self._model = model
-        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        outputs = [model.logp(vars=model.free_RVs)]
-        (output,), joined = join_nonshared_inputs(model.initial_point(), outputs, values)
-        self._log_density = compile_pymc([joined], output)
-        self._log_density.trust_input = True
+        self._log_density = RowFunction(model, model.logp(vars=model.free_RVs))
 
     def log_density(self, x: Array) -> Array:
         """Log-density of points x (m, k) with the Jacobians of the transforms; NaN becomes -inf."""
-        found = np.array([self._log_density(point) for point in x], dtype=np.float64)
-        return np.where(np.isnan(found), -np.inf, found)
+        return self._log_density.evaluate(x)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent draws, shape (count, k), in the order of `log_density`.
