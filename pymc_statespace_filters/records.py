@@ -94,7 +94,10 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     steps = np.round((array - t0) / dt)
     if (clashes := np.flatnonzero(np.diff(steps) == 0)).size:
         first, second = array[clashes[0]], array[clashes[0] + 1]
-        raise ModelError(f"times {first:g} and {second:g} fall on one step of dt = {dt:g}")
+        raise ModelError(
+            f"times {first:g} and {second:g} fall on one step of dt = {dt:g}: take a smaller dt, "
+            "or one value for both"
+        )
     return check_steps(steps.astype("int64"))
 
 

@@ -329,7 +329,10 @@ def test_filters_refuse_systems_that_they_cannot_treat():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (([0.0, 0.1, 0.104], 0.1), "times 0.1 and 0.104 fall on one step"),
+        (
+            ([0.0, 0.1, 0.104], 0.1),
+            "times 0.1 and 0.104 fall on one step of dt = 0.1: take a smaller dt",
+        ),
         (([-0.2, 0.1], 0.1), "negative"),
         (([0.0, np.nan], 0.1), "times .*finite"),
         (([0.0, 0.1], 0.0), "dt must be a positive number, got 0.0"),

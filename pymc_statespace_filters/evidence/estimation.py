@@ -140,7 +140,10 @@ class EvidenceEstimates(dict[str, Evidence]):
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("estimator")
 
     def __repr__(self) -> str:
-        return f"{self.to_dataframe()}\n{self._verdict()}"
+        # Doubts are sentences: in a column they would push the errors out of sight.
+        table = self.to_dataframe().drop(columns="doubts").to_string()
+        doubts = [f"{name}: {e.doubts}" for name, e in self.items() if e.doubts]
+        return "\n".join([table, self._verdict(), *doubts])
 
     def _repr_html_(self) -> str:
         return f"{self.to_dataframe().to_html()}<p>{self._verdict()}</p>"
@@ -150,7 +153,8 @@ class EvidenceEstimates(dict[str, Evidence]):
         if judged < 2:
             return "one estimate with an error: nothing to compare it with"
         if self.agreement:
-            return f"the estimates agree within {self.agreement.difference:.3f} nats"
+            apart = self.agreement.difference
+            return f"the estimates agree within their errors, {apart:.3f} nats apart at most"
         return f"the estimates disagree: {self.agreement.reading}"
 
 

@@ -16,14 +16,18 @@ class _Bar:
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack
+        self._shown: tuple | None = None
         self.announce("", 0)
 
     def announce(self, task: str, total: int) -> None:
         """Name what is evaluated next, and about how many evaluations that takes."""
+        if self._shown is not None:  # the number was a guess: what is done is done
+            bar, task = self._shown
+            bar.advance(task, advance=max(0, self._total - self._done))
         self._stack.close()
         self._task, self._total = task, total
         self._done, self._start = 0, perf_counter()
-        self._shown: tuple | None = None
+        self._shown = None
 
     def advance(self, count: int) -> None:
         self._done += count

@@ -90,4 +90,7 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dat
 
 
 def _text(log_evidence: float, se: float) -> str:
-    return f"{log_evidence:.2f}" if math.isnan(se) else f"{log_evidence:.2f} ± {se:.2f}"
+    if math.isnan(se):
+        return f"{log_evidence:.2f}"
+    digits = min(max(2, math.ceil(-math.log10(se))), 4) if se > 0 else 2  # none is "0.00"
+    return f"{log_evidence:.{digits}f} ± {se:.{digits}f}"

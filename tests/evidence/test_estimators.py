@@ -135,3 +135,13 @@ class TestAgreement:
         assert not found.agreement
         assert reading in found.agreement.reading
         assert reading in repr(found)
+
+
+def test_a_long_doubt_does_not_hide_the_errors():
+    doubtful = psf.Evidence(
+        -4.0, 0.125, "b", 2, 10, -3.0, "0c5f", doubts="the chains disagree " * 9
+    )
+    shown = repr(EvidenceEstimates({"a": evidence("a", -4.1, 0.25), "b": doubtful}))
+    for error in ("0.125", "0.250"):
+        assert error in shown
+    assert shown.endswith(f"b: {doubtful.doubts}")

@@ -236,7 +236,7 @@ def test_few_particles_in_many_dimensions_are_a_doubt():
     rng = np.random.default_rng(91)
     posterior = draws_of(Regression(12, 100, rng, sd=0.05))
     found = smc(posterior, n_particles=50, n_runs=8)
-    assert any("raise n_particles" in doubt for doubt in found.doubts)
+    assert any("descend from" in doubt for doubt in found.doubts)
 
 
 def test_a_very_noisy_likelihood_is_a_doubt():

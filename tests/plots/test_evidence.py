@@ -32,6 +32,11 @@ def test_numbers_beside_the_points(table, estimates):
     assert drawn(plot_evidence(estimates, backend="none"), "text")["laplace"]["string"] == "-5.30"
 
 
+def test_a_small_error_is_not_written_as_none(table):
+    collection = plot_evidence(table.assign(se=0.004), backend="none")
+    assert drawn(collection, "text")["cubic"]["string"] == "-5.000 ± 0.004"
+
+
 def test_an_estimate_without_error_has_no_bar(estimates):
     collection = plot_evidence(estimates, backend="none")
     assert drawn(collection, "point")["laplace"] is not None

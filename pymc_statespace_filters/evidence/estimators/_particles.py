@@ -42,7 +42,7 @@ def particles_of_prior(posterior: Posterior, count: int, rng: np.random.Generato
     if alive < MIN_ALIVE:
         raise ModelError(
             f"{alive} of {count} draws of the prior have a likelihood, fewer than {MIN_ALIVE}: "
-            "narrow the priors to values that the model can have, or raise n_particles"
+            "narrow the priors to values that the model can have"
         )
     return Particles(x, log_prior, log_likelihood, np.arange(count))
 
@@ -97,7 +97,8 @@ def _fitted(x: Array) -> Whitened:
         chol = np.linalg.cholesky(np.cov(x, rowvar=False).reshape(k, k))
     except np.linalg.LinAlgError:
         raise ModelError(
-            f"too few different particles are left to move in {k} dimensions: raise n_particles"
+            f"too few different particles are left to move in {k} dimensions: narrow the priors, "
+            "or use an estimator that starts from the draws"
         ) from None
     return Whitened(x.mean(axis=0), chol)
 

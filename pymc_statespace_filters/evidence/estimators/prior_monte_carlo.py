@@ -67,8 +67,8 @@ class PriorMonteCarlo:
         evidence = log_mean_of_independent(log_likelihood)
         if np.isneginf(evidence.value):
             raise ModelError(
-                f"none of {self.n_draws} draws of the prior has a likelihood: raise n_draws, or "
-                "narrow the priors to values that the model can have"
+                f"none of {self.n_draws} draws of the prior has a likelihood: narrow the "
+                "priors to values that the model can have"
             )
         n_effective = self.n_draws / (1 + self.n_draws * evidence.error**2)
         return Estimate(
@@ -84,6 +84,5 @@ def _doubts(n_effective: float) -> Iterator[str]:
     if n_effective < MIN_EFFECTIVE:
         yield (
             f"{n_effective:.0f} draws of the prior carry the mean, fewer than {MIN_EFFECTIVE}, and "
-            "better places may have been missed: raise n_draws, or use an estimator that goes "
-            "where the posterior is"
+            "better places may have been missed: use an estimator that goes where the posterior is"
         )

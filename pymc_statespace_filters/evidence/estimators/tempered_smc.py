@@ -210,10 +210,12 @@ def _doubts(acceptance: float, n_ancestors: float, spread: float) -> Iterator[st
     if n_ancestors < MIN_ANCESTORS:
         yield (
             f"its particles descend from {n_ancestors:.1f} draws of the prior in each run, fewer "
-            f"than {MIN_ANCESTORS}: raise n_particles"
+            f"than {MIN_ANCESTORS}: narrow the priors, or trust estimators that start from the "
+            "draws"
         )
     if spread > MAX_SPREAD:
         yield (
             f"its runs disagree, with a standard deviation of {spread:.2f} of their mean: a few of "
-            "them carry it, and its error is itself a guess; raise n_particles"
+            "them carry it, and its error is itself a guess: narrow the priors, or trust "
+            "estimators that start from the draws"
         )
