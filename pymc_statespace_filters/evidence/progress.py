@@ -16,6 +16,7 @@ class _Bar:
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack
+        self._total = self._done = 0
         self._shown: tuple | None = None
         self.announce("", 0)
 
