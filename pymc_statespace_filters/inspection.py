@@ -1,15 +1,11 @@
 """What samplers, evidence and diagnostics need to know of the state-space variables in a model."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
-import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
-from pymc.pytensorf import compile as compile_pymc
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.replace import clone_replace
@@ -17,23 +13,20 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import COLLAPSED, EKF, FAILURES, Filter
-from pymc_statespace_filters.integrators import EulerMaruyama
+from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.likelihood import check_kinds
-from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
-from pymc_statespace_filters.overshoot import smallest_multiplier
 from pymc_statespace_filters.random_variable import StateSpaceRV
 
 __all__ = [
     "COLLAPSED",
     "FAILURES",
     "MovedNoise",
-    "densities_by_steps",
     "exactness",
     "health_outputs",
     "hold_noise",
     "is_filter",
+    "likelihood_nodes",
     "log_density_terms",
     "move_noise",
     "noise_seeds",
@@ -41,7 +34,6 @@ __all__ = [
     "resized",
     "smooth_filters",
     "state_space_names",
-    "step_multipliers",
     "with_filter",
 ]
 
@@ -54,7 +46,8 @@ def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
     }
 
 
-def _likelihood_nodes(graphs: Sequence[Variable]) -> list[Any]:
+def likelihood_nodes(graphs: Sequence[Variable]) -> list[Any]:
+    """The applications of likelihood operations that graphs depend on, each once."""
     nodes = {v.owner: None for v in ancestors(graphs) if v.owner is not None}
     return [node for node in nodes if isinstance(node.op, LogLikelihood)]
 
@@ -105,7 +98,7 @@ def resized(filter: Filter, n_members: int) -> Filter:
 
 def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     """The health vector of every filter evaluation in the graphs: see `ops.LogLikelihood`."""
-    return [node.outputs[1] for node in _likelihood_nodes(graphs)]
+    return [node.outputs[1] for node in likelihood_nodes(graphs)]
 
 
 def hold_noise(
@@ -119,7 +112,7 @@ def hold_noise(
     replaced: dict[Variable, Variable] = {}
     normals: dict[TensorVariable, TensorVariable] = {}
     names = {seed: name for name, seed in seeds.items()}
-    for node in _likelihood_nodes(graphs):
+    for node in likelihood_nodes(graphs):
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, filter = node.op.system, node.op.filter
@@ -171,7 +164,7 @@ def move_noise(
     replaced: dict[Variable, Variable] = {}
     noises: list[tuple[TensorVariable, TensorVariable, TensorVariable]] = []
     names = {seed: name for name, seed in seeds.items()}
-    for node in _likelihood_nodes(graphs):
+    for node in likelihood_nodes(graphs):
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
@@ -211,7 +204,7 @@ def with_filter(
         check_kinds(variables[name].op.system, filter)
     replaced: dict[Variable, Variable] = {}
     found: set[str] = set()
-    for node in _likelihood_nodes(graphs):
+    for node in likelihood_nodes(graphs):
         names = [name for name in variables if _is_likelihood_of(node, model, variables[name])]
         found.update(names)
         new = {filters.get(name, node.op.filter) for name in names}
@@ -249,76 +242,3 @@ def exactness(model: pm.Model) -> bool:
     """Whether sampling the model targets its posterior itself, without the bias of a filter."""
     ops = [node.op for node in _state_space_nodes(model).values()]
     return all(op.filter.is_exact_for(op.system) for op in ops)
-
-
-def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable] | None:
-    """A model's log-density by its Euler-Maruyama steps, and by steps half as long.
-
-    Both by deterministic filters, the EKF where it can treat the system, else the variable's own.
-    None if no variable has such steps, or if one has no deterministic filter.
-    """
-    log_density = model.logp()
-    by_steps: list[dict[Variable, Variable]] = [{}, {}]
-    nodes = _likelihood_nodes([log_density])
-    if not any(_has_steps(node) for node in nodes):
-        return None
-    for node in nodes:
-        system = refined = node.op.system
-        if _has_steps(node):
-            integrator = system.integrator
-            refined = system.with_integrator(replace(integrator, substeps=2 * integrator.substeps))
-        filter = _deterministic_filter(system, refined, node.op.filter)
-        if filter is None:
-            return None
-        for replaced, of in zip(by_steps, (system, refined), strict=True):
-            outputs = LogLikelihood(of, filter)(*node.inputs)
-            replaced |= dict(zip(node.outputs, outputs, strict=True))
-    coarse, fine = (clone_replace(log_density, replaced) for replaced in by_steps)
-    return coarse, fine
-
-
-def step_multipliers(
-    model: pm.Model,
-) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """By which the steps of a model's integrators multiply a small deviation, at worst.
-
-    The function takes points of the joined value variables (m, k) and gives numbers (m,), see
-    `overshoot.smallest_multiplier`; the smallest of all variables with Euler-Maruyama steps. None
-    if there are no such variables.
-    """
-    nodes = [node for node in _likelihood_nodes([model.logp()]) if _has_steps(node)]
-    if not nodes:
-        return None
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    asked = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]  # without data and seed
-    outputs, joined = join_nonshared_inputs(model.initial_point(), asked, values)
-    record = compile_pymc([joined], outputs, mode="FAST_COMPILE")
-
-    def multipliers(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]
-        found = [
-            smallest_multiplier(node.op.system, *columns[4 * i : 4 * i + 4])
-            for i, node in enumerate(nodes)
-        ]
-        return np.stack(found).min(axis=0)
-
-    return multipliers
-
-
-def _has_steps(node: Any) -> bool:
-    return isinstance(node.op.system.integrator, EulerMaruyama)
-
-
-def _deterministic_filter(
-    system: StateSpaceModel, refined: StateSpaceModel, own: Filter
-) -> Filter | None:
-    """A filter that gives a number for both systems, whatever the seed."""
-    for filter in (EKF(), own):
-        try:
-            filter.check(system)
-            filter.check(refined)
-        except ModelError:
-            continue
-        if not filter.noisy:
-            return filter
-    return None

@@ -14,7 +14,7 @@ from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.doubts.discretisation import doubts_of_steps
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.draws import unconstrained_draws
-from pymc_statespace_filters.inspection import densities_by_steps
+from pymc_statespace_filters.integration_steps import densities_by_steps
 
 POSITION = {"observation": lambda x: [x[0]]}
 

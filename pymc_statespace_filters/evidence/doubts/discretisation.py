@@ -25,7 +25,7 @@ from scipy.stats import rankdata
 
 from pymc_statespace_filters.evidence.posterior import RowFunction
 from pymc_statespace_filters.evidence.posterior.data import scalar_count
-from pymc_statespace_filters.inspection import densities_by_steps, step_multipliers
+from pymc_statespace_filters.integration_steps import densities_by_steps, step_multipliers
 
 N_DRAWS = 100
 MIN_DRAWS = 2  # one may be chance
