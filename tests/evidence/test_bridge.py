@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence.estimators import bridge as module
 from pymc_statespace_filters.evidence.estimators.bridge import MOST_TERMS, Bridge
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes, half_normally_distributed
@@ -187,6 +188,15 @@ class TestDoubts:
         )
         found = Bridge().estimate(posterior, rng=rng)
         assert any("nearer to a Gaussian" in doubt for doubt in found.doubts)
+
+    def test_the_gap_between_halves_is_in_units_of_its_error(self, monkeypatch):
+        monkeypatch.setattr(module, "MAX_GAP", -1.0)
+        gaps = []
+        for run in range(100):
+            rng = np.random.default_rng([34, run])
+            found = Bridge().estimate(half_normal((4, 250), rng), rng=rng)
+            gaps.append(float(found.doubts[-1].split("differ by ")[1].split(" of")[0]))
+        assert 0.6 < np.mean(np.square(gaps)) < 1.6  # 1 within 0.14
 
     def test_halves_that_disagree(self):
         rng = np.random.default_rng(31)

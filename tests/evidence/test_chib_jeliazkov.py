@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence.estimators import chib_jeliazkov as module
 from pymc_statespace_filters.evidence.estimators._means import (
     log_mean_of_chains,
     log_mean_of_independent,
@@ -70,6 +71,23 @@ def test_autocorrelation_enlarges_the_error():
     )
     sticky = ChibJeliazkov(20_000).estimate(posterior, rng=rng)
     assert sticky.se > 1.5 * ChibJeliazkov(20_000).estimate(independent, rng=rng).se
+
+
+def test_effective_numbers_and_the_error_say_the_same():
+    rng = np.random.default_rng(20)
+    found = ChibJeliazkov(1000).estimate(gaussian(2, (4, 500), rng, correlation=0.8), rng=rng)
+    worth = [found.settings[f"n_effective_{mean}"] for mean in ("numerator", "denominator")]
+    assert sum(1 / number for number in worth) == pytest.approx(found.se**2, rel=1e-12)
+
+
+def test_the_gap_between_halves_is_in_units_of_its_error(monkeypatch):
+    monkeypatch.setattr(module, "MAX_GAP", -1.0)
+    gaps = []
+    for run in range(100):
+        rng = np.random.default_rng([21, run])
+        found = ChibJeliazkov(500).estimate(gaussian(2, (4, 250), rng), rng=rng)
+        gaps.append(float(found.doubts[-1].split("differ by ")[1].split(" of")[0]))
+    assert 0.6 < np.mean(np.square(gaps)) < 1.6  # 1 within 0.14
 
 
 def test_proposals_without_density_count_as_zeros():

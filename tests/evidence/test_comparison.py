@@ -119,6 +119,12 @@ def test_undecided_is_when_the_interval_of_the_odds_holds_one(gap, se, undecided
     assert list(table["undecided"]) == [undecided, undecided, False]
 
 
+def test_what_the_prior_decides_is_not_undecided():
+    rivals = {"a": evidence(-8, se=0.1), "b": evidence(-8, se=0.1)}
+    assert compare_evidence(rivals)["undecided"].all()
+    assert not compare_evidence(rivals, prior={"a": 99, "b": 1})["undecided"].any()
+
+
 def test_groups_are_accepted():
     idata = az.from_dict({"posterior": {"x": np.zeros((1, 4))}})
     stored = evidence(-8)

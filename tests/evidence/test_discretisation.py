@@ -11,7 +11,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.doubts.discretisation import doubts_of_steps
+from pymc_statespace_filters.evidence.doubts import discretisation, doubts_of_steps
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.draws import unconstrained_draws
 from pymc_statespace_filters.integration_steps import densities_by_steps
@@ -169,3 +169,45 @@ def test_a_pickled_system_has_forgotten_its_integrator():
     assert again == linear()
     assert again.integrator is None
     assert doubts(linear_model(again), near(-19.0)) == []
+
+
+class TestRules:
+    """Which draws are guilty, with losses and multipliers that are given instead of computed."""
+
+    def doubts(self, monkeypatch, *, lost, overshoots, size=1):
+        with pm.Model() as model:
+            a = pm.Normal("a", 0, 10)
+            pm.Normal("y", 0 * a, 1, observed=np.zeros(size))
+        value = model.rvs_to_values[a]
+        densities = model.logp(), model.logp() - lost(value)
+        monkeypatch.setattr(discretisation, "densities_by_steps", lambda model: densities)
+        monkeypatch.setattr(
+            discretisation,
+            "step_multipliers",
+            lambda model: lambda x: np.where(overshoots(x[:, 0]), -0.5, 0.5),
+        )
+        return doubts(model, near(-1.0, 1.0))
+
+    def test_draws_that_do_not_overshoot_may_lose(self, monkeypatch):
+        def lost(a):
+            return pt.switch(a > 0, 20.0, 0.0)
+
+        assert self.doubts(monkeypatch, lost=lost, overshoots=lambda a: a < 0) == []
+        assert len(self.doubts(monkeypatch, lost=lost, overshoots=lambda a: a > 0)) == 1
+
+    def test_only_overshooting_can_end_a_posterior(self, monkeypatch):
+        """With finer steps the likelihood would go on rising where no draw is."""
+
+        def lost(a):
+            return pt.switch(abs(a) > 1.35, -20.0, 0.0)
+
+        assert self.doubts(monkeypatch, lost=lost, overshoots=lambda a: abs(a) < 1) == []
+        (doubt,) = self.doubts(monkeypatch, lost=lost, overshoots=lambda a: abs(a) > 1.35)
+        assert doubt.startswith("the posterior ends where")
+
+    @pytest.mark.parametrize(("loss", "is_doubt"), [(14.0, False), (16.0, True)])
+    def test_a_long_record_may_lose_more(self, monkeypatch, loss, is_doubt):
+        found = self.doubts(
+            monkeypatch, lost=lambda a: loss + 0 * a, overshoots=lambda a: a < 0, size=100
+        )
+        assert bool(found) == is_doubt

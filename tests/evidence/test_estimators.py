@@ -118,6 +118,10 @@ class TestAgreement:
     def test_an_error_of_zero(self):
         assert agreement_of(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
 
+    def test_of_three_the_pair_furthest_apart_in_its_errors_is_named(self):
+        found = estimates(bridge=(-10.0, 0.01), importance=(-10.5, 0.01), tempered_smc=(-9.0, 1.0))
+        assert found.agreement.reading.startswith("bridge is 0.50 above importance; ")
+
     @pytest.mark.parametrize(
         ("values", "reading"),
         [

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import t as student
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._maximum import EdgeError, derivatives
+from pymc_statespace_filters.evidence.estimators._maximum import EdgeError, derivatives, whitened_by
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.analytic import Regression, gaussian, half_normal
@@ -111,6 +111,42 @@ def test_a_climb_without_end(slope):
     posterior = Posterior(draws, log_density(draws), lambda x, rng: log_density(x))
     with pytest.raises(ModelError, match="goes on growing, or levels off"):
         laplace(posterior)
+
+
+def test_a_cusp_is_no_mode():
+    """Of an asymmetric Laplace density: differences see a curvature there, and a slope."""
+
+    def log_density(x):
+        return np.where(x[..., 0] < 0, x[..., 0], -3 * x[..., 0])
+
+    rng = np.random.default_rng(41)
+    draws = rng.exponential(1 / 3, (2, 500, 1)) - rng.exponential(1, (2, 500, 1))
+    posterior = Posterior(draws, log_density(draws), lambda x, rng: log_density(x))
+    with pytest.raises(ModelError, match=r"curvature is \d.* and the gradient"):
+        laplace(posterior)
+
+
+def test_a_chain_far_from_its_top_is_climbed_too():
+    """No draw of the second chain is among the best, and its mode is the higher one."""
+    rng = np.random.default_rng(42)
+    centres, heights = np.array([-20.0, 20.0]), np.array([0.0, 3.0])
+
+    def log_density(x):
+        return (heights - 0.5 * (x - centres) ** 2).max(axis=-1)
+
+    draws = centres[:, None, None] + rng.standard_normal((2, 500, 1))
+    draws[1] += 4 * np.sign(draws[1] - centres[1])
+    found = laplace(Posterior(draws, log_density(draws), lambda x, rng: log_density(x)))
+    assert found.log_evidence == pytest.approx(3 + 0.5 * np.log(2 * np.pi), abs=1e-6)
+
+
+def test_coordinates_are_those_within_chains():
+    rng = np.random.default_rng(43)
+    within = rng.standard_normal((2, 100, 3))
+    draws = within + np.array([-50.0, 50.0])[:, None, None]
+    chol = whitened_by(Posterior(draws, draws[..., 0], lambda x, rng: x[:, 0])).chol
+    expected = np.mean([np.cov(chain, rowvar=False, ddof=0) for chain in within], axis=0)
+    np.testing.assert_allclose(chol @ chol.T, expected, rtol=1e-12)
 
 
 def test_draws_that_do_not_vary():

@@ -39,20 +39,21 @@ def test_the_higher_of_two_peaks_even_if_the_lower_is_wider():
 
 
 def test_chains_that_stand_still():
-    """Metropolis repeats itself: 20 chains, root mean square 0.14 of a deviation (az.mode: 0.25).
+    """Metropolis repeats itself: 60 times two chains, root mean square 0.15 of a deviation.
 
-    A right implementation is above 0.2 once in some 1000 seeds.
+    It is 0.22 with the bandwidth for as many draws as there are, and a right implementation is
+    above 0.19 once in some 1000 seeds.
     """
     rng = np.random.default_rng(1)
-    steps, levels = 3 * rng.standard_normal((4000, 40)), np.log(rng.random((4000, 40)))
-    x = np.empty((4000, 40))
-    now = np.zeros(40)
+    steps, levels = 3 * rng.standard_normal((4000, 120)), np.log(rng.random((4000, 120)))
+    x = np.empty((4000, 120))
+    now = np.zeros(120)
     for i in range(4000):
         move = now + steps[i]
         now = np.where(levels[i] < (now**2 - move**2) / 2, move, now)
         x[i] = now
-    modes = marginal_modes(idata(x=x.T.reshape(2, 20, 4000).swapaxes(1, 2)))
-    assert 0.05 < np.sqrt((modes.loc["posterior"] ** 2).mean()) < 0.2
+    modes = marginal_modes(idata(x=x.T.reshape(2, 60, 4000).swapaxes(1, 2)))
+    assert 0.05 < np.sqrt((modes.loc["posterior"] ** 2).mean()) < 0.19
 
 
 def test_short_chains():

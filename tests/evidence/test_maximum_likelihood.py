@@ -8,6 +8,7 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
+    N_VALUING,
     max_log_likelihood,
 )
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
@@ -148,3 +149,18 @@ class TestNoisyLikelihood:
 
         largest(replace(posterior, evaluate=counted))
         assert sum(rows) == N_EVALUATIONS < 400
+
+    def test_the_winner_is_valued_by_estimates_that_did_not_choose_it(self):
+        rng = np.random.default_rng(63)
+        posterior = Banana(3).posterior((4, 250), rng, noise_sd=1.0)
+        calls = []
+
+        def recorded(x, rng):
+            calls.append((x, posterior.evaluate(x, rng)))
+            return calls[-1][1]
+
+        found = max_log_likelihood(replace(posterior, evaluate=recorded), rng)
+        x, values = calls[-1]
+        likelihoods = np.exp(values - posterior.prior.log_density(x))
+        assert len(x) == N_VALUING
+        assert found.log_likelihood == pytest.approx(np.log(likelihoods.mean()), rel=1e-12)

@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import comb
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.estimators import multi_block
-from pymc_statespace_filters.evidence.estimators._proposal import plan_proposal
+from pymc_statespace_filters.evidence.estimators._proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.multi_block import estimate_in_blocks
-from tests.evidence.analytic import gaussian, half_normal
+from pymc_statespace_filters.evidence.posterior import Posterior
+from tests.evidence.analytic import autoregressive, gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
@@ -71,6 +73,39 @@ def test_standard_errors_are_calibrated(k, n_blocks, n_draws, correlation, noise
         z.append((found.log_evidence - LOG_EVIDENCE) / found.se)
     assert abs(np.mean(z)) < 0.25
     assert 0.7 < np.square(z).mean() < 1.4
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_the_error_is_that_of_terms_known_in_closed_form(correlation):
+    """Two blocks of a standard normal posterior: every term is exp(-y^2 / 2) of a normal y.
+
+    If two such y have the correlation r, their terms have the relative covariance
+    2 / sqrt(4 - r^2) - 1, a power series in r^2. Draws have r = rho^lag; walkers, which here accept
+    all moves, the product of the cosines of their angles.
+    """
+    m = np.arange(1, 40)
+    central = comb(2 * m, m)
+
+    def variance(mean_power):
+        """Of the mean of n terms, times n; given the mean of r^(2 m) one step apart."""
+        return (central / 16.0**m * (1 + mean_power) / (1 - mean_power)).sum()
+
+    draws, walkers = variance(correlation ** (2 * m)), variance(central / 4.0**m)
+    independent = variance(0.0)
+    n_draws, squares = 4096, []
+    for run in range(20):
+        rng = np.random.default_rng([39, run])
+        y = autoregressive((4, n_draws // 4, 2), correlation, rng)
+        posterior = Posterior(
+            y, -0.5 * (y**2).sum(axis=-1), lambda x, rng: -0.5 * (x**2).sum(axis=-1)
+        )
+        proposal = Proposal(np.zeros(2), 0.0, np.eye(2))
+        found = estimate_in_blocks(proposal, posterior, n_blocks=2, n_proposals=n_draws, rng=rng)
+        squares.append(found.se**2)
+    # Numerator; numerator and denominator of the reduced run; denominator of the last.
+    exact = draws + (walkers + independent) + independent
+    # The mean of twenty has an error of three per cent.
+    assert np.mean(squares) * n_draws == pytest.approx(exact, rel=0.1)
 
 
 class TestNoisyLikelihood:
@@ -139,6 +174,32 @@ class TestWalkers:
         ):
             means = values.mean(axis=1)
             assert abs(means.mean() - truth) < 4 * means.std() / 8 < 0.2
+
+    def test_forget_where_they_started(self):
+        """All moves under N(0, 1) are accepted, and thirty of them leave nothing of a start."""
+        rng = np.random.default_rng(37)
+
+        def target(y):
+            return -0.5 * (y**2).sum(axis=1)
+
+        starts = np.full((64, 1), 20.0)
+        run = multi_block._walk(target, starts, target(starts), np.zeros(1), slice(0, 1), 640, rng)
+        assert run.n_moves == multi_block.N_WARMUP + 10
+        assert abs(run.y.mean()) < 0.3  # its error is 0.08
+
+    def test_start_with_the_estimates_of_their_places(self, monkeypatch):
+        rng = np.random.default_rng(38)
+        posterior = gaussian(4, (4, 500), rng)
+        walk, started = multi_block._walk, []
+
+        def checked(target, y, log_density, *rest):
+            np.testing.assert_allclose(log_density, target(y), rtol=1e-12)
+            started.append(len(y))
+            return walk(target, y, log_density, *rest)
+
+        monkeypatch.setattr(multi_block, "_walk", checked)
+        estimate(posterior, 3, rng, n_proposals=500)
+        assert started == [multi_block.N_WALKERS] * 4
 
     def test_never_stand_where_there_is_no_density(self):
         rng = np.random.default_rng(28)

@@ -61,6 +61,9 @@ def test_draws_without_likelihood_count_as_zeros():
     found = PriorMonteCarlo(10_000).estimate(posterior, rng=np.random.default_rng(76))
     assert found.se == pytest.approx(0.01, rel=0.05)
     assert abs(found.log_evidence - np.log(0.5)) < 4 * found.se
+    # As many draws count as have a likelihood.
+    n_effective = found.settings["n_effective_prior_draws"]
+    assert n_effective == pytest.approx(10_000 * np.exp(found.log_evidence))
 
 
 def test_too_many_parameters_are_a_doubt():

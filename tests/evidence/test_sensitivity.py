@@ -17,6 +17,7 @@ from pymc_statespace_filters import (
     prior_sensitivity,
 )
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence.choice.stretched_prior import StretchedPrior
 from pymc_statespace_filters.evidence.result import store_evidence
 from tests.evidence.analytic import Regression
 
@@ -119,6 +120,12 @@ class TestWidths:
         assert (se < 0.05).all()
         np.testing.assert_allclose(error.sel(width=1), 0, atol=1e-10)
         np.testing.assert_allclose(se.sel(width=1), [0.01, 0.02])
+        for name, own in (("line", 0.01), ("plane", 0.02)):
+            rival = rivals[name]
+            draws = rival.idata["posterior"].to_dataset()
+            of_width = StretchedPrior(rival.model, ["w"]).reweighted(draws, 0.5)
+            assert of_width.error > own / 2
+            assert se.sel(model=name, width=0.5) == pytest.approx(np.hypot(own, of_width.error))
         weights = curves["width_log_evidence"] + np.log([[1], [2]])
         np.testing.assert_allclose(curves["width_prob"], softmax(weights, axis=0))
         assert (curves["width_prob_low"] < curves["width_prob"]).all()

@@ -132,6 +132,10 @@ def test_what_lies_beyond_the_bounds_is_not_guessed():
     wide = prior.reweighted(draws, 1.5)
     assert wide.beyond > 0.31 / 0.69
     assert not wide.is_known
+    with pm.Model() as mirrored:
+        pm.Uniform("x", -1.3, 0)
+    mirror_image = StretchedPrior(mirrored, ["x"]).reweighted(-draws, 1.5)
+    assert mirror_image.beyond == pytest.approx(wide.beyond)
     check(target, model, uniform(0, 0.65 * 1.6), 0.8)  # narrower is known
     # None of the draws is left.
     nothing = prior.reweighted(draws, 0.01)
@@ -216,6 +220,23 @@ def test_heavy_tails_are_seen():
     light = reweigh(z**2 / 2 * (1 - 1 / 1.05), np.zeros(SHAPE))
     assert light.pareto_k < 0.3
     assert light.is_known
+
+
+def test_what_lies_beyond_is_weighed_as_the_draws_are():
+    """Half the draws weigh three times as much as the others, and only they are at the edge."""
+    heavy = np.arange(4000).reshape(SHAPE) % 2
+    found = reweigh(np.log(1.0 + 2 * heavy), np.where(heavy, 0.4, 0.0))
+    assert found.beyond == pytest.approx(0.3)
+    assert found.log_ratio == pytest.approx(np.log(2))
+
+
+def test_autocorrelated_draws_are_worth_less():
+    log_ratio = 0.3 * autoregressive((4, 4000, 1), 0.9, np.random.default_rng(7))[..., 0]
+    # The terms themselves have the correlation 0.9 nearly: 19 of them are worth one.
+    alone = np.exp(0.3**2) - 1
+    assert reweigh(log_ratio, np.zeros((4, 4000))).error ** 2 * 16_000 / alone == pytest.approx(
+        19, rel=0.25
+    )
 
 
 def test_few_effective_draws_are_not_enough():

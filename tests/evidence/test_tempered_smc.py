@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import norm, uniform
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators import tempered_smc
@@ -50,6 +50,19 @@ def test_evidence_of_a_conjugate_regression(k):
     assert found.se < 0.15
     assert abs(found.log_evidence - regression.log_evidence) < 4 * found.se
     assert not found.doubts
+
+
+def test_moves_to_where_there_is_no_prior():
+    """A box without a transform: neither prior nor density beyond it."""
+    prior = Independent((uniform(0, 1), REAL))
+    posterior = replace(
+        draws_of(bounded()),
+        prior=prior,
+        evaluate=lambda x, rng: prior.log_density(x) + norm.logpdf(x[:, 0], 0, 0.1),
+    )
+    found = smc(posterior)
+    truth = np.log(norm.cdf(1, 0, 0.1) - 0.5)
+    assert abs(found.log_evidence - truth) < 4 * found.se < 0.2
 
 
 @pytest.mark.parametrize("target", [half_normally_distributed(), bounded(), Banana(4)])
@@ -151,6 +164,11 @@ class TestParts:
         assert found.log_evidence == pytest.approx(np.log(2.0) - 2000)
         # Standard deviation sqrt(2), relative to the mean 2, of eight; Student's factor.
         assert found.se == pytest.approx(np.sqrt(2) / 2 / np.sqrt(8) * np.sqrt(7 / 5))
+
+    def test_ancestors_are_counted_by_run(self):
+        ancestor = np.repeat(np.arange(24), 2)  # eight runs of six particles, three ancestors each
+        found = tempered_smc._summary(np.zeros(8), ancestor, [])
+        assert found.settings["n_ancestors"] == 3
 
     @pytest.mark.parametrize("spread", [1.0, 1e3, 1e9])
     def test_temperatures_leave_a_share_of_the_effective_number(self, spread):
