@@ -80,14 +80,20 @@ def chib_jeliazkov(
     Raises
     ------
     ModelError
-        If a free variable is discrete, or the draws are too few or do not vary.
+        If an argument is wrong, a free variable is discrete, the draws are too few or do not vary,
+        or chains of held noise have different seeds.
     DataMismatchError
-        If the draws lack free variables of the model or belong to another model or to other data.
+        If the draws lack free variables of the model or belong to another model or to other data,
+        or the estimates of a noisy likelihood cannot be found again.
+    TypeError
+        If no model is given, by argument or ``with`` block.
 
     Warns
     -----
     EvidenceWarning
-        If few terms dominate a mean, or the chains disagree.
+        If the error or the number deserves doubt: few terms dominate a mean, the chains disagree, a
+        prior is improper or not normalised, part of the posterior lies at the stability limit of
+        Euler-Maruyama steps.
 
     Examples
     --------
@@ -191,13 +197,17 @@ def estimate_evidence(
     Returns
     -------
     EvidenceEstimates
-        A dictionary of name to `Evidence`, with an ``agreement``.
+        A dictionary of name to `Evidence`, shown as a table. Its ``agreement`` is true if they
+        agree, and has ``p_value``, ``difference`` (nats) and ``reading`` (the likely cause if they
+        do not); ``to_dataframe()`` is the table.
 
     Raises
     ------
     ModelError
-        If an estimator is unknown, or cannot treat the model.
-    DataMismatchError
+        If an estimator is unknown, or cannot treat the model: "laplace" a noisy likelihood or a
+        mode at the edge of the support, "tempered_smc" and "prior_monte_carlo" a prior that cannot
+        be drawn from. And as `chib_jeliazkov`.
+    DataMismatchError, TypeError
         As `chib_jeliazkov`.
 
     Warns

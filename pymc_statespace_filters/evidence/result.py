@@ -53,6 +53,12 @@ class Evidence:
         Names of the free variables whose prior is improper, as ``pm.Flat``, or is not normalised,
         as under an ordering transform.
 
+    Raises
+    ------
+    ModelError
+        If a number is not what it must be: `log_evidence` and `log_volume` finite, `se` not
+        negative, the counts neither, `noise` one of the three.
+
     Examples
     --------
     >>> from pymc_statespace_filters import Evidence
@@ -167,7 +173,7 @@ def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
     """
     if GROUP not in idata.children:
         raise ModelError(
-            f"{name!r} has no group {GROUP!r}: call chib_jeliazkov(idata, model) on it first; "
+            f"{name!r} has no group {GROUP!r}: call estimate_evidence(idata, model) on it first; "
             f"its groups are {sorted(idata.children)}"
         )
     group = idata[GROUP].to_dataset()

@@ -136,7 +136,7 @@ def test_groups_are_accepted():
 
 def test_an_idata_without_the_group_says_what_to_call():
     idata = az.from_dict({"posterior": {"x": np.zeros((1, 4))}})
-    with pytest.raises(ModelError, match=r"'a' has no group 'evidence': call chib_jeliazkov"):
+    with pytest.raises(ModelError, match=r"'a' has no group 'evidence': call estimate_evidence"):
         compare_evidence({"a": idata})
 
 

@@ -91,7 +91,7 @@ def test_a_rugged_log_density_is_a_doubt():
 
 def test_a_noisy_likelihood_has_no_mode():
     posterior = gaussian(2, (2, 500), np.random.default_rng(36), noise_sd=0.1)
-    with pytest.raises(ModelError, match="neither mode nor curvature; use ChibJeliazkov"):
+    with pytest.raises(ModelError, match="neither mode nor curvature; use chib_jeliazkov"):
         laplace(posterior)
 
 

@@ -61,7 +61,9 @@ def average_models(
     Raises
     ------
     ModelError
-        If an argument is wrong, or if the models' arrays disagree in dims, shape or coordinates.
+        If an argument is wrong; if an evidence in the table has no error; or if the models' arrays
+        disagree in dims, shape or coordinates. What `function` itself raises is passed on, with a
+        note that names the model.
 
     Notes
     -----

@@ -38,6 +38,11 @@ class DimensionCorrection:
         alpha. The thesis used 3; 1 is the penalty of the Bayesian information criterion, for flat
         priors.
 
+    Raises
+    ------
+    ModelError
+        If `exponent` is not a finite number.
+
     Examples
     --------
     >>> from pymc_statespace_filters import DimensionCorrection, Evidence

@@ -82,7 +82,7 @@ class Laplace:
             raise ModelError(
                 "Laplace needs a log-density that is a function of the parameters: this likelihood "
                 "is estimated with fresh noise each time and has neither mode nor curvature; use "
-                "ChibJeliazkov or bridge sampling, or a chain that held its seed"
+                "chib_jeliazkov or bridge, or a chain that held its seed"
             )
         coordinates = whitened_by(posterior)
 
@@ -112,7 +112,7 @@ def _log_curvature(log_density: Rows, mode: Array) -> tuple[float, float]:
     except EdgeError:
         raise ModelError(
             "Laplace needs a mode inside the support: the largest log-density lies at its edge, "
-            "where there is no curvature; use ChibJeliazkov or bridge sampling, or give the "
+            "where there is no curvature; use chib_jeliazkov or bridge, or give the "
             "parameter a transform"
         ) from None
     curvature = -(4 * fine - coarse) / 3
@@ -123,7 +123,7 @@ def _log_curvature(log_density: Rows, mode: Array) -> tuple[float, float]:
             "Laplace needs a mode with curvature in every direction: where the climb ended the "
             f"smallest curvature is {smallest:.2g} and the gradient {steepest:.2g}, in units of "
             "the draws' covariance. The log-density goes on growing, or levels off, towards a "
-            "bound or along a ridge; use ChibJeliazkov or bridge sampling"
+            "bound or along a ridge; use chib_jeliazkov or bridge"
         )
     log_det, of_fine, of_coarse = np.linalg.slogdet(np.stack([curvature, -fine, -coarse]))[1]
     return float(log_det), float(of_fine - of_coarse)
