@@ -20,7 +20,6 @@ from tests.evidence.calibration import (
 from tests.evidence.targets import half_normally_distributed
 
 QUICK = "half-normal, log"
-OUTSIDE = {("banana", "tempered_smc"): "evidences of a long upper tail: mean z -0.3, not -0.25"}
 
 
 def pairs(cases):
@@ -64,9 +63,7 @@ def test_errors_of_a_few_replications(target, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("target", "name"), pairs(CASES))
-def test_errors(target, name, request):
-    if (target, name) in OUTSIDE:
-        request.applymarker(pytest.mark.xfail(reason=OUTSIDE[target, name]))
+def test_errors(target, name):
     case = CASES[target]
     result = calibrate(CALIBRATED[name], case.source, replications(name, case))
     # An estimator that is out of its depth may be wrong if it says so.
