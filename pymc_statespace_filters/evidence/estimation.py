@@ -231,7 +231,7 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
-    names = [estimators] if isinstance(estimators, str) else list(estimators)
+    names = [estimators] if isinstance(estimators, str) else list(estimators or ())
     if not names or not set(names) <= set(ESTIMATORS):
         raise ModelError(
             f"estimators must name at least one of {list(ESTIMATORS)} and nothing else, got {names}"

@@ -8,14 +8,19 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.errors import EvidenceWarning
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.doubts import doubts_of_draws, doubts_of_steps
 from pymc_statespace_filters.evidence.estimators.estimate import Estimator
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     max_log_likelihood,
 )
-from pymc_statespace_filters.evidence.posterior import ModelDensity, noise_was_moved, posterior_of
+from pymc_statespace_filters.evidence.posterior import (
+    ModelDensity,
+    noise_was_moved,
+    posterior_group,
+    posterior_of,
+)
 from pymc_statespace_filters.evidence.posterior.data import data_fingerprint, observation_count
 from pymc_statespace_filters.evidence.posterior.support import Support
 from pymc_statespace_filters.evidence.progress import watched
@@ -51,6 +56,9 @@ def evidences_of(
     EvidenceWarning
         Once for what is doubtful whatever the estimator, and once for each estimate that is.
     """
+    if not isinstance(model, pm.Model | None):
+        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
+    posterior_group(idata)  # raises what is wrong with it, before anything is compiled
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = posterior_of(idata, density)
     support = Support.of(density.model)
@@ -69,7 +77,11 @@ def evidences_of(
         estimates = {}
         for name, estimator in estimators.items():
             announce(name, estimator.n_evaluations(posterior))
-            estimates[name] = estimator.estimate(posterior, rng=stream(name))
+            try:
+                estimates[name] = estimator.estimate(posterior, rng=stream(name))
+            except ModelError as error:
+                error.add_note(f"raised by the estimator {name!r}")
+                raise
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 

@@ -228,3 +228,25 @@ def test_an_error_inside_the_function_names_the_model():
     with pytest.raises(KeyError, match="k") as caught:
         average_models({"a": TWO["a"], "b": draws(1, name="c")}, {"a": 1, "b": 1}, slope)
     assert caught.value.__notes__ == ["raised by function with the posterior of model 'b'"]
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("k", "function must be callable, for model 'a' it is 'k'"),
+        (lambda post: post["k"].isel(draw=slice(0)), "returned no draws for model 'a'"),
+        (lambda post: post["k"].assign_coords(model="mine"), "without 'model'"),
+    ],
+)
+def test_functions_of_no_use_are_refused(function, message):
+    with pytest.raises(ModelError, match=message):
+        average_models(TWO, {"a": 1, "b": 1}, function)
+
+
+@pytest.mark.parametrize("name", ["model", "level"])
+def test_an_array_named_as_a_dim_takes_the_name_of_the_function(name):
+    def named(posterior):
+        return posterior["k"].expand_dims(level=2).rename(name)
+
+    average = average_models(TWO, {"a": 1, "b": 1}, named, n_draws=10)
+    assert list(average["posterior"].data_vars) == ["named"]

@@ -288,3 +288,22 @@ def test_bad_correction():
 def test_bad_evidences(evidences):
     with pytest.raises(ModelError, match="evidences"):
         compare_evidence(evidences)
+
+
+@pytest.mark.parametrize("weights", [(1e-320, 1e308), ("much", 1.0), (None, 1.0), (-1, 0)])
+def test_prior_weights_of_no_use_are_refused(weights):
+    prior = dict(zip("ab", weights, strict=True))
+    with pytest.raises(ModelError, match="prior must be positive and finite"):
+        compare_evidence({"a": evidence(-9), "b": evidence(-7)}, prior=prior)
+
+
+def test_the_largest_prior_weights_are_equal():
+    prior = {"a": 1e308, "b": 1e308}
+    table = compare_evidence({"a": evidence(-9), "b": evidence(-9)}, prior=prior)
+    np.testing.assert_allclose(table["prob"], 0.5)
+
+
+def test_evidence_under_a_held_seed_is_marked():
+    """Its error lacks that of the filter."""
+    table = compare_evidence({"a": replace(evidence(-9), noise="held"), "b": evidence(-7)})
+    assert table["warning"].to_dict() == {"a": True, "b": False}

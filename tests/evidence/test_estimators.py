@@ -149,3 +149,12 @@ def test_a_long_doubt_does_not_hide_the_errors():
     for error in ("0.125", "0.250"):
         assert error in shown
     assert shown.endswith(f"b: {doubtful.doubts}")
+
+
+def test_an_error_names_the_estimator_that_raised_it():
+    idata = az.from_dict({"posterior": {"a": np.random.default_rng(1).normal(1, 1, (2, 200))}})
+    with pm.Model() as model:
+        pm.Normal("y", pm.Flat("a"), 1, observed=1.0)
+    with pytest.raises(ModelError) as caught:
+        psf.estimate_evidence(idata, model, estimators=["prior_monte_carlo"])
+    assert caught.value.__notes__ == ["raised by the estimator 'prior_monte_carlo'"]

@@ -106,3 +106,9 @@ def test_bad_idatas(given):
 def test_an_entry_without_draws(given):
     with pytest.raises(ModelError, match=r"idatas\['a'\] must be a DataTree with a group 'post"):
         marginal_modes({"a": given})
+
+
+def test_draws_that_are_not_finite_have_no_mode():
+    draws = np.where(LEVELS < 0.1, np.nan, LEVELS)
+    found = marginal_modes(idata(x=draws, y=np.full((2, 50), np.inf), z=LEVELS)).loc["posterior"]
+    assert found.isna().to_dict() == {"x": True, "y": True, "z": False}

@@ -4,10 +4,17 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence import chib_jeliazkov
+from pymc_statespace_filters.evidence.doubts import doubts_of_draws
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior.draws import posterior_of, unconstrained_draws
+from pymc_statespace_filters.evidence.posterior.draws import (
+    Posterior,
+    posterior_of,
+    unconstrained_draws,
+)
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
 
 DATA = np.array([0.3, 1.2, 0.8])
@@ -142,3 +149,36 @@ class TestStoredLogDensity:
         columns = np.stack([log_density - 1, log_density - 2], axis=-1)
         found, _ = posterior_of(self.stored(idata, columns), density)
         np.testing.assert_array_equal(found.log_density, log_density)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda idata: idata["posterior"].to_dataset(), "must be a DataTree.*got Dataset"),
+        (lambda idata: None, "must be a DataTree.*got NoneType"),
+        (lambda idata: idata["posterior"], "must have a group 'posterior'"),
+        (lambda idata: idata.isel(chain=0), "dimensions chain and draw.*isel"),
+    ],
+)
+def test_what_is_no_idata_is_said(idata, model, wrong, message):
+    with pytest.raises(ModelError, match=message):
+        chib_jeliazkov(wrong(idata), model)
+    with pytest.raises(ModelError, match=r"model must be a pymc\.Model, got str"):
+        chib_jeliazkov(idata, "model")
+
+
+def test_zeros_that_several_step_methods_leave_are_no_log_density(idata, model, density):
+    expected = posterior_of(idata, density)[0].log_density
+    idata["sample_stats"] = xr.DataTree(xr.Dataset({"lp": (("chain", "draw"), np.zeros((2, 30)))}))
+    np.testing.assert_array_equal(posterior_of(idata, density)[0].log_density, expected)
+    moved = ModelDensity(model, moved=True)
+    with pytest.raises(DataMismatchError, match="all variables by one DRAM step"):
+        posterior_of(idata, moved)
+
+
+def test_a_parameter_that_does_not_vary_hides_no_disagreement():
+    values = np.random.default_rng(1).standard_normal((2, 100, 2))
+    values[..., 0] = 1.0
+    values[1, :, 1] += 10
+    (doubt,) = doubts_of_draws(Posterior(values, values[..., 1], lambda x, rng: x[:, 1]))
+    assert "the chains disagree" in doubt

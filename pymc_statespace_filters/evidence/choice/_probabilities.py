@@ -45,10 +45,15 @@ def prior_of(prior: Mapping[str, float] | None, names: list[str]) -> Array:
         return np.full(len(names), 1 / len(names))
     if not isinstance(prior, Mapping) or set(prior) != set(names):
         raise ModelError(f"prior must give a weight to exactly the models {names}, got {prior!r}")
-    weights = np.array([prior[name] for name in names], dtype=np.float64)
-    if not (np.isfinite(weights).all() and (weights > 0).all()):
+    try:
+        weights = np.array([prior[name] for name in names], dtype=np.float64)
+    except (TypeError, ValueError):
+        weights = np.array(np.nan)
+    # Their sum may overflow, and beside the largest the smallest vanish.
+    share = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
+    if not (np.isfinite(weights).all() and (share > 0).all()):
         raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
-    return weights / weights.sum()
+    return share / share.sum()
 
 
 def check_ci_prob(ci_prob: float) -> None:

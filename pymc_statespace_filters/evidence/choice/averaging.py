@@ -189,6 +189,8 @@ def _arrays(
     arrays = {}
     for name, idata in idatas.items():
         of_model = function[name] if isinstance(function, Mapping) else function
+        if not callable(of_model):
+            raise ModelError(f"function must be callable, for model {name!r} it is {of_model!r}")
         try:
             array = of_model(idata["posterior"].to_dataset())
         except Exception as error:
@@ -197,12 +199,14 @@ def _arrays(
         if not (
             isinstance(array, xr.DataArray)
             and set(SAMPLE_DIMS) <= set(array.dims)
-            and "model" not in array.dims
+            and "model" not in {*array.dims, *array.coords}
         ):
             raise ModelError(
                 "function must return a DataArray with dims 'chain' and 'draw' and without 'model',"
                 f" for model {name!r} it returned {array!r}"
             )
+        if not array.sizes["chain"] * array.sizes["draw"]:
+            raise ModelError(f"function returned no draws for model {name!r}")
         arrays[name] = array
 
     first, reference = next(iter(arrays.items()))
@@ -229,7 +233,8 @@ def _label(arrays: Mapping[str, xr.DataArray], function: Function | Mapping[str,
     """Name the average as its arrays are named, or else as the function is."""
     own = {array.name for array in arrays.values()}
     of_function = getattr(function, "__name__", "<mapping>")
-    taken = set(next(iter(arrays.values())).coords)
+    first = next(iter(arrays.values()))
+    taken = {*first.coords, *first.dims, "model", "prob"}
     for label in (own.pop() if len(own) == 1 else None, of_function):
         if label and label not in taken and not str(label).startswith("<"):
             return str(label)

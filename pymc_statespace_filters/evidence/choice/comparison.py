@@ -127,7 +127,8 @@ def compare_evidence(
             favours this row, and only prior or correction put it below the first. Empty for the
             first row.
         ``warning``
-            The number came with doubts, without an error, or from an improper prior.
+            The number came with doubts, without an error, from an improper prior, or from chains
+            that held a noise seed, whose own error ``se`` lacks.
 
         Where an estimator has no error (``se`` is NaN, as Laplace's), the probabilities are still
         those of the estimates; but all intervals are NaN, since each holds every evidence, what
@@ -195,7 +196,9 @@ def compare_evidence(
             "prior": weights,
             "strength": _strength(-log_bayes_factor, error, best),
             "warning": [
-                bool(rival.doubts or rival.improper or math.isnan(rival.se)) for rival in rivals
+                bool(rival.doubts or rival.improper or math.isnan(rival.se))
+                or rival.noise == "held"
+                for rival in rivals
             ],
         },
         index=pd.Index(names, name="model"),

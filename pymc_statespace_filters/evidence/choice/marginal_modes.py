@@ -36,7 +36,7 @@ def marginal_modes(
     -------
     pandas.DataFrame
         Index ``model`` (of a lone DataTree: ``posterior``), a column for each scalar, labelled as
-        by ArviZ: ``theta[0]``. NaN where a model lacks the parameter.
+        by ArviZ: ``theta[0]``. NaN where a model lacks the parameter, or a draw is not finite.
 
     Raises
     ------
@@ -100,6 +100,8 @@ def _modes(posterior: xr.Dataset, names: Iterable[Hashable]) -> dict[str, float]
 
 def _mode(draws: Array) -> float:
     """Place of the highest density of draws (chain, draw)."""
+    if not np.isfinite(draws).all():
+        return np.nan
     if np.ptp(draws) == 0:
         return float(draws.flat[0])
     # Rules for the bandwidth take every draw for an independent one.

@@ -123,7 +123,8 @@ def _log_curvature(log_density: Rows, mode: Array) -> tuple[float, float]:
             "Laplace needs a mode with curvature in every direction: where the climb ended the "
             f"smallest curvature is {smallest:.2g} and the gradient {steepest:.2g}, in units of "
             "the draws' covariance. The log-density goes on growing, or levels off, towards a "
-            "bound or along a ridge; use chib_jeliazkov or bridge"
+            "bound or along a ridge, or it is rugged, as with a held noise seed; use "
+            "chib_jeliazkov or bridge"
         )
     log_det, of_fine, of_coarse = np.linalg.slogdet(np.stack([curvature, -fine, -coarse]))[1]
     return float(log_det), float(of_fine - of_coarse)

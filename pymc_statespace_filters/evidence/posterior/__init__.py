@@ -5,6 +5,7 @@ from pymc_statespace_filters.evidence.posterior.draws import (
     Posterior,
     Prior,
     noise_was_moved,
+    posterior_group,
     posterior_of,
     unconstrained_draws,
 )
@@ -15,6 +16,7 @@ __all__ = [
     "Prior",
     "RowFunction",
     "noise_was_moved",
+    "posterior_group",
     "posterior_of",
     "unconstrained_draws",
 ]

@@ -70,6 +70,30 @@ class Posterior:
         )
 
 
+def posterior_group(idata: xr.DataTree) -> xr.Dataset:
+    """The draws, every variable with the dimensions chain and draw.
+
+    Raises
+    ------
+    ModelError
+        If `idata` is no DataTree, or has no such group.
+    """
+    if not isinstance(idata, xr.DataTree):
+        raise ModelError(
+            "idata must be a DataTree of posterior draws, as pm.sample and sample_dram return it, "
+            f"got {type(idata).__name__}"
+        )
+    if "posterior" not in idata.children:
+        raise ModelError(f"idata must have a group 'posterior', it has {sorted(idata.children)}")
+    posterior = idata["posterior"].to_dataset()
+    if not {"chain", "draw"} <= set(posterior.dims):
+        raise ModelError(
+            "the posterior of idata must have the dimensions chain and draw, it has "
+            f"{sorted(map(str, posterior.dims))}: select one chain as isel(chain=[0])"
+        )
+    return posterior
+
+
 def noise_was_moved(idata: xr.DataTree) -> bool:
     """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
     return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
@@ -86,9 +110,7 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> Array:
         If free variables are missing from it or have other shapes, or if a draw lies outside the
         support.
     """
-    if "posterior" not in idata.children:
-        raise ModelError(f"idata must have a group 'posterior', it has {sorted(idata.children)}")
-    posterior = idata["posterior"].to_dataset()
+    posterior = posterior_group(idata)
     missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
     if missing:
         raise DataMismatchError(
@@ -150,7 +172,14 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     draws = unconstrained_draws(idata, density.model)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
     lacking = [f"{name}_seed" for name in density.seed_names if f"{name}_seed" not in stats]
-    if lacking and not any(name in stats for name in STORED_NAMES):
+    stored = _stored_name(stats)
+    if density.moved and stored is None:
+        raise DataMismatchError(
+            "sample_stats of idata holds no log-density of the draws, and as their noise was moved "
+            "along the chain no seed gives it again: sample all variables by one DRAM step, and "
+            "keep the group sample_stats"
+        )
+    if lacking and stored is None:
         raise DataMismatchError(
             f"sample_stats of idata holds neither the noise seeds of the draws ({lacking}) nor "
             "their log-density: the estimates that the chain accepted cannot be found again. Keep "
@@ -193,15 +222,26 @@ def _stored_seeds(
     )
 
 
+def _stored_name(stats: xr.Dataset) -> str | None:
+    """The name of the log-density of whole draws in `stats`, if there is one.
+
+    Several step methods side by side store one column each, none of them that of the whole draw;
+    and PyMC fills in zeros if the last of them stores none.
+    """
+    for name in STORED_NAMES:
+        if name in stats and stats[name].ndim == 2 and stats[name].values.any():
+            return name
+    return None
+
+
 def _stored_log_density(
     stats: xr.Dataset, density: ModelDensity, draws: Array, seeds: NDArray[np.int64]
 ) -> Array:
     """Log-densities of the draws (chain, draw): the stored ones, else recomputed."""
     flat_draws = draws.reshape(-1, draws.shape[-1])
     flat_seeds = seeds.reshape(len(flat_draws), -1)
-    # Several step methods side by side store one column each, none of them that of the whole draw.
-    names = [name for name in STORED_NAMES if name in stats and stats[name].ndim == 2]
-    if not names:
+    name = _stored_name(stats)
+    if name is None:
         log_density = density.log_density(flat_draws, flat_seeds)
         if impossible := int(np.isneginf(log_density).sum()):
             raise DataMismatchError(
@@ -210,7 +250,7 @@ def _stored_log_density(
             )
         return log_density.reshape(draws.shape[:2])
 
-    stored = stats[names[0]].transpose("chain", "draw").values.astype(np.float64)
+    stored = stats[name].transpose("chain", "draw").values.astype(np.float64)
     if density.moved:  # there is nothing to compare with
         return stored
     checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
@@ -221,7 +261,7 @@ def _stored_log_density(
     if agree.mean() < 0.5:
         worst = int(np.flatnonzero(~agree)[0])
         raise DataMismatchError(
-            f"sample_stats[{names[0]!r}] of idata is {expected[worst]:.6g} where the model gives "
+            f"sample_stats[{name!r}] of idata is {expected[worst]:.6g} where the model gives "
             f"{recomputed[worst]:.6g}: the draws belong to another model, other data or other "
             "settings"
         )
