@@ -8,6 +8,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+# PyMC writes progress to the stderr of its import: imported in a test, to one that is closed later.
+import pymc_statespace_filters  # noqa: F401
+
 ROOT = Path(__file__).parent.parent
 
 
