@@ -177,9 +177,8 @@ def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
             f"its groups are {sorted(idata.children)}"
         )
     group = idata[GROUP].to_dataset()
-    known = [
-        field.name for field in fields(Evidence) if field.name in group
-    ]  # old groups lack some
+    # Groups that earlier versions stored lack some.
+    known = [field.name for field in fields(Evidence) if field.name in group]
     found = {}
     for i, estimator in enumerate(map(str, group["estimator"].values)):
         values = {key: group[key].values[i] for key in known if key != "estimator"}

@@ -80,6 +80,19 @@ def test_effective_numbers_and_the_error_say_the_same():
     assert sum(1 / number for number in worth) == pytest.approx(found.se**2, rel=1e-12)
 
 
+def test_the_share_of_impossible_proposals_is_that_of_both_halves():
+    rng, calls = np.random.default_rng(22), []
+    posterior = half_normal((4, 500), rng)
+
+    def recorded(x, rng):
+        calls.append(posterior.evaluate(x, rng))
+        return calls[-1]
+
+    found = ChibJeliazkov(1000).estimate(replace(posterior, evaluate=recorded), rng=rng)
+    proposals = [values for values in calls[-2:] if len(values) == 500]
+    assert found.settings["zero_density"] == np.isneginf(proposals).mean() > 0
+
+
 def test_the_gap_between_halves_is_in_units_of_its_error(monkeypatch):
     monkeypatch.setattr(module, "MAX_GAP", -1.0)
     gaps = []

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators.importance import Importance, _pareto_k
+from pymc_statespace_filters.evidence.estimators._means import pareto_k
+from pymc_statespace_filters.evidence.estimators.importance import Importance
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
 
@@ -101,8 +102,8 @@ def test_tail_of_the_weights():
     """Weights u^-k have the tail k, zeros among them or not; 4 of its errors at most."""
     u = np.random.default_rng(57).uniform(size=20_000)
     for k in (0.3, 0.9):
-        assert _pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.25)
-        assert _pareto_k(np.where(u > 0.9, -np.inf, -k * np.log(u))) == pytest.approx(k, abs=0.25)
+        assert pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.25)
+        assert pareto_k(np.where(u > 0.9, -np.inf, -k * np.log(u))) == pytest.approx(k, abs=0.25)
 
 
 def test_weights_of_heavy_tail_are_doubted():

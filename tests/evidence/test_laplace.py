@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import t as student
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._maximum import EdgeError, derivatives, whitened_by
+from pymc_statespace_filters.evidence.estimators._maximum import EdgeError, derivatives
+from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.analytic import Regression, gaussian, half_normal
@@ -144,7 +145,7 @@ def test_coordinates_are_those_within_chains():
     rng = np.random.default_rng(43)
     within = rng.standard_normal((2, 100, 3))
     draws = within + np.array([-50.0, 50.0])[:, None, None]
-    chol = whitened_by(Posterior(draws, draws[..., 0], lambda x, rng: x[:, 0])).chol
+    chol = moments_within_chains(draws).chol
     expected = np.mean([np.cov(chain, rowvar=False, ddof=0) for chain in within], axis=0)
     np.testing.assert_allclose(chol @ chol.T, expected, rtol=1e-12)
 

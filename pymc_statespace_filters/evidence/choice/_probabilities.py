@@ -39,7 +39,7 @@ def probabilities(log_weight: Array, se: Array, ci_prob: float) -> Probabilities
     return Probabilities(prob, np.minimum(low, prob), np.maximum(high, prob))
 
 
-def prior_of(prior: Mapping[str, float] | None, names: list[str]) -> Array:
+def prior_weights(prior: Mapping[str, float] | None, names: list[str]) -> Array:
     """Check and normalise prior weights of models; equal ones by default."""
     if prior is None:
         return np.full(len(names), 1 / len(names))

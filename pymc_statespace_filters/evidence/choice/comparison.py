@@ -13,7 +13,7 @@ from scipy.stats import norm
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.choice._probabilities import (
     check_ci_prob,
-    prior_of,
+    prior_weights,
     probabilities,
 )
 from pymc_statespace_filters.evidence.choice._rivals import Given, evidences_of_rivals
@@ -167,7 +167,7 @@ def compare_evidence(
     if not (correction is None or isinstance(correction, DimensionCorrection)):
         raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")
     names, rivals = list(found), list(found.values())
-    weights = prior_of(prior, names)
+    weights = prior_weights(prior, names)
     _warn_of_improper(found)
 
     log_evidence = np.array([rival.log_evidence for rival in rivals])

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.choice._probabilities import (
     check_ci_prob,
-    prior_of,
+    prior_weights,
     probabilities,
 )
 from pymc_statespace_filters.evidence.choice._rivals import Given
@@ -209,7 +209,7 @@ def _table(
         raise ModelError(f"estimator was chosen when the table was made, got {estimator!r}")
     if prior is None:
         return evidences
-    return evidences.assign(prior=prior_of(prior, list(evidences.index)))
+    return evidences.assign(prior=prior_weights(prior, list(evidences.index)))
 
 
 @dataclass(frozen=True)

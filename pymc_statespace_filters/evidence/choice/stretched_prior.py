@@ -10,7 +10,6 @@ positive quantity is one of a positive quantity; elsewhere it is PyMC's support 
 depends on other variables is stretched given them.
 """
 
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -18,7 +17,6 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
-from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from pymc.distributions.distribution import support_point
 from pymc.distributions.transforms import _default_transform
@@ -28,7 +26,7 @@ from pytensor.graph.replace import clone_replace, vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._means import log_mean_of_chains
+from pymc_statespace_filters.evidence.estimators._means import SAME, log_mean_of_chains, pareto_k
 from pymc_statespace_filters.evidence.posterior.support import has_law
 
 EDGE = 0.05  # of the length of a bounded support, at each end
@@ -36,8 +34,6 @@ EDGE = 0.05  # of the length of a bounded support, at each end
 MIN_EFFECTIVE = 100
 MAX_PARETO_K = 0.5  # from there on the weights have no variance, and their mean no standard error
 MAX_BEYOND = 0.02
-CONSTANT = 1e-9
-NEGLIGIBLE = 700.0  # nats below the largest weight
 
 Array = NDArray[np.float64]
 
@@ -146,20 +142,10 @@ def reweigh(log_ratio: Array, beyond: Array) -> Reweighted:
     if np.isneginf(peak):
         return Reweighted(-np.inf, np.inf, 0.0, np.inf, 0.0)
     beyond_share = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
-    if np.ptp(log_ratio) < CONSTANT:  # a Uniform prior made wider: all draws weigh the same
+    if np.ptp(log_ratio) < SAME:  # a Uniform prior made wider: all draws weigh the same
         return Reweighted(float(peak), 0.0, np.inf, -np.inf, beyond_share)
     mean = log_mean_of_chains(log_ratio)
-    return Reweighted(mean.value, mean.error, mean.n_effective, _pareto_k(log_ratio), beyond_share)
-
-
-def _pareto_k(log_weights: Array) -> float:
-    """Pareto's k of the upper tail, by ArviZ; -inf if the largest weights are all the same."""
-    weights = np.maximum(log_weights.ravel(), log_weights.max() - NEGLIGIBLE)
-    n_tail = math.ceil(min(0.2 * weights.size, 3 * weights.size**0.5))
-    tail = np.sort(weights)[-n_tail:]
-    if np.ptp(tail) < CONSTANT:
-        return -np.inf
-    return float(array_stats.psislw(-weights)[1])  # it asks for log-likelihoods
+    return Reweighted(mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share)
 
 
 def _check_stretchable(rv: TensorVariable, model: pm.Model) -> None:

@@ -7,9 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior import Posterior
-
 STEP = 0.01  # of the differences, in standard deviations of the draws
 MAX_GRADIENT = 1e-4  # nats per standard deviation
 MAX_ITERATIONS = 100
@@ -18,21 +15,6 @@ MIN_GAIN, MAX_IDLE = 1e-7, 5
 
 Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]
-
-
-class Whitened(NamedTuple):
-    """Coordinates in which the draws have covariance one within chains: x = mean + chol z."""
-
-    mean: Array  # (k,)
-    chol: Array  # (k, k)
-
-    def unconstrained(self, z: Array) -> Array:
-        """Points x (m, k) of whitened points z (m, k)."""
-        return self.mean + z @ self.chol.T
-
-    def whitened(self, x: Array) -> Array:
-        """Whitened points of x (m, k)."""
-        return np.linalg.solve(self.chol, (x - self.mean).T).T
 
 
 class Top(NamedTuple):
@@ -45,24 +27,6 @@ class Top(NamedTuple):
 
 class EdgeError(Exception):
     """The function is minus infinity within one step of a point."""
-
-
-def whitened_by(posterior: Posterior) -> Whitened:
-    """Coordinates in which finite differences are well scaled.
-
-    The covariance is that within chains: chains in separate modes would blur the width of each.
-    """
-    draws = posterior.draws
-    k = draws.shape[-1]
-    about_mean = (draws - draws.mean(axis=1, keepdims=True)).reshape(-1, k)
-    try:
-        chol = np.linalg.cholesky(about_mean.T @ about_mean / len(about_mean))
-    except np.linalg.LinAlgError:
-        raise ModelError(
-            "idata must hold draws that vary in every direction; the covariance of "
-            f"{len(about_mean)} draws of {k} unconstrained parameters is singular"
-        ) from None
-    return Whitened(draws.mean(axis=(0, 1)), chol)
 
 
 def best_of_chains(values: Array, n_best: int) -> NDArray[np.int64]:

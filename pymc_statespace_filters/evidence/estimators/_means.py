@@ -1,10 +1,16 @@
 """Means of positive terms that are known by their logarithms, with their errors."""
 
+import math
 from typing import NamedTuple
 
 import arviz as az
 import numpy as np
+from arviz_stats.base import array_stats
 from numpy.typing import NDArray
+
+MIN_EFFECTIVE = 100  # with fewer effective terms a standard error is itself a guess
+SAME = 1e-9  # nats, between weights that are one and the same
+NEGLIGIBLE = 700.0  # nats below the largest weight
 
 Array = NDArray[np.float64]
 
@@ -19,6 +25,10 @@ class LogMean(NamedTuple):
     def n_effective(self) -> float:
         """Inverse squared relative error: as good as so many terms of relative variance one."""
         return self.error**-2
+
+    def n_carrying(self, count: int) -> float:
+        """Kish's effective number: how many of `count` independent terms carry the mean."""
+        return count / (1 + count * self.error**2)
 
 
 def log_mean(log_terms: Array) -> float:
@@ -56,3 +66,13 @@ def log_mean_of_independent(log_terms: Array) -> LogMean:
     if np.isneginf(value):
         return LogMean(-np.inf, np.inf)
     return LogMean(value, float(np.exp(log_terms - value).std() / len(log_terms) ** 0.5))
+
+
+def pareto_k(log_weights: Array) -> float:
+    """Shape of the upper tail of weights, the larger the heavier; -inf if they are all the same."""
+    # ArviZ bears no infinities.
+    weights = np.maximum(log_weights.ravel(), log_weights.max() - NEGLIGIBLE)
+    n_tail = math.ceil(min(0.2 * weights.size, 3 * weights.size**0.5))
+    if np.ptp(np.sort(weights)[-n_tail:]) < SAME:
+        return -np.inf
+    return float(array_stats.psislw(-weights)[1])  # it asks for log-likelihoods

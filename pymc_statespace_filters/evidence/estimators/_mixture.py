@@ -9,11 +9,10 @@ component as wide as everything keeps the weights in the outskirts from being la
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from pymc_statespace_filters.evidence.estimators._moments import moments
@@ -88,12 +87,9 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
     ModelError
         If the draws do not vary in every direction.
     """
-    mean, chol = moments(posterior.draws)
-    halves = [_thinned(half) for half in posterior.halves()]
-    first, second = (
-        solve_triangular(chol, (half.draws.reshape(-1, len(mean)) - mean).T, lower=True).T
-        for half in halves
-    )
+    mean, chol = coordinates = moments(posterior.draws)
+    halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves()]
+    first, second = (coordinates.whitened(half.draws.reshape(-1, len(mean))) for half in halves)
     best, n_best, least = scattered(first, 1, rng), 0, np.inf
     for n_components in range(1, MOST_COMPONENTS + 1):
         q = fitted_mixture(first, scattered(first, n_components, rng))
@@ -146,9 +142,3 @@ def _maximised(mixture: StudentMixture, x: Array, members: Array) -> StudentMixt
     scales = (scatter + (k + 1) * np.eye(k)) / (sizes + k + 1)[:, None, None]
     weights = (sizes + 1) / (sizes + 1).sum()
     return StudentMixture(weights, means, np.linalg.cholesky(scales))
-
-
-def _thinned(half: Posterior) -> Posterior:
-    """Every so manieth draw of each chain, at most `MOST_FITTED` / 2 in all."""
-    step = math.ceil(half.log_density.size / (MOST_FITTED / 2))
-    return replace(half, draws=half.draws[:, ::step], log_density=half.log_density[:, ::step])

@@ -1,15 +1,33 @@
 """Location and scale of draws, by which proposals are placed and spaces are standardised."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from pymc_statespace_filters.errors import ModelError
 
 Array = NDArray[np.float64]
 
 
-def moments(draws: Array) -> tuple[Array, Array]:
-    """Mean (k,) and lower Cholesky factor (k, k) of the covariance of draws (..., k).
+class Whitened(NamedTuple):
+    """Coordinates z in which draws have mean zero and covariance one: x = mean + chol z."""
+
+    mean: Array  # (k,)
+    chol: Array  # (k, k), lower
+
+    def unconstrained(self, z: Array) -> Array:
+        """Points x (m, k) of whitened points z (m, k)."""
+        return self.mean + z @ self.chol.T
+
+    def whitened(self, x: Array) -> Array:
+        """Whitened points of x (m, k)."""
+        return solve_triangular(self.chol, (x - self.mean).T, lower=True).T
+
+
+def moments(draws: Array) -> Whitened:
+    """Mean and lower Cholesky factor of the covariance of draws (..., k).
 
     Raises
     ------
@@ -18,11 +36,29 @@ def moments(draws: Array) -> tuple[Array, Array]:
     """
     k = draws.shape[-1]
     flat = draws.reshape(-1, k)
+    return _factored(flat.mean(axis=0), np.cov(flat, rowvar=False).reshape(k, k), len(flat))
+
+
+def moments_within_chains(draws: Array) -> Whitened:
+    """Mean of draws (chain, draw, k), and the factor of their covariance within chains.
+
+    Chains in separate modes would otherwise blur the width of each.
+
+    Raises
+    ------
+    ModelError
+        If the draws do not vary in every direction.
+    """
+    about_mean = (draws - draws.mean(axis=1, keepdims=True)).reshape(-1, draws.shape[-1])
+    count = len(about_mean)
+    return _factored(draws.mean(axis=(0, 1)), about_mean.T @ about_mean / count, count)
+
+
+def _factored(mean: Array, covariance: Array, count: int) -> Whitened:
     try:
-        chol = np.linalg.cholesky(np.cov(flat, rowvar=False).reshape(k, k))
+        return Whitened(mean, np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
         raise ModelError(
             "idata must hold draws that vary in every direction; the covariance of "
-            f"{len(flat)} draws of {k} unconstrained parameters is singular"
+            f"{count} draws of {len(mean)} unconstrained parameters is singular"
         ) from None
-    return flat.mean(axis=0), chol

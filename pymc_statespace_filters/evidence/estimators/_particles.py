@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators._factors import evaluate_factors, prior_of
-from pymc_statespace_filters.evidence.estimators._maximum import Whitened
+from pymc_statespace_filters.evidence.estimators._moments import Whitened
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_ALIVE = 50  # draws of the prior that have a likelihood

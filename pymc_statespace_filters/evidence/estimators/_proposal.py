@@ -112,15 +112,14 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
     """Points in the bulk of the draws, densest first, each with its constant log-density."""
     k = posterior.draws.shape[-1]
     draws = posterior.draws.reshape(-1, k)
-    mean, chol = moments(draws)
+    coordinates = moments(draws)
     few = draws[:: -(-len(draws) // N_CLUSTERED)]
-    whitened = solve_triangular(chol, (few - mean).T, lower=True).T
-    centres, _ = kmeans2(whitened, N_CLUSTERS, minit="++", rng=rng)
+    centres, _ = kmeans2(coordinates.whitened(few), N_CLUSTERS, minit="++", rng=rng)
     points = np.stack(
         [
-            mean,
+            coordinates.mean,
             np.median(draws, axis=0),
-            *(mean + centres @ chol.T),
+            *coordinates.unconstrained(centres),
             draws[posterior.log_density.argmax()],
         ]
     )
@@ -131,7 +130,7 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
     constants = [log_mean(estimates) for estimates in log_density.reshape(len(points), -1)]
 
     found = [
-        Proposal(point, constant, chol)
+        Proposal(point, constant, coordinates.chol)
         for point, constant in zip(points, constants, strict=True)
         if np.isfinite(constant)
     ]

@@ -39,7 +39,7 @@ noises of a point and its image there: a draw has the noise of the chain, its im
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import arviz as az
@@ -51,6 +51,7 @@ from scipy.stats import Covariance, multivariate_normal
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators._means import (
+    MIN_EFFECTIVE,
     LogMean,
     log_mean_of_chains,
     log_mean_of_independent,
@@ -60,7 +61,6 @@ from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, of both halves
-MIN_EFFECTIVE = 100  # with fewer effective draws the standard error is itself a guess
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # and so it is with fewer effective terms
 MAX_GAP = 4.0
 
@@ -137,7 +137,7 @@ class Bridge:
         proposals = q.rvs(n_proposals, random_state=rng).reshape(n_proposals, -1)
         at_proposals = averaged.evaluate(proposals, rng)
         if self.warped:
-            averaged = _thinned(averaged)
+            averaged = averaged.thinned(MOST_TERMS // 2)
             pooled = (mean, pooled[1])  # the reflection was about this mean
         at_proposals = self._warp(averaged, proposals, at_proposals, mean, rng)
         if np.isneginf(at_proposals).all():
@@ -229,12 +229,6 @@ def _normal(mean: Array, chol: Array) -> Any:
 
 def _n_terms(posterior: Posterior) -> int:
     return min(max(posterior.log_density.size, FEWEST_TERMS), MOST_TERMS)
-
-
-def _thinned(half: Posterior) -> Posterior:
-    """Keep every so manieth draw of each chain, that not too many mirror images are evaluated."""
-    step = math.ceil(half.log_density.size / (MOST_TERMS / 2))
-    return replace(half, draws=half.draws[:, ::step], log_density=half.log_density[:, ::step])
 
 
 def _doubts(n_effective: float, se_draws: float, se_proposals: float, gap: float) -> Iterator[str]:

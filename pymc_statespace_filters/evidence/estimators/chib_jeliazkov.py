@@ -39,6 +39,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.estimators._means import MIN_EFFECTIVE
 from pymc_statespace_filters.evidence.estimators._proposal import Plan, plan_proposal
 from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.estimators.multi_block import (
@@ -52,7 +53,6 @@ from pymc_statespace_filters.evidence.estimators.single_block import (
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_PROPOSALS = 100
-MIN_EFFECTIVE = 100  # with fewer effective terms the standard error is itself a guess
 MOST_PROPOSALS = 20_000
 PROPOSALS_OF_RUN = 5000
 MAX_GAP = 4.0

@@ -19,20 +19,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from arviz_stats.base import array_stats
-from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators._means import (
+    MIN_EFFECTIVE,
+    log_mean_of_independent,
+    pareto_k,
+)
 from pymc_statespace_filters.evidence.estimators._mixture import choose_mixture
 from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000
-MIN_EFFECTIVE = 100  # with fewer effective terms the standard error is itself a guess
 MAX_PARETO_K = 0.7
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,8 @@ class Importance:
             )
         log_weights = log_density - q.log_density(proposals)
         evidence = log_mean_of_independent(log_weights)
-        pareto_k = _pareto_k(log_weights)
-        n_effective = n_proposals / (1 + n_proposals * evidence.error**2)
+        tail = pareto_k(log_weights)
+        n_effective = evidence.n_carrying(n_proposals)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,
@@ -74,20 +73,14 @@ class Importance:
                 "n_proposals": n_proposals,
                 "n_components": len(q.weights),
                 "n_effective_proposals": n_effective,
-                "pareto_k": pareto_k,
+                "pareto_k": tail,
                 "zero_density": float(np.isneginf(log_density).mean()),
             },
-            doubts=tuple(_doubts(n_effective, pareto_k)),
+            doubts=tuple(_doubts(n_effective, tail)),
         )
 
 
-def _pareto_k(log_weights: Array) -> float:
-    """Shape of the upper tail of the weights; the larger, the heavier."""
-    # ArviZ wants the negatives, as they come in leave-one-out validation, and no infinities.
-    return float(array_stats.psislw(-np.maximum(log_weights, log_weights.max() - 700))[1])
-
-
-def _doubts(n_effective: float, pareto_k: float) -> Iterator[str]:
+def _doubts(n_effective: float, tail: float) -> Iterator[str]:
     """Reasons for doubt, from what the proposals are worth and the tail of their weights."""
     if n_effective < MIN_EFFECTIVE:
         yield (
@@ -95,9 +88,9 @@ def _doubts(n_effective: float, pareto_k: float) -> Iterator[str]:
             f"{MIN_EFFECTIVE}: use bridge sampling, or give the parameters a scale on which their "
             "posterior is nearer to a Gaussian"
         )
-    if not pareto_k <= MAX_PARETO_K:
+    if not tail <= MAX_PARETO_K:
         yield (
-            f"the largest weights have a heavy tail (Pareto k {pareto_k:.2f}, above "
+            f"the largest weights have a heavy tail (Pareto k {tail:.2f}, above "
             f"{MAX_PARETO_K}), so that larger ones may have been missed: the posterior has mass "
             "where there are few draws, or a sharp edge; draw more, or use bridge sampling"
         )

@@ -25,8 +25,8 @@ from pymc_statespace_filters.evidence.estimators._maximum import (
     best_of_chains,
     climb,
     derivatives,
-    whitened_by,
 )
+from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
 from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
@@ -84,7 +84,7 @@ class Laplace:
                 "is estimated with fresh noise each time and has neither mode nor curvature; use "
                 "chib_jeliazkov or bridge, or a chain that held its seed"
             )
-        coordinates = whitened_by(posterior)
+        coordinates = moments_within_chains(posterior.draws)
 
         def log_density(z: Array) -> Array:
             return posterior.evaluate(coordinates.unconstrained(z), rng)

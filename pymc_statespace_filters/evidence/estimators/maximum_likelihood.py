@@ -16,9 +16,9 @@ from pymc_statespace_filters.evidence.estimators._maximum import (
     Rows,
     best_of_chains,
     climb,
-    whitened_by,
 )
 from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3
@@ -72,7 +72,7 @@ def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> Maximu
     -------
     MaximumLikelihood
     """
-    coordinates = whitened_by(posterior)
+    coordinates = moments_within_chains(posterior.draws)
 
     def log_likelihood(z: Array) -> Array:
         return evaluate_factors(posterior, coordinates.unconstrained(z), rng)[1]

@@ -40,7 +40,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.special import softmax
 
 from pymc_statespace_filters.errors import DataMismatchError
@@ -49,6 +48,7 @@ from pymc_statespace_filters.evidence.estimators._means import (
     error_of_walkers,
     log_mean,
 )
+from pymc_statespace_filters.evidence.estimators._moments import Whitened
 from pymc_statespace_filters.evidence.estimators._proposal import Proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 
@@ -155,11 +155,10 @@ def estimate_in_blocks(
 
 def _thinned(proposal: Proposal, posterior: Posterior, most: int) -> Run:
     """The draws of the posterior, evenly thinned to about `most`, in whitened coordinates."""
-    every = -(-posterior.log_density.size // most)
-    draws = posterior.draws[:, ::every]
-    flat = (draws - proposal.point).reshape(-1, draws.shape[-1])
-    y = solve_triangular(proposal.chol, flat.T, lower=True).T.reshape(draws.shape)
-    return Run(y, posterior.log_density[:, ::every])
+    thinned = posterior.thinned(most)
+    flat = thinned.draws.reshape(-1, len(proposal.point))
+    y = Whitened(proposal.point, proposal.chol).whitened(flat)
+    return Run(y.reshape(thinned.draws.shape), thinned.log_density)
 
 
 def _walk(

@@ -19,12 +19,14 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators._factors import evaluate_factors, prior_of
-from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators._means import (
+    MIN_EFFECTIVE,
+    log_mean_of_independent,
+)
 from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_DRAWS = 100
-MIN_EFFECTIVE = 100  # with fewer effective terms the standard error is itself a guess
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class PriorMonteCarlo:
                 f"none of {self.n_draws} draws of the prior has a likelihood: narrow the "
                 "priors to values that the model can have"
             )
-        n_effective = self.n_draws / (1 + self.n_draws * evidence.error**2)
+        n_effective = evidence.n_carrying(self.n_draws)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,

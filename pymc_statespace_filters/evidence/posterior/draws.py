@@ -69,6 +69,11 @@ class Posterior:
             replace(self, draws=self.draws[:, middle:], log_density=self.log_density[:, middle:]),
         )
 
+    def thinned(self, most: int) -> "Posterior":
+        """Every so manieth draw of each chain, that there are about `most` in all, or fewer."""
+        step = -(-self.log_density.size // most)
+        return replace(self, draws=self.draws[:, ::step], log_density=self.log_density[:, ::step])
+
 
 def posterior_group(idata: xr.DataTree) -> xr.Dataset:
     """The draws, every variable with the dimensions chain and draw.
