@@ -14,7 +14,7 @@ from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJelia
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.draws import posterior_of
 from tests.evidence import double_well
-from tests.evidence.state_space import StateSpace
+from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     Banana,
     Regression,
@@ -107,7 +107,7 @@ def sampled_regression(k):
 
 def pseudo_marginal():
     """The target of the row above, now sampled with a particle filter."""
-    target = StateSpace()
+    target = state_space()
     return Sampled(target.model(psf.BootstrapPF(50)), target.log_evidence, 5000)
 
 
@@ -126,7 +126,7 @@ CASES = {
     "uniform, at its bound": Case(lambda: Drawn(bounded(), 1000), 1),
     "banana": Case(lambda: Drawn(Banana(12), 2500), 12),
     "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4, is_noisy=True),
-    "state space, EKF": Case(lambda: Drawn(StateSpace(), 1000), 2, 20),
+    "state space, EKF": Case(lambda: Drawn(state_space(), 1000), 2, 20),
     "state space, BootstrapPF": Case(pseudo_marginal, 2, 20, is_noisy=True),
     "double well, BootstrapPF": Case(pseudo_marginal_double_well, 2, 20, is_noisy=True),
 }

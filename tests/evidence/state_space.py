@@ -1,5 +1,7 @@
 """A linear-Gaussian state-space model of two parameters, with exact evidence and exact draws."""
 
+from functools import cache
+
 import numpy as np
 import pymc as pm
 from scipy.interpolate import PchipInterpolator, RectBivariateSpline
@@ -56,3 +58,9 @@ class StateSpace(Target):
     def transport(self, z):
         first = self._line.quantile(z[..., 0])
         return np.stack([first, self._given.ev(first, z[..., 1])], axis=-1)
+
+
+@cache
+def state_space():
+    """The one that tests share: its quadrature takes seconds."""
+    return StateSpace()

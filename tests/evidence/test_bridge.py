@@ -68,7 +68,7 @@ def test_share_of_proposals_without_density():
     ("k", "n_draws", "correlation", "noise_sd"),
     [
         (4, 100, 0.0, 0.0),  # most of the error is common to both halves
-        (2, 500, 0.8, 1.0),
+        (2, 250, 0.8, 1.0),
         pytest.param(2, 500, 0.9, 0.0, marks=pytest.mark.slow),
         pytest.param(12, 1000, 0.8, 0.0, marks=pytest.mark.slow),
     ],

@@ -27,17 +27,12 @@ def model_with(filter):
 
 def test_the_evidence_is_that_of_the_exact_likelihood():
     """4 standard errors: one false alarm in 16 000 seeds; the exact number by quadrature."""
-    exact = model_with(psf.EKF())
     phi = np.linspace(-1, 1, 4001)[1:-1]
     terms = psf.log_likelihood(LINEAR, psf.EKF(), {"phi": phi}, OBSERVED, steps=STEPS).sum(axis=-1)
     truth = np.log(np.mean(np.exp(terms - terms.max()))) + terms.max()
-    with exact:
-        by_kalman = psf.chib_jeliazkov(
-            psf.sample_dram(2000, chains=2, random_seed=1, progressbar=False), random_seed=1
-        )
     with model_with(psf.BootstrapPF(40)) as noisy:
         idata = psf.sample_dram(
-            4000, chains=2, stages=1, correlation=0.9, random_seed=1, progressbar=False
+            2000, chains=2, stages=1, correlation=0.9, random_seed=1, progressbar=False
         )
         found = psf.chib_jeliazkov(idata, random_seed=1)
     assert "d_seed" not in idata["sample_stats"]
@@ -45,6 +40,5 @@ def test_the_evidence_is_that_of_the_exact_likelihood():
     assert smooth_filters(noisy) == {
         "d": psf.BootstrapPF(40, resampling="sorted", resample_below=1)
     }
-    assert abs(by_kalman.log_evidence - truth) < 4 * by_kalman.se
     assert abs(found.log_evidence - truth) < 4 * found.se
     assert found.se < 0.2

@@ -24,7 +24,7 @@ def test_unbiased_with_an_honest_error(target, noise_sd):
     posterior = target.posterior((2, 20), np.random.default_rng(71), noise_sd=noise_sd)
     scores = []
     for run in range(200):
-        found = PriorMonteCarlo(10_000).estimate(posterior, rng=np.random.default_rng([75, run]))
+        found = PriorMonteCarlo(5000).estimate(posterior, rng=np.random.default_rng([75, run]))
         assert not found.doubts
         scores.append((found.log_evidence - target.log_evidence) / found.se)
     assert abs(np.mean(scores)) < 0.25

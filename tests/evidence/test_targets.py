@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tests.evidence.state_space import StateSpace
+from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     Banana,
     Regression,
@@ -21,7 +21,7 @@ TARGETS = {
     "half-normal": (half_normally_distributed, 1e-4),
     "Gamma": (gamma_distributed, 1e-4),
     "bounded": (bounded, 1e-4),
-    "state space": (StateSpace, 3e-4),
+    "state space": (state_space, 3e-4),
 }
 
 
@@ -57,7 +57,7 @@ def test_two_modes_by_quadrature():
 def test_draws_from_the_prior_have_its_density():
     """The likelihood's mean over the prior is the evidence, here to some percent."""
     rng = np.random.default_rng(7)
-    for target in (half_normally_distributed(), gamma_distributed(), bounded(), StateSpace()):
+    for target in (half_normally_distributed(), gamma_distributed(), bounded(), state_space()):
         likelihood = np.exp(target.log_likelihood(target.prior.sample(40_000, rng)))
         error = likelihood.std() / likelihood.mean() / 200
         assert abs(np.log(likelihood.mean()) - target.log_evidence) < 4 * error < 0.1

@@ -16,7 +16,7 @@ from pymc_statespace_filters.evidence.estimators._particles import (
 )
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, raised_from
-from tests.evidence.state_space import StateSpace
+from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     REAL,
     Banana,
@@ -149,7 +149,7 @@ def test_few_particles_in_many_dimensions_are_not_biased():
 
 @pytest.mark.slow
 def test_a_linear_state_space_model():
-    target = StateSpace()
+    target = state_space()
     found = smc(draws_of(target))
     assert found.se < 0.05
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se

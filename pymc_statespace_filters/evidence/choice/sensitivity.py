@@ -124,15 +124,15 @@ def prior_sensitivity(
     """
     check_ci_prob(ci_prob)
     table = _table(evidences, prior, estimator)
-    found = _over_exponents(table, _grid("exponents", exponents, EXPONENTS), ci_prob)
-    if models is not None:
-        factors = _grid("widths", widths, WIDTHS)
-        if not (factors > 0).all():
-            raise ModelError(f"widths must be positive, got {widths!r}")
-        drawn = _drawn(evidences, models, list(table.index), var_names)
-        found = found.merge(_over_widths(table, drawn, factors, ci_prob))
-    elif widths is not None or var_names is not None:
+    alphas, factors = _grid("exponents", exponents, EXPONENTS), _grid("widths", widths, WIDTHS)
+    if not (factors > 0).all():
+        raise ModelError(f"widths must be positive, got {widths!r}")
+    if models is None and not (widths is None and var_names is None):
         raise ModelError("widths and var_names need models, the pm.Model of each DataTree")
+    drawn = None if models is None else _drawn(evidences, models, list(table.index), var_names)
+    found = _over_exponents(table, alphas, ci_prob)
+    if drawn is not None:
+        found = found.merge(_over_widths(table, drawn, factors, ci_prob))
     return found.assign_attrs(ci_prob=ci_prob)
 
 

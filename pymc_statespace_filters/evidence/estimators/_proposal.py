@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
-from scipy.linalg import solve_triangular
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators._means import log_mean, log_mean_of_chains
-from pymc_statespace_filters.evidence.estimators._moments import moments
+from pymc_statespace_filters.evidence.estimators._moments import Whitened, moments
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
@@ -48,9 +47,7 @@ class Proposal:
     def log_q(self, x: Array) -> Array:
         """Log q(x, x*) of x (..., k)."""
         k = len(self.point)
-        # The inverse of a small matrix, not a solution for every x: BLAS is slow at those.
-        inverse = solve_triangular(self.chol, np.eye(k), lower=True)
-        z = (x - self.point).reshape(-1, k) @ inverse.T / self.scale
+        z = Whitened(self.point, self.chol).whitened(x.reshape(-1, k)) / self.scale
         log_det = np.log(np.diag(self.chol)).sum() + k * np.log(self.scale)
         log_q = -0.5 * (z**2).sum(axis=1) - 0.5 * k * np.log(2 * np.pi) - log_det
         return log_q.reshape(x.shape[:-1])
