@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from pymc_statespace_filters.evidence.estimators._maximum import climb
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     N_VALUING,
@@ -38,6 +39,23 @@ def test_least_squares(k):
     found = largest(regression.posterior((4, 250), rng))
     np.testing.assert_allclose(found.point, point, atol=1e-5)
     assert found.log_likelihood == pytest.approx(value, abs=1e-8)
+
+
+def test_hundreds_of_parameters_need_no_hessian():
+    """The differences for it would be some 40 000 points of 200 numbers, at every step."""
+    regression = Regression(200, 400, np.random.default_rng(52))
+    point, value = least_squares(regression)
+    largest_call = 0
+
+    def log_likelihood(x):
+        nonlocal largest_call
+        largest_call = max(largest_call, len(x))
+        return regression.log_likelihood(x)
+
+    found = climb(log_likelihood, np.zeros(200))
+    assert largest_call == 400
+    np.testing.assert_allclose(found.point, point, atol=1e-4)
+    assert found.value == pytest.approx(value, abs=1e-6)
 
 
 def test_the_prior_has_no_part_in_it():

@@ -1,7 +1,10 @@
-"""The largest value of a smooth function near the draws: Newton's method on differences."""
+"""The largest value of a smooth function near the draws: Newton's method on differences.
+
+Of more than fifty parameters the Hessian is not made, only its products with directions.
+"""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +13,7 @@ from scipy.optimize import minimize
 STEP = 0.01  # of the differences, in standard deviations of the draws
 MAX_GRADIENT = 1e-4  # nats per standard deviation
 MAX_ITERATIONS = 100
+MANY = 50  # parameters whose Hessian is too large: products with it take its place
 # Steps in a row that gain next to nothing end a climb: on a ridge the gradient may never vanish.
 MIN_GAIN, MAX_IDLE = 1e-7, 5
 
@@ -64,6 +68,32 @@ def derivatives(function: Rows, point: Array, step: float) -> tuple[Array, Array
     return (up - down) / (2 * step), hessian
 
 
+def gradient(function: Rows, point: Array, step: float) -> Array:
+    """Gradient (k,) by central differences; 2 k points in one call.
+
+    Raises
+    ------
+    EdgeError
+        If the function is minus infinity at one of the points.
+    """
+    axes = step * np.eye(len(point))
+    values = function(np.concatenate([point + axes, point - axes]))
+    if not np.isfinite(values).all():
+        raise EdgeError
+    up, down = np.split(values, 2)
+    return (up - down) / (2 * step)
+
+
+def curvature_along(function: Rows, point: Array, direction: Array, step: float) -> Array:
+    """Product (k,) of the Hessian with a direction, from the gradients on either side."""
+    length = np.linalg.norm(direction)
+    if length == 0:
+        return np.zeros_like(point)
+    move = step / length * direction
+    ahead, behind = (gradient(function, point + m, step) for m in (move, -move))
+    return (ahead - behind) * length / (2 * step)
+
+
 def climb(function: Rows, start: Array) -> Top:
     """Go up from `start` (k,) until the gradient vanishes, or until one step leads off an edge.
 
@@ -94,13 +124,23 @@ def climb(function: Rows, start: Array) -> Top:
         if n_idle == MAX_IDLE:
             raise StopIteration
 
+    if len(start) <= MANY:
+        method: dict[str, Any] = {
+            "method": "trust-exact",
+            "jac": lambda z: -differences(z)[0],
+            "hess": lambda z: -differences(z)[1],
+        }
+    else:
+        method = {
+            "method": "trust-ncg",
+            "jac": lambda z: -gradient(function, z, STEP),
+            "hessp": lambda z, p: -curvature_along(function, z, p, STEP),
+        }
     try:
         minimize(
             descent,
             start,
-            jac=lambda z: -differences(z)[0],
-            hess=lambda z: -differences(z)[1],
-            method="trust-exact",
+            **method,
             callback=stop_if_idle,
             options={"gtol": MAX_GRADIENT, "maxiter": MAX_ITERATIONS},
         )
