@@ -204,16 +204,17 @@ def estimate_evidence(
     Raises
     ------
     ModelError
-        If an estimator is unknown, or cannot treat the model: "laplace" a noisy likelihood or a
-        mode at the edge of the support, "tempered_smc" and "prior_monte_carlo" a prior that cannot
-        be drawn from. And as `chib_jeliazkov`.
+        If an estimator is unknown, or none can treat the model: "laplace" cannot with a noisy
+        likelihood or a mode at the edge of the support, "tempered_smc" and "prior_monte_carlo" with
+        a prior that cannot be drawn from. And as `chib_jeliazkov`.
     DataMismatchError, TypeError
         As `chib_jeliazkov`.
 
     Warns
     -----
     EvidenceWarning
-        If an estimate is doubtful, or if the estimates disagree: p < 0.001 by Cochran's chi-square
+        If an estimate is doubtful; if an estimator cannot treat the model, which is then missing
+        from the result; or if the estimates disagree: p < 0.001 by Cochran's chi-square
         test, and by more than 0.05 nats. The warning names the likely cause.
 
     Examples

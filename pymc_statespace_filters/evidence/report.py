@@ -1,7 +1,7 @@
 """From draws and a model to `Evidence`: what every estimator has in common."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from zlib import crc32
 
 import numpy as np
@@ -10,13 +10,14 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.doubts import doubts_of_draws, doubts_of_steps
-from pymc_statespace_filters.evidence.estimators.estimate import Estimator
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate, Estimator
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     max_log_likelihood,
 )
 from pymc_statespace_filters.evidence.posterior import (
     ModelDensity,
+    Posterior,
     noise_was_moved,
     posterior_group,
     posterior_of,
@@ -54,7 +55,8 @@ def evidences_of(
     Warns
     -----
     EvidenceWarning
-        Once for what is doubtful whatever the estimator, and once for each estimate that is.
+        Once for what is doubtful whatever the estimator, once for each estimate that is, and once
+        for each estimator that cannot treat the model while another can.
     """
     if not isinstance(model, pm.Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
@@ -74,42 +76,52 @@ def evidences_of(
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
     with watched(density, enabled=progressbar) as announce:
-        estimates = {}
-        for name, estimator in estimators.items():
-            announce(name, estimator.n_evaluations(posterior))
-            try:
-                estimates[name] = estimator.estimate(posterior, rng=stream(name))
-            except ModelError as error:
-                error.add_note(f"raised by the estimator {name!r}")
-                raise
+        estimates = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
     _warn("the log-evidence is less certain than its error says", common)
+    of_model = {
+        "n_parameters": posterior.draws.shape[-1],
+        "n_observations": observation_count(density.model),
+        "max_log_likelihood": largest,
+        "data_fingerprint": data_fingerprint(density.model),
+        "noise": noise,
+        "log_volume": support.log_volume,
+        "uniform": support.uniform,
+        "improper": support.improper,
+    }
     found = {}
     for name, estimate in estimates.items():
-        _warn(
-            f"log-evidence {estimate.log_evidence:.2f} ({name}) is less certain than its error "
-            "says",
-            estimate.doubts,
-        )
-        found[name] = Evidence(
-            log_evidence=estimate.log_evidence,
-            se=estimate.se,
-            estimator=name,
-            n_parameters=posterior.draws.shape[-1],
-            n_observations=observation_count(density.model),
-            max_log_likelihood=largest,
-            data_fingerprint=data_fingerprint(density.model),
-            noise=noise,
-            doubts="; ".join((*common, *estimate.doubts)),
-            log_volume=support.log_volume,
-            uniform=support.uniform,
-            improper=support.improper,
-        )
+        number = f"{estimate.log_evidence:.2f} ({name})"
+        _warn(f"log-evidence {number} is less certain than its error says", estimate.doubts)
+        doubts = "; ".join((*common, *estimate.doubts))
+        found[name] = Evidence(estimate.log_evidence, estimate.se, name, doubts=doubts, **of_model)
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
     return found
+
+
+def _estimates(
+    estimators: Mapping[str, Estimator],
+    posterior: Posterior,
+    stream: Callable[[str], np.random.Generator],
+    announce: Callable[[str, int], None],
+) -> dict[str, Estimate]:
+    """Run one after the other; one that cannot treat the model does not cost the others' work."""
+    estimates, refusals = {}, {}
+    for name, estimator in estimators.items():
+        announce(name, estimator.n_evaluations(posterior))
+        try:
+            estimates[name] = estimator.estimate(posterior, rng=stream(name))
+        except ModelError as error:
+            error.add_note(f"raised by the estimator {name!r}")
+            refusals[name] = error
+    if not estimates:
+        raise next(iter(refusals.values()))
+    for name, refusal in refusals.items():
+        _warn(f"no estimate by {name}", [str(refusal)])
+    return estimates
 
 
 def _warn(message: str, doubts: Sequence[str]) -> None:

@@ -158,3 +158,16 @@ def test_an_error_names_the_estimator_that_raised_it():
     with pytest.raises(ModelError) as caught:
         psf.estimate_evidence(idata, model, estimators=["prior_monte_carlo"])
     assert caught.value.__notes__ == ["raised by the estimator 'prior_monte_carlo'"]
+
+
+def test_who_cannot_treat_the_model_costs_the_others_nothing():
+    idata = az.from_dict({"posterior": {"a": np.random.default_rng(1).normal(1, 1, (2, 200))}})
+    with pm.Model() as model:
+        pm.Normal("y", pm.Flat("a"), 1, observed=1.0)
+    with pytest.warns(EvidenceWarning) as caught:
+        found = psf.estimate_evidence(
+            idata, model, estimators=["prior_monte_carlo", "bridge"], random_seed=1
+        )
+    assert list(found) == ["bridge"]
+    assert abs(found["bridge"].log_evidence) < 4 * found["bridge"].se  # the whole of a normal
+    assert any("no estimate by prior_monte_carlo: " in str(warning.message) for warning in caught)

@@ -49,8 +49,9 @@ from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
-FEWEST_PARTICLES, PARTICLES_PER_PARAMETER = 250, 40
-SHARE = 0.6  # of the effective number that a step of the temperature leaves
+SHARE = (
+    0.85  # of the effective number that a step of the temperature leaves; longer steps miss tails
+)
 # Move until the squared distance from the start grows by less than a share of itself.
 MIN_MOVES, MAX_MOVES, MIN_GAIN = 2, 50, 0.1
 ACCEPTANCE = 0.25  # of random walks
@@ -76,9 +77,8 @@ class TemperedSMC:
 
     Parameters
     ----------
-    n_particles : int, optional
-        In each run, at least 50. By default 40 for every parameter, and no fewer than 250: with
-        fewer, runs miss curved tails together, and their spread does not tell.
+    n_particles : int
+        In each run; at least 50.
     n_runs : int
         Independent but for what they learn from each other; even, because either half learns from
         the other, and at least 8, so that their spread is an error.
@@ -90,14 +90,12 @@ class TemperedSMC:
     TemperedSMC(n_particles=500, n_runs=16)
     """
 
-    n_particles: int | None = None
+    n_particles: int = 250
     n_runs: int = 16
 
     def __post_init__(self) -> None:
         particles, runs = self.n_particles, self.n_runs
-        if particles is not None and not (
-            isinstance(particles, int | np.integer) and particles >= MIN_PARTICLES
-        ):
+        if not (isinstance(particles, int | np.integer) and particles >= MIN_PARTICLES):
             raise ModelError(
                 f"n_particles must be an integer of at least {MIN_PARTICLES}, got {particles!r}"
             )
@@ -106,11 +104,7 @@ class TemperedSMC:
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """A guess: the number of temperatures and of moves is found on the way."""
-        k = posterior.draws.shape[-1]
-        return self.n_runs * self._n_particles(k) * (1 + 5 * (2 + k))
-
-    def _n_particles(self, k: int) -> int:
-        return self.n_particles or max(FEWEST_PARTICLES, PARTICLES_PER_PARAMETER * k)
+        return self.n_runs * self.n_particles * (1 + 5 * (2 + posterior.draws.shape[-1]))
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from draws of the prior.
@@ -120,8 +114,7 @@ class TemperedSMC:
         ModelError
             If the prior is improper, or too few of its draws have a likelihood.
         """
-        n_particles = self._n_particles(posterior.draws.shape[-1])
-        particles = particles_of_prior(posterior, self.n_runs * n_particles, rng)
+        particles = particles_of_prior(posterior, self.n_runs * self.n_particles, rng)
         log_evidences = np.zeros(self.n_runs)
         temperature, scale = 0.0, 1.0
         stages: list[_Stage] = []
@@ -129,8 +122,8 @@ class TemperedSMC:
             # Weight the particles where they are; only then resample and move them.
             raised = raised_from(temperature, particles.log_likelihood)
             log_weights = (raised - temperature) * particles.log_likelihood
-            log_weights = log_weights.reshape(self.n_runs, n_particles)
-            log_evidences += logsumexp(log_weights, axis=1) - np.log(n_particles)
+            log_weights = log_weights.reshape(self.n_runs, self.n_particles)
+            log_evidences += logsumexp(log_weights, axis=1) - np.log(self.n_particles)
             particles = particles.at(resampled(log_weights, rng))
             temperature = raised
             if temperature == 1:
