@@ -336,7 +336,9 @@ def test_a_record_that_became_wrong():
 
 
 INTERRUPTED = """
+import signal
 import warnings
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
 warnings.simplefilter("ignore")
 from tests.sampling.test_sample_dram import Watched, sample_dram
 watched = Watched()
@@ -353,6 +355,8 @@ def interrupt(seconds, tune, presses):
     child = subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    watchdog = threading.Timer(120.0, child.kill)  # whoever is not interrupted draws for hours
+    watchdog.start()
     with child:
         while child.stdout.readline() not in ("go\n", ""):
             pass
@@ -362,6 +366,7 @@ def interrupt(seconds, tune, presses):
             child.send_signal(signal.SIGINT)
             time.sleep(0.15)
         output = child.stdout.readline() or child.stderr.read()
+    watchdog.cancel()
     return output, time.monotonic() - begun
 
 
