@@ -23,8 +23,8 @@ class _Bar:
     def announce(self, task: str, total: int) -> None:
         """Name what is evaluated next, and about how many evaluations that takes."""
         if self._shown is not None:  # the number was a guess: what is done is done
-            bar, task = self._shown
-            bar.advance(task, advance=max(0, self._total - self._done))
+            bar, row = self._shown
+            bar.advance(row, advance=max(0, self._total - self._done))
         self._stack.close()
         self._task, self._total = task, total
         self._done, self._start = 0, perf_counter()
@@ -37,8 +37,8 @@ class _Bar:
             self._shown = bar, bar.add_task(self._task, completed=0, total=self._total)
             count = self._done
         if self._shown is not None:
-            bar, task = self._shown
-            bar.advance(task, advance=count)
+            bar, row = self._shown
+            bar.advance(row, advance=count)
 
 
 @contextmanager

@@ -76,11 +76,13 @@ def evidences_of(
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
     with watched(density, enabled=progressbar) as announce:
-        estimates = _estimates(estimators, posterior, stream, announce)
+        estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
     _warn("the log-evidence is less certain than its error says", common)
+    for name, refusal in refusals.items():
+        _warn(f"no estimate by {name}", [str(refusal)])
     of_model = {
         "n_parameters": posterior.draws.shape[-1],
         "n_observations": observation_count(density.model),
@@ -107,9 +109,10 @@ def _estimates(
     posterior: Posterior,
     stream: Callable[[str], np.random.Generator],
     announce: Callable[[str, int], None],
-) -> dict[str, Estimate]:
+) -> tuple[dict[str, Estimate], dict[str, ModelError]]:
     """Run one after the other; one that cannot treat the model does not cost the others' work."""
-    estimates, refusals = {}, {}
+    estimates: dict[str, Estimate] = {}
+    refusals: dict[str, ModelError] = {}
     for name, estimator in estimators.items():
         announce(name, estimator.n_evaluations(posterior))
         try:
@@ -119,9 +122,7 @@ def _estimates(
             refusals[name] = error
     if not estimates:
         raise next(iter(refusals.values()))
-    for name, refusal in refusals.items():
-        _warn(f"no estimate by {name}", [str(refusal)])
-    return estimates
+    return estimates, refusals
 
 
 def _warn(message: str, doubts: Sequence[str]) -> None:

@@ -49,7 +49,7 @@ def points():
 
 def test_each_point_has_its_own_seeds(noisy, points):
     x, seeds = points
-    found = noisy.log_density(x, seeds)
+    found = noisy.evaluate(x, seeds)
     shared = psf.inspection.noise_seeds(noisy.model)
     log_density = noisy.model.compile_logp()
     for i in (0, 7, 22):
@@ -60,26 +60,26 @@ def test_each_point_has_its_own_seeds(noisy, points):
 
 @pytest.mark.parametrize("n_threads", [1, 2, 5, 40])
 def test_threads_do_not_matter(noisy, points, n_threads, monkeypatch):
-    expected = noisy.log_density(*points)
+    expected = noisy.evaluate(*points)
     monkeypatch.setattr(module, "available_cores", lambda: n_threads)
-    np.testing.assert_array_equal(noisy.log_density(*points), expected)
+    np.testing.assert_array_equal(noisy.evaluate(*points), expected)
 
 
 def test_no_points_no_values(noisy):
-    assert noisy.log_density(np.empty((0, 2)), np.empty((0, 2), dtype=np.int64)).shape == (0,)
+    assert noisy.evaluate(np.empty((0, 2)), np.empty((0, 2), dtype=np.int64)).shape == (0,)
 
 
 def test_the_watch_hears_of_every_point(noisy, points, monkeypatch):
     counts = []
     monkeypatch.setattr(noisy, "watch", counts.append)
-    noisy.log_density(*points)
+    noisy.evaluate(*points)
     assert sum(counts) == 23
 
 
 def test_failed_estimates_are_minus_infinity():
     density = ModelDensity(model_of(psf.EKF()))
     with np.errstate(over="ignore"):
-        found = density.log_density(np.array([[0.5, 0.5], [1e300, 0.5]]), np.empty((2, 0)))
+        found = density.evaluate(np.array([[0.5, 0.5], [1e300, 0.5]]), np.empty((2, 0)))
     assert np.isfinite(found[0])
     assert np.isneginf(found[1])
 
@@ -102,9 +102,9 @@ def test_an_exception_of_the_model_is_raised():
     with pytensor.config.change_flags(mode="FAST_COMPILE"):
         density = ModelDensity(python_model(picky))
     seeds = np.empty((3, 0))
-    assert np.isfinite(density.log_density(np.zeros((3, 1)), seeds)).all()
+    assert np.isfinite(density.evaluate(np.zeros((3, 1)), seeds)).all()
     with pytest.raises(ArithmeticError, match="too large"):
-        density.log_density(np.array([[0.0], [2.0], [0.5]]), seeds)
+        density.evaluate(np.array([[0.0], [2.0], [0.5]]), seeds)
 
 
 @pytest.fixture
@@ -127,5 +127,5 @@ def test_an_interrupt_stops_all_threads():
     timer.start()
     start = time.perf_counter()
     with pytest.raises(KeyboardInterrupt):
-        density.log_density(np.zeros((10_000, 1)), np.empty((10_000, 0)))
+        density.evaluate(np.zeros((10_000, 1)), np.empty((10_000, 0)))
     assert time.perf_counter() - start < 20.0  # all of them take 100 s

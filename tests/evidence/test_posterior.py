@@ -85,7 +85,7 @@ def test_log_density_is_that_of_the_model_with_jacobians(idata, model, density):
 
 def test_no_density_is_minus_infinity_never_nan(density):
     x = np.full((1, 9), np.nan)
-    assert density.log_density(x, np.empty((1, 0), dtype=np.int64))[0] == -np.inf
+    assert density.evaluate(x, np.empty((1, 0), dtype=np.int64))[0] == -np.inf
 
 
 def test_missing_variables_are_named(idata, model):

@@ -71,7 +71,7 @@ def test_density_and_draws_are_one_law(model, draws):
 
 def test_potentials_belong_to_the_likelihood(model, draws):
     x = draws[:3]
-    likelihood = ModelDensity(model).log_density(x, np.empty((3, 0), dtype=np.int64))
+    likelihood = ModelDensity(model).evaluate(x, np.empty((3, 0), dtype=np.int64))
     likelihood = likelihood - ModelPrior(model).log_density(x)
     w0 = np.exp(x[:, 4]) / (np.exp(x[:, 4:]).sum(axis=1) + np.exp(-x[:, 4:].sum(axis=1)))
     expected = norm.logpdf(0.3, w0) + 100 * np.exp(x[:, 0])

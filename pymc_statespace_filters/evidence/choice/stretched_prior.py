@@ -26,12 +26,11 @@ from pytensor.graph.replace import clone_replace, vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._means import SAME, log_mean_of_chains, pareto_k
+from pymc_statespace_filters.evidence.means import MIN_EFFECTIVE, SAME, log_mean_of_chains, pareto_k
 from pymc_statespace_filters.evidence.posterior.support import has_law
 
 EDGE = 0.05  # of the length of a bounded support, at each end
 # Past these the draws do not know the evidence under the other priors.
-MIN_EFFECTIVE = 100
 MAX_PARETO_K = 0.5  # from there on the weights have no variance, and their mean no standard error
 MAX_BEYOND = 0.02
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.estimators._moments import Whitened, moments
+from pymc_statespace_filters.evidence.means import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)

@@ -50,14 +50,14 @@ from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import (
+from pymc_statespace_filters.evidence.estimators._moments import moments
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
+from pymc_statespace_filters.evidence.means import (
     MIN_EFFECTIVE,
     LogMean,
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.estimators._moments import moments
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, of both halves

@@ -39,7 +39,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._means import MIN_EFFECTIVE
 from pymc_statespace_filters.evidence.estimators._proposal import Plan, plan_proposal
 from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.estimators.multi_block import (
@@ -50,6 +49,7 @@ from pymc_statespace_filters.evidence.estimators.single_block import (
     OneBlockEstimate,
     estimate_in_one_block,
 )
+from pymc_statespace_filters.evidence.means import MIN_EFFECTIVE
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_PROPOSALS = 100

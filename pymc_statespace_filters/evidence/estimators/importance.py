@@ -21,13 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import (
+from pymc_statespace_filters.evidence.estimators._mixture import choose_mixture
+from pymc_statespace_filters.evidence.estimators.estimate import Estimate
+from pymc_statespace_filters.evidence.means import (
     MIN_EFFECTIVE,
     log_mean_of_independent,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.estimators._mixture import choose_mixture
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000

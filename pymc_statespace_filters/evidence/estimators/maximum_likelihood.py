@@ -17,8 +17,8 @@ from pymc_statespace_filters.evidence.estimators._maximum import (
     best_of_chains,
     climb,
 )
-from pymc_statespace_filters.evidence.estimators._means import log_mean_of_independent
 from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
+from pymc_statespace_filters.evidence.means import log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3

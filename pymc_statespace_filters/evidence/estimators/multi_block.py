@@ -43,13 +43,13 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import (
+from pymc_statespace_filters.evidence.estimators._moments import Whitened
+from pymc_statespace_filters.evidence.estimators._proposal import Proposal
+from pymc_statespace_filters.evidence.means import (
     error_of_chains,
     error_of_walkers,
     log_mean,
 )
-from pymc_statespace_filters.evidence.estimators._moments import Whitened
-from pymc_statespace_filters.evidence.estimators._proposal import Proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_WALKERS = 64

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._means import (
+from pymc_statespace_filters.evidence.estimators._proposal import Proposal
+from pymc_statespace_filters.evidence.means import (
     LogMean,
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.estimators._proposal import Proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 

@@ -167,7 +167,3 @@ class ModelDensity(RowFunction):
         if moved:
             (log_density,) = with_filter([log_density], model, smooth_filters(model))
         super().__init__(model, log_density)
-
-    def log_density(self, x: Array, seeds: NDArray[np.int64]) -> Array:
-        """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf."""
-        return self.evaluate(x, seeds)

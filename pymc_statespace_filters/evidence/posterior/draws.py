@@ -204,9 +204,9 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
 
     def evaluate(x: Array, rng: np.random.Generator) -> Array:
         if held:
-            return density.log_density(x, np.broadcast_to(seeds[0, 0], (len(x), seeds.shape[-1])))
+            return density.evaluate(x, np.broadcast_to(seeds[0, 0], (len(x), seeds.shape[-1])))
         size = (len(x), seeds.shape[-1])
-        return density.log_density(x, rng.integers(np.iinfo(np.int64).max, size=size))
+        return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
     prior = ModelPrior(density.model)
     return Posterior(draws, log_density, evaluate, is_noisy=not held, prior=prior), noise
@@ -247,7 +247,7 @@ def _stored_log_density(
     flat_seeds = seeds.reshape(len(flat_draws), -1)
     name = _stored_name(stats)
     if name is None:
-        log_density = density.log_density(flat_draws, flat_seeds)
+        log_density = density.evaluate(flat_draws, flat_seeds)
         if impossible := int(np.isneginf(log_density).sum()):
             raise DataMismatchError(
                 f"{impossible} of {len(flat_draws)} draws of idata have no density under the "
@@ -259,7 +259,7 @@ def _stored_log_density(
     if density.moved:  # there is nothing to compare with
         return stored
     checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
-    recomputed = density.log_density(flat_draws[checked], flat_seeds[checked])
+    recomputed = density.evaluate(flat_draws[checked], flat_seeds[checked])
     expected = stored.ravel()[checked]
     # Near a bound the transform loses digits, so a minority of the draws may differ.
     agree = np.isclose(recomputed, expected, rtol=1e-6, atol=1e-4)
