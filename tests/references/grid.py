@@ -55,10 +55,18 @@ class PointMassFilter:
         self._kernels: dict[int, Array] = {0: np.eye(n_points)}
 
     def predict(self, density: Array, n_steps: int) -> Array:
-        """Density n_steps later; the kernel of each distinct gap is computed once."""
+        """Density n_steps later."""
+        return self._kernel(n_steps) @ density
+
+    def predict_back(self, function: Array, n_steps: int) -> Array:
+        """Mean of a function of the state n_steps later, given the state now."""
+        return self._kernel(n_steps).T @ function
+
+    def _kernel(self, n_steps: int) -> Array:
+        """Kernel of a gap; that of each distinct one is computed once."""
         if n_steps not in self._kernels:
             self._kernels[n_steps] = np.linalg.matrix_power(self.kernel, n_steps)
-        return self._kernels[n_steps] @ density
+        return self._kernels[n_steps]
 
     def moments(self, density: Array) -> tuple[float, float]:
         """Predictive mean and standard deviation of an observation of a state with this density."""
