@@ -20,7 +20,7 @@ IN = $(VENV)/bin
 PYTEST = -m pytest -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-quick test test-slow test-latest lint docs bench bench-quick lock clean
+.PHONY: help demo demo-quick test test-slow test-latest lint docs linkcheck bench bench-quick lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -47,8 +47,11 @@ lint: $(VENV)/.installed  ## style, format, types, and who imports whom
 	$(IN)/mypy
 	$(IN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed  ## the documentation, in docs/_build/html
-	$(IN)/python -m sphinx -W --keep-going --quiet -b html docs docs/_build/html
+docs: $(VENV)/.installed  ## the guide, in docs/_build/html; every notebook in it is run
+	$(IN)/python -m sphinx -E -W --keep-going --quiet -b html docs docs/_build/html
+
+linkcheck: $(VENV)/.installed  ## the guide's links to other sites, on a machine that reaches them
+	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
 
 bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  ## all timings beside other packages, into docs/; ARGS="--only ekf"
 	$(IN)/python -m benchmarks $(ARGS)
@@ -63,7 +66,7 @@ lock: $(LATEST)/.exists  ## resolve anew; PYTHON=python3.12, so that the version
 	mv $(LATEST)/lock requirements.lock
 
 clean:  ## remove what the commands made, the environments excepted
-	rm -rf out docs/_build .cache .pytest_cache .mypy_cache .ruff_cache
+	rm -rf out docs/_build docs/reference/api .cache .pytest_cache .mypy_cache .ruff_cache
 
 # The environment is made once and brought up to date when the lock or the metadata change.
 $(VENV)/.installed: requirements.lock pyproject.toml

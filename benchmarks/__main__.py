@@ -1,4 +1,4 @@
-"""Measure everything and write the tables and figures of ``docs/benchmarks.md``.
+"""Measure everything and write the tables and figures of ``docs/reference/benchmarks.md``.
 
 ``python -m benchmarks`` measures part after part and keeps each as a file in ``out/benchmarks``;
 ``--only ekf enkf`` measures some parts anew, ``--resume`` those that are not there yet, and

@@ -3,7 +3,8 @@
 The double well at the parameters of its record. Normals u are those of one seed, v those of
 another; the numbers are variances of log L(rho u + sqrt(1 - rho^2) v) - log L(u) over pairs of
 seeds, good to a sixth of their size. Run with ``python -m benchmarks.noise_variance`` from the root
-of the repository; it takes a few minutes. ``docs/noisy-likelihoods.md`` shows some of the rows.
+of the repository; it takes a few minutes. ``docs/explanation/noisy-likelihoods.md`` shows some of
+the rows.
 """
 
 import warnings

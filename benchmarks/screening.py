@@ -4,7 +4,7 @@ For each screen a few chains from the parameters of the record. All iterations, 
 count as CPU time and as calls of the likelihood; what a run of two iterations takes, to compile and
 to convert, is taken off. The effective sample size is the smallest of the four parameters, of the
 draws kept. Run with ``python -m benchmarks.screening`` from the root of the repository; it takes
-some twenty minutes and writes the table of ``docs/noisy-likelihoods.md``.
+some twenty minutes and writes the table of ``docs/explanation/noisy-likelihoods.md``.
 """
 
 import logging

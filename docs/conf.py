@@ -1,26 +1,76 @@
 """Sphinx settings."""
 
+import os
+import sys
 from importlib.metadata import version as installed_version
 from inspect import signature
+from pathlib import Path
 
-from pymc_statespace_filters import DRAM
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+import reference_pages  # noqa: E402
+
+from pymc_statespace_filters import DRAM  # noqa: E402
 
 project = "pymc-statespace-filters"
 author = "The pymc-statespace-filters developers"
 release = version = installed_version(project)
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "numpydoc"]
-myst_enable_extensions = ["dollarmath"]
+extensions = [
+    "myst_nb",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
 exclude_patterns = ["_build"]
+nitpicky = True  # every reference within the guide must be found
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
 
-# The reference is the list of public names in __init__.py, in its order.
+# Notebooks are kept without outputs and run once in every build from scratch. One that raises, or
+# writes a warning to its stderr, fails the build.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 240
+nb_merge_streams = True
+nb_output_stderr = "warn"
+os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
+
+# The reference is the list of public names in __init__.py.
+autosummary_generate = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # shapes and types are told in the docstrings
 numpydoc_show_class_members = False
 # Sphinx would show that of __new__, by which PyMC makes every step method: (*args, **kwargs).
 DRAM.__signature__ = signature(DRAM)
 
-html_theme = "pydata_sphinx_theme"
+copybutton_exclude = ".linenos, .gp, .go"
+
+html_theme = "pydata_sphinx_theme"  # that of PyMC's own pages is made from it
 html_title = "pymc-statespace-filters"
-html_theme_options = {"show_prev_next": False}
-html_sidebars = {"**": []}
+html_static_path = ["_static"]
+html_css_files = ["guide.css"]
+html_sidebars = {"index": [], "start": []}
+html_show_sourcelink = False
+html_theme_options = {
+    "footer_end": [],
+    "footer_start": ["copyright"],
+    "header_links_before_dropdown": 6,
+    "navbar_end": ["theme-switcher"],
+    "secondary_sidebar_items": ["page-toc"],
+    "show_nav_level": 2,
+}
+
+# `make linkcheck`, on a machine that reaches them.
+linkcheck_timeout = 20
+linkcheck_anchors = False
+
+
+def setup(app: Sphinx) -> None:
+    reference_pages.write(HERE / "reference" / "api")

@@ -32,7 +32,7 @@ def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
 
 
 def test_your_own_system() -> None:
-    names = run_code_of("docs/your_system.md")
+    names = run_code_of("docs/tutorials/your_system.md")
     # The record was made by a hardening spring, and says so.
     assert names["table"].loc["hardening", "prob_low"] > 0.99
     assert np.isfinite(names["terms"]).all()
@@ -40,7 +40,7 @@ def test_your_own_system() -> None:
 
 def test_evidence() -> None:
     with az.rc_context({"plot.backend": "matplotlib"}):
-        names = run_code_of("docs/evidence.md")
+        names = run_code_of("docs/explanation/evidence.md")
     plt.close("all")
     table, found = names["table"], names["found"]
     assert found.agreement

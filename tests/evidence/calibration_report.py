@@ -1,4 +1,4 @@
-"""What the calibration gave: the tables of ``docs/evidence-calibration.md``.
+"""What the calibration gave: the tables of ``docs/reference/evidence-calibration.md``.
 
 Run with ``python -m tests.evidence.calibration_report`` from the root of the repository; with names
 of estimators, of targets or of both behind it for their rows alone, the others being kept.

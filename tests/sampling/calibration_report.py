@@ -1,4 +1,4 @@
-"""What the calibration gave: the tables and the picture of ``docs/calibration.md``.
+"""What the calibration gave: the tables and the picture of ``docs/reference/calibration.md``.
 
 Run with ``python -m tests.sampling.calibration_report`` from the root of the repository.
 """

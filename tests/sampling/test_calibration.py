@@ -1,7 +1,8 @@
 """Chains of every kind are calibrated, and the same comparisons find chains that are not.
 
 All comparisons of a right sampler together fail for one set of seeds in a thousand. What they gave
-is kept in ``docs/calibration.md``, which ``python -m tests.sampling.calibration_report`` writes.
+is kept in ``docs/reference/calibration.md``, which ``python -m tests.sampling.calibration_report``
+writes.
 """
 
 import numpy as np

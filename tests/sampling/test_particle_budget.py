@@ -167,7 +167,7 @@ def test_ensemble_filters_are_tuned_too():
 
 def test_the_pages_on_sampling_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # one writes a checkpoint
-    names = run_code_of("docs/sampling.md", "docs/noisy-likelihoods.md")
+    names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
     table = names["table"]
     assert 1.0 < table.loc[table.attrs["n_particles"], "variance_centre"] < 3.3
     assert (tmp_path / "first-run").is_dir()

@@ -1,0 +1,74 @@
+"""Pages of the reference, one per public name, written before each build."""
+
+import inspect
+import shutil
+from pathlib import Path
+
+import pymc_statespace_filters as psf
+
+PACKAGE = psf.__name__
+
+# Where a name stands follows from the room it comes from; a room that is not here stops the build.
+GROUPS = {
+    "Systems and records": (
+        "model",
+        "integrators",
+        "nonlinearities",
+        "records",
+        "simulation",
+    ),
+    "Filters": ("filters", "likelihood"),
+    "In a PyMC model": ("distribution", "sampling"),
+    "States, forecasts, diagnostics": ("states", "diagnostics"),
+    "Evidence and model choice": ("evidence",),
+    "Plots": ("plots",),
+    "Errors and warnings": ("errors",),
+}
+
+# What rooms ask of each other, and PyMC of a step method, is no part of a user's reading.
+INTERNAL = """algorithm check compile compile_batch compile_gradient compile_reverse compile_states
+compile_taped equations fingerprint is_exact_for kernel n_normals n_theta noise_size noise_sizes
+resampling_normals rv_op rv_type settings setup_chain size smooth smoothing_method step stop_tuning
+stored_normals support_point""".split()
+
+
+def write(folder: Path) -> None:
+    """Write an index of all names in groups, and one page for each name."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    sections = [_heading("Names", "="), f".. currentmodule:: {PACKAGE}\n"]
+    for title, names in _grouped().items():
+        sections.append(_section(title, names))
+        for name in names:
+            (folder / f"{name}.rst").write_text(_page(name))
+    (folder / "index.rst").write_text("\n".join(sections))
+
+
+def _grouped() -> dict[str, list[str]]:
+    rooms = {room: title for title, rooms in GROUPS.items() for room in rooms}
+    groups: dict[str, list[str]] = {title: [] for title in GROUPS}
+    for name in psf.__all__:
+        room = getattr(psf, name).__module__.removeprefix(f"{PACKAGE}.").split(".")[0]
+        groups[rooms[room]].append(name)
+    return {title: names for title, names in groups.items() if names}
+
+
+def _section(title: str, names: list[str]) -> str:
+    table = [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in names)]
+    pages = [".. toctree::", "   :hidden:", "", *(f"   {name}" for name in names)]
+    return "\n".join([_heading(title, "-"), *table, "", *pages, ""])
+
+
+def _page(name: str) -> str:
+    value = getattr(psf, name)
+    kind = "autoclass" if inspect.isclass(value) else "autofunction"
+    lines = [_heading(name, "="), f".. currentmodule:: {PACKAGE}", "", f".. {kind}:: {name}"]
+    if kind == "autoclass":
+        lines += ["   :members:", f"   :exclude-members: {', '.join(INTERNAL)}"]
+    if inspect.isclass(value) and issubclass(value, Exception):
+        lines += ["   :show-inheritance:"]
+    return "\n".join(lines) + "\n"
+
+
+def _heading(text: str, line: str) -> str:
+    return f"{text}\n{line * len(text)}\n"
