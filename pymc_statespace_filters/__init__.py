@@ -31,6 +31,7 @@ from pymc_statespace_filters.plots import (
     plot_evidence,
     plot_model_probabilities,
     plot_prior_sensitivity,
+    plot_states,
 )
 from pymc_statespace_filters.records import nearest_steps
 from pymc_statespace_filters.sampling import DRAM, sample_dram, suggest_particles
@@ -70,6 +71,7 @@ __all__ = [
     "plot_evidence",
     "plot_model_probabilities",
     "plot_prior_sensitivity",
+    "plot_states",
     "prior_sensitivity",
     "sample_dram",
     "simulate",

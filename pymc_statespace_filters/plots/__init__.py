@@ -4,5 +4,12 @@ from pymc_statespace_filters.plots.average import plot_average
 from pymc_statespace_filters.plots.evidence import plot_evidence
 from pymc_statespace_filters.plots.model_probabilities import plot_model_probabilities
 from pymc_statespace_filters.plots.prior_sensitivity import plot_prior_sensitivity
+from pymc_statespace_filters.plots.states import plot_states
 
-__all__ = ["plot_average", "plot_evidence", "plot_model_probabilities", "plot_prior_sensitivity"]
+__all__ = [
+    "plot_average",
+    "plot_evidence",
+    "plot_model_probabilities",
+    "plot_prior_sensitivity",
+    "plot_states",
+]

@@ -13,6 +13,7 @@ from arviz_plots.plot_collection import backend_from_object
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
+DOTS_PER_INCH = 100  # where a backend counts dots
 
 
 def canvas(
@@ -22,7 +23,9 @@ def canvas(
     pc_kwargs: Mapping[str, Any],
     aes: Mapping[str, list[str]],
     height: float = 2.5,
+    size: tuple[float, float] | None = None,
     n_panels: int = 1,
+    panels_in_line: int = PANELS_IN_LINE,
     legend: bool = False,
     **defaults: Any,
 ) -> PlotCollection:
@@ -38,7 +41,9 @@ def canvas(
         Aesthetics by dimension.
     height : float
         Of a panel, in rows as ``scale_fig_size`` of arviz_plots counts them.
-    n_panels : int
+    size : tuple of float, optional
+        Width and height of the figure in inches, in place of what follows from its panels.
+    n_panels, panels_in_line : int
     legend : bool
         Leave room for one beside the panels.
     **defaults
@@ -47,15 +52,22 @@ def canvas(
     backend = rcParams["plot.backend"] if backend is None else backend
     drawing = import_module(f"arviz_plots.backend.{backend}")
     figure = dict(pc_kwargs.get("figure_kwargs", {}))
-    if "figsize" not in figure:
-        n_lines = math.ceil(n_panels / PANELS_IN_LINE)
-        n_columns = min(n_panels, PANELS_IN_LINE) + (0.5 if legend else 0.0)
-        figure["figsize"] = drawing.scale_fig_size(None, rows=height * n_lines, cols=n_columns)
+    n_lines = math.ceil(n_panels / panels_in_line)
+    if "figsize" not in figure and size is not None and backend == "matplotlib":
+        figure["figsize"] = size
+    elif "figsize" not in figure:
+        n_columns = min(n_panels, panels_in_line) + (0.5 if legend else 0.0)
+        dots = size and (DOTS_PER_INCH * size[0], DOTS_PER_INCH * size[1])
+        figure["figsize"] = drawing.scale_fig_size(
+            dots, rows=height * n_lines, cols=n_columns, figsize_units=dots and "dots"
+        )
         figure["figsize_units"] = "dots"
     if backend == "matplotlib":  # it alone must be told to keep room for a legend
         figure.setdefault("layout", "constrained")
+    if backend == "plotly" and size is not None:  # it keeps room for titles
+        figure.setdefault("vertical_spacing", 0.25 / n_lines)
     given = {
-        "col_wrap": PANELS_IN_LINE,
+        "col_wrap": panels_in_line,
         **defaults,
         **pc_kwargs,
         "figure_kwargs": figure,
@@ -98,11 +110,17 @@ def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
 
 
 def band(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Fill the space between two curves, the ends of the dimension `BOUND`."""
+    """Fill the space between two curves, the ends of the dimension `BOUND`; return the last part.
+
+    A backend that fills a polygon cannot have gaps in it: what lies between gaps is one each.
+    """
     (dim,) = (dim for dim in da.dims if dim != BOUND)
-    da = da.dropna(dim)  # a backend that fills a polygon cannot have gaps in it
     low, high = da.transpose(BOUND, dim).values
-    return backend_from_object(target).fill_between_y(da[dim].values, low, high, target, **kwargs)
+    fill = backend_from_object(target).fill_between_y
+    filled = None
+    for part in np.ma.clump_unmasked(np.ma.masked_invalid(low + high)):
+        filled = fill(da[dim].values[part], low[part], high[part], target, **kwargs)
+    return filled
 
 
 def interval(low: xr.Dataset, high: xr.Dataset) -> xr.Dataset:

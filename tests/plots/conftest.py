@@ -70,3 +70,36 @@ def scalar_average(draws):
 def average_in_panels(draws):
     sides = xr.DataArray([1.0, -1.0], coords=[("side", ["left", "right"])])
     return averaged(draws, lambda posterior: (posterior["k"] * X * sides).rename("force"))
+
+
+TIMES = np.linspace(0, 4, 41)
+
+
+def states_group(values, names, times=TIMES, **attrs):
+    """A group of draws of states, values of shape (chain, draw, time, state)."""
+    draws = (("chain", "draw", "d_time", "state"), values)
+    return xr.Dataset({"d_states": draws}, coords={"d_time": times, "state": names}, attrs=attrs)
+
+
+@pytest.fixture(scope="session")
+def states():
+    """Draws 0, 1, ..., 99 above a curve for each of two states, and a record of the first."""
+    steps = np.arange(100.0).reshape(2, 50)[:, :, None, None]
+    curves = np.stack([np.sin(TIMES), 10 * np.cos(TIMES)], axis=1)
+    record = np.sin(TIMES[::5])[:, None].copy()
+    record[3] = np.nan
+    observed = xr.Dataset(
+        {"d": (("d_time", "observable"), record)},
+        coords={"d_time": TIMES[::5], "observable": ["position"]},
+    )
+    smoothed = states_group(curves + steps, ["position", "speed"], at="steps")
+    at_observations = states_group(
+        (curves - steps)[:, :, ::5], ["position", "speed"], TIMES[::5], at="observations"
+    )
+    return xr.DataTree.from_dict(
+        {
+            "smoothed_states": smoothed,
+            "filtered_states": at_observations,
+            "observed_data": observed,
+        }
+    )

@@ -9,6 +9,7 @@ from pymc_statespace_filters import (
     plot_evidence,
     plot_model_probabilities,
     plot_prior_sensitivity,
+    plot_states,
     prior_sensitivity,
 )
 
@@ -20,6 +21,7 @@ PLOTS = [
     (plot_average, "curve_average"),
     (plot_average, "scalar_average"),
     (plot_average, "average_in_panels"),
+    (plot_states, "states"),
 ]
 
 

@@ -1,0 +1,132 @@
+"""What the plots of states read: groups of draws, one of their variables, the truth beside them."""
+
+from collections.abc import Hashable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pymc_statespace_filters.errors import ModelError
+
+SAMPLE_DIMS = ("chain", "draw")
+CALLS = {  # by which groups are made
+    "smoothed_states": "psf.smoothed_states(idata, model)",
+    "filtered_states": "psf.filtered_states(idata, model)",
+    "predictions": "psf.forecast(idata, model, n_steps=...)",
+    "filter_diagnostics": "psf.filter_diagnostics(idata, model)",
+}
+
+
+def group_of(idata: Any, *groups: str) -> tuple[str, xr.Dataset]:
+    """Return the first group that there is, with its name, or say which call makes one."""
+    if not isinstance(idata, xr.DataTree):
+        raise ModelError(f"idata must be a DataTree of draws, got {type(idata).__name__}")
+    for group in groups:
+        if group in idata.children:
+            return group, idata[group].to_dataset()
+    make = f": run {CALLS[groups[0]]} first" if groups[0] in CALLS else f", only {list(idata)}"
+    raise ModelError(f"idata has no group {groups[0]!r}{make}")
+
+
+def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str) -> str:
+    """Return the name of the StateSpace variable whose results are in a group."""
+    found = [str(name).removesuffix(suffix) for name in dataset if str(name).endswith(suffix)]
+    if var_name is None and len(found) == 1:
+        return found[0]
+    if var_name is None or var_name not in found:
+        raise ModelError(f"var_name must be one of {found}, got {var_name!r}")
+    return var_name
+
+
+def time_of(array: xr.DataArray, *others: Hashable) -> Hashable:
+    """Return the dimension of `array` that is neither of samples nor among `others`."""
+    (dim,) = (dim for dim in array.dims if dim not in (*SAMPLE_DIMS, *others))
+    return dim
+
+
+def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
+    """Return the record of a variable if idata has it, with dimensions "time" and "observable"."""
+    if "observed_data" not in idata.children or name not in idata["observed_data"]:
+        return None
+    record = idata["observed_data"][name]
+    return record.rename(dict(zip(record.dims, ("time", "observable"), strict=True)))
+
+
+def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:
+    """Return `names`, all of them if None, checked against what there is."""
+    if names is None:
+        return list(available)
+    names = [names] if isinstance(names, str) else list(names)
+    known(argument, names, available)
+    return names
+
+
+def known(argument: str, names: Iterable[str], available: Sequence[str]) -> None:
+    """Raise an error for names that there are not."""
+    unknown = [name for name in names if name not in available]
+    if unknown:
+        raise ModelError(f"{argument} must be among {list(available)}, got {unknown}")
+
+
+def truth_of(
+    truth: Any, simulated: str, along: str, names: Sequence[str], times: np.ndarray
+) -> xr.DataArray:
+    """Return what the user knows to be true, with dimensions "time" and `along`.
+
+    Parameters
+    ----------
+    truth : xarray.Dataset, xarray.DataArray or array_like
+        Of `simulate`; with one dimension `along` and another whose coordinate is time; or of
+        shape (len(times), len(names)).
+    simulated : str
+        Its variable in what `simulate` returns.
+    along : {"state", "observable"}
+    names : sequence of str
+        Those of the results, in order.
+    times : numpy.ndarray
+        Of the rows of the results.
+    """
+    if isinstance(truth, xr.Dataset):
+        if simulated not in truth:
+            raise ModelError(f"truth must have the variable {simulated!r} of simulate, got {truth}")
+        truth = truth[simulated]
+    if not isinstance(truth, xr.DataArray):
+        return _rows(np.asarray(truth, dtype=float), along, names, times)
+    if along not in truth.dims and len(names) == 1:
+        truth = truth.expand_dims({along: list(names)})
+    others = [dim for dim in truth.dims if dim != along]
+    if along not in truth.coords or len(others) != 1:
+        raise ModelError(
+            f"truth must have the dimension {along!r} with names and another one of time, got "
+            f"dimensions {truth.dims}"
+        )
+    shared = [name for name in names if name in truth[along].values]
+    if not shared:
+        raise ModelError(
+            f"truth must know some of {list(names)}, got {along}s {list(truth[along].values)}"
+        )
+    return _with_times(truth.sel({along: shared}), others[0]).transpose("time", along)
+
+
+def _rows(values: np.ndarray, along: str, names: Sequence[str], times: np.ndarray) -> xr.DataArray:
+    if values.ndim == 1 and len(names) == 1:
+        values = values[:, None]
+    expected = (times.size, len(names))
+    if values.shape != expected:
+        raise ModelError(
+            f"truth must have shape {expected}, a row for each of the times drawn, got shape "
+            f"{values.shape}; a DataArray with times as coordinate may have other times"
+        )
+    return xr.DataArray(values, coords=[("time", times), (along, list(names))])
+
+
+def _with_times(truth: xr.DataArray, dim: Hashable) -> xr.DataArray:
+    """Make time the coordinate of its only dimension besides the names."""
+    of_dim = [
+        name
+        for name, coordinate in truth.coords.items()
+        if coordinate.dims == (dim,) and str(name).endswith("time")
+    ]
+    times = truth[of_dim[0] if of_dim else dim].values
+    values = truth.drop_vars([name for name, c in truth.coords.items() if dim in c.dims])
+    return values.rename({dim: "time"}).assign_coords(time=times)

@@ -1,0 +1,162 @@
+"""The state over time: what the record tells of it, the record, the truth (thesis, Fig. 12)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import xarray as xr
+from arviz_plots import PlotCollection
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots._canvas import canvas, curve
+from pymc_statespace_filters.plots._marks import (
+    DATA,
+    DOTS,
+    PATHS,
+    TRUTH,
+    draw_bands,
+    draw_bars,
+    paths,
+    points,
+    some_draws,
+    write_axes,
+    write_key,
+)
+from pymc_statespace_filters.plots._results import (
+    chosen,
+    data_of,
+    group_of,
+    known,
+    time_of,
+    truth_of,
+    variable_of,
+)
+
+
+def plot_states(
+    idata: xr.DataTree,
+    *,
+    group: str | None = None,
+    var_name: str | None = None,
+    states: str | Sequence[str] | None = None,
+    observables: Mapping[str, str] | None = None,
+    truth: Any = None,
+    n_draws: int = 0,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    """Draw the state over time with its uncertainty, one panel for each of its components.
+
+    Bands hold 50 % and 90 % of the draws, which carry the uncertainty of the parameters too, and
+    the line is their median. States at observation times alone are bars instead: nothing is
+    claimed for the time between. Draws that failed do not count; where all did there is a gap.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Of `filtered_states` or `smoothed_states`.
+    group : {"smoothed_states", "filtered_states"}, optional
+        By default the smoothed states where there are any.
+    var_name : str, optional
+        The StateSpace variable, where there are several.
+    states : str or sequence of str, optional
+        By default all.
+    observables : mapping of str to str, optional
+        By state the observable that measures it: the record is drawn in its panel, as points. By
+        default each observable that has the name of a state.
+    truth : array_like or xarray.DataArray or xarray.Dataset, optional
+        What `simulate` returned; a DataArray with a dimension ``state`` and another whose
+        coordinate is time; or an array of shape (number of times drawn, number of states).
+    n_draws : int
+        So many draws beside the bands: paths of smoothed states; of filtered states, which are
+        drawn at each time by itself, points.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``, as ``col_wrap=2`` for panels side by side.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``band_90``, ``band_50`` and ``median`` (or ``bar_90`` and ``bar_50``), ``data``,
+        ``truth``, ``draws``, along ``state``.
+
+    Raises
+    ------
+    ModelError
+        If there are no such states, or a name or the truth does not fit them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_states
+    >>> times, rng = np.linspace(0, 10, 101), np.random.default_rng(1)
+    >>> draws = np.sin(times)[:, None] + 0.2 * rng.normal(size=(2, 100, 101, 1))
+    >>> smoothed = xr.Dataset(
+    ...     {"d_states": (("chain", "draw", "d_time", "state"), draws)},
+    ...     coords={"d_time": times, "state": ["position"]},
+    ... )
+    >>> idata = xr.DataTree.from_dict({"smoothed_states": smoothed})
+    >>> collection = plot_states(idata, truth=np.sin(times))
+    >>> collection.savefig("states.png")  # doctest: +SKIP
+    """
+    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
+    group, results = group_of(idata, *groups)
+    name = variable_of(results, var_name, "_states")
+    draws = results[f"{name}_states"]
+    all_states = [str(state) for state in draws["state"].values]
+    shown = chosen("states", states, all_states)
+    record = _record(idata, name, observables, all_states)
+    times = draws[time_of(draws, "state")]
+    if truth is not None:
+        truth = truth_of(truth, "states", "state", all_states, times.values)
+
+    data = draws.sel(state=shown).to_dataset(name="states")
+    collection = canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={},
+        size=(8.0, 1.5 + 2.0 * len(shown) ** 0.9),
+        panels_in_line=1,
+        cols=["state"],
+    )
+    if n_draws:
+        mark, style = (points, DOTS) if group == "filtered_states" else (paths, PATHS)
+        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+    key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
+    if truth is not None:
+        collection.map(
+            curve, "truth", data=truth.reindex(state=shown).to_dataset(name="truth"), **TRUTH
+        )
+        key["truth"] = TRUTH
+    if record is not None:
+        collection.map(
+            points,
+            "data",
+            data=record.reindex(state=shown).to_dataset(name="data"),
+            diameter=4,
+            **DATA,
+        )
+        key["data"] = {**DATA, "linestyle": "C2", "width": 4}
+    write_axes(collection, times)
+    write_key(collection, key)
+    return collection
+
+
+def _record(
+    idata: xr.DataTree, name: str, observables: Mapping[str, str] | None, states: Sequence[str]
+) -> xr.DataArray | None:
+    """Return what was observed of each state that is measured, with dimensions time and state."""
+    record = data_of(idata, name)
+    if record is None:
+        if observables:
+            raise ModelError(f"observables was given, but idata has no observed_data[{name!r}]")
+        return None
+    there = [str(observable) for observable in record["observable"].values]
+    if observables is None:
+        observables = {state: state for state in states if state in there}
+    known("observables: its states", observables, states)
+    known("observables: its values", observables.values(), there)
+    measured = record.sel(observable=list(observables.values()))
+    return measured.rename(observable="state").assign_coords(state=list(observables))
