@@ -14,7 +14,7 @@ from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._elementary import exp, float_of, log, sin_cos_quarter
 from pymc_statespace_filters.machine_code import NUMBERS, Entry, digest
 
-INITIAL, PROCESS, OBSERVATION, RESAMPLING = (np.uint64(purpose) for purpose in range(4))
+INITIAL, PROCESS, OBSERVATION, RESAMPLING, STATES = (np.uint64(purpose) for purpose in range(5))
 """Purposes: which stream of a step a number belongs to."""
 
 BLOCK = 64

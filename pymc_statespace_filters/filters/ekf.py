@@ -4,29 +4,32 @@ The two verbs are written once, as graphs; their derivatives come from the same 
 of the filter is one vector: the mean, then the lower triangle of the covariance.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import pytensor.tensor as pt
-from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._batch import compile_batch
+from pymc_statespace_filters.filters._linearised import (
+    Symbols,
+    move_from,
+    pack,
+    sight_from,
+    state_size,
+    unpack,
+)
 from pymc_statespace_filters.filters._recursion import Recursion, compile_taped, compile_value
 from pymc_statespace_filters.filters._reverse import compile_gradient, compile_reverse
+from pymc_statespace_filters.filters._states import compile_states
 from pymc_statespace_filters.lowering import (
     Compiled,
     Graph,
     VectorFunction,
     call,
     is_linear,
-    jacobian_of,
     log_normal,
-    observation_moments,
     symbols_of,
-    without_missing,
 )
 from pymc_statespace_filters.model import StateSpaceModel
 
@@ -93,69 +96,53 @@ class EKF:
         """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""
         return compile_gradient(_recursion(system))
 
+    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+        """The states at some steps, by their mean and standard deviation, and a draw of them.
 
-def _state_size(n: int) -> int:
-    return n + n * (n + 1) // 2
+        The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> (mean (R, n),
+        sd (R, n), drawn (R, n), n_effective (R,), health (3,)); ``moment`` is "predicted",
+        "filtered" or "smoothed". The draws of one ``draw_seed`` belong together: if smoothed, they
+        are a path. See `_bryson_frazier` for how both are made.
+        """
+        return compile_states(_recursion(system), moment)
 
-
-def _pack(mean: TensorVariable, cov: TensorVariable) -> TensorVariable:
-    rows, columns = np.tril_indices(mean.type.shape[0])
-    return pt.concatenate([mean, cov[rows, columns]])
-
-
-def _unpack(s: TensorVariable, n: int) -> tuple[TensorVariable, TensorVariable]:
-    where = np.zeros((n, n), dtype="int64")
-    where[np.tril_indices(n)] = np.arange(n * (n + 1) // 2)
-    where = np.maximum(where, where.T)
-    return s[:n], s[n:][where]
-
-
-Symbols = Mapping[str, TensorVariable]
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """What smoothed states are made by."""
+        return "modified Bryson-Frazier"
 
 
 def _start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     mean = call(system.equations.initial_mean, system, values)
-    return _pack(mean, call(system.equations.initial_cov, system, values))
+    return pack(mean, call(system.equations.initial_cov, system, values))
 
 
 def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     """Eqs. 4.8-4.11: A and B are taken at the analysis of this step."""
-    mean, cov = _unpack(values["s"], system.n)
-    q = pt.zeros((system.m,))
-    at = {**values, "x": mean, "q": q}
-    forecast = call(system.equations.transition, system, at)
-    state_jac, noise_jac = jacobian_of(forecast, mean), jacobian_of(forecast, q)
-    forecast_cov = state_jac @ cov @ state_jac.T
+    mean, cov = unpack(values["s"], system.n)
+    move = move_from(system, values, mean)
+    forecast_cov = move.state_jac @ cov @ move.state_jac.T
     if system.m:
         if system.equations.process_noise is not None:
             noise_cov = call(system.equations.process_noise, system, values)
-            forecast_cov += noise_jac @ noise_cov @ noise_jac.T
+            forecast_cov += move.noise_jac @ noise_cov @ move.noise_jac.T
         else:
-            forecast_cov += noise_jac @ noise_jac.T
-    return _pack(forecast, forecast_cov)
+            forecast_cov += move.noise_jac @ move.noise_jac.T
+    return pack(move.mean, forecast_cov)
 
 
 def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
-    mean, cov = _unpack(values["s"], system.n)
-    expected, noise_cov = observation_moments(system, {**values, "x": mean})
-    seen_jac = jacobian_of(expected, mean)
-    residual, noise_cov, seen = without_missing(values["d"], expected, noise_cov)
-    seen_jac = seen_jac * seen[:, None]
-    innovation_cov = seen_jac @ cov @ seen_jac.T + noise_cov
-    chol = cholesky(innovation_cov, lower=True)
-    # K = P C^T S^-1 by two triangular solves.
-    half = solve_triangular(chol, seen_jac @ cov, lower=True, b_ndim=2)
-    gain = solve_triangular(chol.T, half, lower=False, b_ndim=2).T
-    kept = pt.eye(system.n) - gain @ seen_jac
-    analysis_cov = kept @ cov @ kept.T + gain @ noise_cov @ gain.T
-    increment = log_normal(residual, innovation_cov, seen)
-    return _pack(mean + gain @ residual, analysis_cov), increment
+    mean, cov = unpack(values["s"], system.n)
+    sight = sight_from(system, values, mean, cov)
+    gain, kept = sight.gain, sight.kept
+    analysis_cov = kept @ cov @ kept.T + gain @ sight.noise_cov @ gain.T
+    increment = log_normal(sight.residual, sight.innovation_cov, sight.seen)
+    return pack(mean + gain @ sight.residual, analysis_cov), increment
 
 
 def _recursion(system: StateSpaceModel) -> Recursion:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
-    s = pt.tensor("s", shape=(_state_size(system.n),), dtype="float64")
+    s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
     values = symbols_of(system) | {"s": s}
 
     def function(arguments: str, inputs: str, outputs: list, *scalar: bool):
