@@ -29,7 +29,9 @@ from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
 from pymc_statespace_filters.plots import (
     plot_average,
     plot_evidence,
+    plot_forecast,
     plot_model_probabilities,
+    plot_phase,
     plot_prior_sensitivity,
     plot_states,
 )
@@ -69,7 +71,9 @@ __all__ = [
     "nearest_steps",
     "plot_average",
     "plot_evidence",
+    "plot_forecast",
     "plot_model_probabilities",
+    "plot_phase",
     "plot_prior_sensitivity",
     "plot_states",
     "prior_sensitivity",

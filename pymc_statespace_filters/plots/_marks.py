@@ -95,12 +95,9 @@ def bars(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
 
 def points(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
     """Draw values, of each path if there are some, as points over time."""
-    drawing = backend_from_object(target)
-    size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # others take an area
     dim = time_of(da, "path")
     times, values = xr.broadcast(da[dim], da)
-    known = values.notnull().values
-    return drawing.scatter(times.values[known], values.values[known], target, size=size, **kwargs)
+    return _scatter(times.values.ravel(), values.values.ravel(), target, diameter, **kwargs)
 
 
 def paths(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
@@ -117,6 +114,31 @@ def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
     gaps = np.full((1, np.shape(x)[1]), np.nan)
     x, y = (np.concatenate([values, gaps]).T.ravel() for values in (x, y))
     return backend_from_object(target).line(x, y, target, **kwargs)
+
+
+def path_xy(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
+    """Draw each path of x and y, the ends of the dimension "plot_axis", as a line."""
+    dim = time_of(da, "path", "plot_axis")
+    x, y = da.transpose("plot_axis", dim, "path").values
+    return _broken_line(x, y, target, **kwargs)
+
+
+def points_xy(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
+    """Draw the same as points."""
+    x, y = da.stack(point=[dim for dim in da.dims if dim != "plot_axis"]).values
+    return _scatter(x, y, target, diameter, **kwargs)
+
+
+def _scatter(x: np.ndarray, y: np.ndarray, target: Any, diameter: float, **kwargs: Any) -> Any:
+    drawing = backend_from_object(target)
+    size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # others take an area
+    known = np.isfinite(x) & np.isfinite(y)
+    return drawing.scatter(x[known], y[known], target, size=size, **kwargs)
+
+
+def in_key(style: Mapping[str, Any]) -> dict[str, Any]:
+    """Return how points of a style look in a key, which has lines alone: a line of points."""
+    return {**style, "linestyle": "C2", "width": 4}
 
 
 def write_key(collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]]) -> None:

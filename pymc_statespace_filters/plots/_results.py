@@ -28,7 +28,7 @@ def group_of(idata: Any, *groups: str) -> tuple[str, xr.Dataset]:
     raise ModelError(f"idata has no group {groups[0]!r}{make}")
 
 
-def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str) -> str:
+def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str = "") -> str:
     """Return the name of the StateSpace variable whose results are in a group."""
     found = [str(name).removesuffix(suffix) for name in dataset if str(name).endswith(suffix)]
     if var_name is None and len(found) == 1:

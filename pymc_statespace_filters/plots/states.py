@@ -15,6 +15,7 @@ from pymc_statespace_filters.plots._marks import (
     TRUTH,
     draw_bands,
     draw_bars,
+    in_key,
     paths,
     points,
     some_draws,
@@ -138,7 +139,7 @@ def plot_states(
             diameter=4,
             **DATA,
         )
-        key["data"] = {**DATA, "linestyle": "C2", "width": 4}
+        key["data"] = in_key(DATA)
     write_axes(collection, times)
     write_key(collection, key)
     return collection

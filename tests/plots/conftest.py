@@ -103,3 +103,21 @@ def states():
             "observed_data": observed,
         }
     )
+
+
+@pytest.fixture(scope="session")
+def forecast():
+    """Of two observables, draws 0, 1, ..., 99 at ten times after a record of 31."""
+    steps = np.arange(100.0).reshape(2, 50)[:, :, None, None]
+    observables = ["position", "speed"]
+    predictions = xr.Dataset(
+        {"d": (("chain", "draw", "d_time", "observable"), steps + np.zeros((2, 50, 10, 2)))},
+        coords={"d_time": TIMES[31:], "observable": observables},
+    )
+    predictions["d_states"] = (("chain", "draw", "d_time", "state"), predictions["d"].values)
+    record = np.stack([np.sin(TIMES[:31]), np.cos(TIMES[:31])], axis=1)
+    observed = xr.Dataset(
+        {"d": (("d_time", "observable"), record)},
+        coords={"d_time": TIMES[:31], "observable": observables},
+    )
+    return xr.DataTree.from_dict({"predictions": predictions, "observed_data": observed})

@@ -7,11 +7,18 @@ from arviz_plots import PlotCollection
 from pymc_statespace_filters import (
     plot_average,
     plot_evidence,
+    plot_forecast,
     plot_model_probabilities,
+    plot_phase,
     plot_prior_sensitivity,
     plot_states,
     prior_sensitivity,
 )
+
+
+def portrait(idata, **settings):
+    return plot_phase(idata, "position", "speed", **settings)
+
 
 PLOTS = [
     (plot_evidence, "table"),
@@ -22,6 +29,8 @@ PLOTS = [
     (plot_average, "scalar_average"),
     (plot_average, "average_in_panels"),
     (plot_states, "states"),
+    (plot_forecast, "forecast"),
+    (portrait, "states"),
 ]
 
 

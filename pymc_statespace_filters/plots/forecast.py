@@ -1,0 +1,136 @@
+"""What is to come after a record, beside what came."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import vline
+
+from pymc_statespace_filters.plots._canvas import canvas
+from pymc_statespace_filters.plots._marks import (
+    DATA,
+    TRUTH,
+    draw_bands,
+    draw_bars,
+    in_key,
+    points,
+    write_axes,
+    write_key,
+)
+from pymc_statespace_filters.plots._results import data_of, group_of, truth_of, variable_of
+
+PAST = 2.0  # so much of the record, in lengths of the forecast, is drawn
+FEWEST_OF_PAST = 10
+
+
+def plot_forecast(
+    idata: xr.DataTree,
+    *,
+    var_name: str | None = None,
+    truth: Any = None,
+    n_past: int | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    """Draw predicted observations after the end of the record, one panel for each observable.
+
+    Bands hold 50 % and 90 % of the draws: the uncertainty of parameters and states, the noise to
+    come and that of the measurement. The end of the record is a vertical line.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Of `forecast`.
+    var_name : str, optional
+        The StateSpace variable, where there are several.
+    truth : array_like or xarray.DataArray or xarray.Dataset, optional
+        What came: an array of shape (number of predictions, number of observables); a DataArray
+        with a dimension ``observable`` and another whose coordinate is time; or what `simulate`
+        returned. What is not after the end of the record is not drawn.
+    n_past : int, optional
+        So many of the last observations are drawn; by default those of a time twice as long as
+        the forecast, and at least ten.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``band_90``, ``band_50`` and ``median``, ``data``, ``end``, ``truth``, along
+        ``observable``.
+
+    Raises
+    ------
+    ModelError
+        If there is no forecast, or the truth does not fit it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_forecast
+    >>> times, rng = np.arange(150) / 10, np.random.default_rng(1)
+    >>> came = np.sin(times) + 0.1 * rng.normal(size=150)
+    >>> drawn = np.sin(times[100:])[:, None] + 0.1 * rng.normal(size=(2, 100, 50, 1))
+    >>> observable = {"observable": ["position"]}
+    >>> predictions = xr.Dataset(
+    ...     {"d": (("chain", "draw", "d_time", "observable"), drawn)},
+    ...     coords={"d_time": times[100:], **observable},
+    ... )
+    >>> record = xr.Dataset(
+    ...     {"d": (("d_time", "observable"), came[:100, None])},
+    ...     coords={"d_time": times[:100], **observable},
+    ... )
+    >>> idata = xr.DataTree.from_dict({"predictions": predictions, "observed_data": record})
+    >>> collection = plot_forecast(idata, truth=came[100:])
+    >>> collection.savefig("forecast.png")  # doctest: +SKIP
+    """
+    _, results = group_of(idata, "predictions")
+    predicted = results[[name for name in results if not str(name).endswith("_states")]]
+    name = variable_of(predicted, var_name)
+    draws = predicted[name].rename(
+        dict(zip(predicted[name].dims[-2:], ("time", "observable"), strict=True))
+    )
+    observables = [str(observable) for observable in draws["observable"].values]
+    if truth is not None:
+        truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
+    record = data_of(idata, name)
+
+    data = draws.to_dataset(name="observations")
+    collection = canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={},
+        size=(8.0, 1.5 + 2.0 * len(observables) ** 0.9),
+        n_panels=len(observables),
+        panels_in_line=1,
+        cols=["observable"],
+    )
+    key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
+    if record is not None:
+        past = record.isel(time=slice(-_n_past(record, draws) if n_past is None else -n_past, None))
+        end = record["time"][-1].expand_dims(observable=observables).drop_vars("time")
+        if truth is not None:
+            truth = truth.where(truth["time"] > record["time"][-1], drop=True)
+        collection.map(vline, "end", data=end.to_dataset(name="end"), color="B2", linestyle="C1")
+        collection.map(points, "data", data=past.to_dataset(name="data"), diameter=4, **DATA)
+        key["data"] = in_key(DATA)
+        key["end of the record"] = {"color": "B2", "linestyle": "C1"}
+    if truth is not None:
+        came = truth.reindex(observable=observables).to_dataset(name="truth")
+        collection.map(points, "truth", data=came, diameter=4, color=TRUTH["color"])
+        key["what came"] = in_key(TRUTH)
+    write_axes(collection, draws["time"])
+    write_key(collection, key)
+    return collection
+
+
+def _n_past(record: xr.DataArray, draws: xr.DataArray) -> int:
+    """Return how many of the last observations are of a time `PAST` times that of the forecast."""
+    end = record["time"].values[-1]
+    begin = end - PAST * (draws["time"].values[-1] - end)
+    return max(int(np.sum(record["time"].values >= begin)), FEWEST_OF_PAST)

@@ -1,0 +1,164 @@
+"""One quantity against another while time goes: phase portraits, loops of force (Figs. 24-28)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import labelled_x, labelled_y, line_xy
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots._canvas import canvas
+from pymc_statespace_filters.plots._marks import (
+    DOTS,
+    PATHS,
+    TRUTH,
+    over_draws,
+    path_xy,
+    points_xy,
+    some_draws,
+    write_key,
+)
+from pymc_statespace_filters.plots._results import (
+    SAMPLE_DIMS,
+    chosen,
+    group_of,
+    time_of,
+    truth_of,
+    variable_of,
+)
+
+
+def plot_phase(
+    idata: xr.DataTree,
+    x: str | xr.DataArray,
+    y: str | xr.DataArray,
+    *,
+    group: str | None = None,
+    var_name: str | None = None,
+    truth: Any = None,
+    n_draws: int = 20,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    """Draw one quantity against another while time goes: the phase portrait, the loop of a force.
+
+    The thin lines are draws, the thick line goes through the medians of both. Filtered states are
+    drawn at each time by itself, and so their draws are points instead.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Of `filtered_states` or `smoothed_states`.
+    x, y : str or xarray.DataArray
+        Name of a state; or what was computed from the states, as a restoring force, with
+        dimensions (chain, draw, time), its name that of the axis.
+    group : {"smoothed_states", "filtered_states"}, optional
+        By default the smoothed states where there are any.
+    var_name : str, optional
+        The StateSpace variable, where there are several.
+    truth : xarray.DataArray, xarray.Dataset or pair of array_like, optional
+        What `simulate` returned (if x and y are names of states), or the true x and y over time.
+    n_draws : int
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``draws``, ``median``, ``truth``, ``x_label``, ``y_label``.
+
+    Raises
+    ------
+    ModelError
+        If there are no such states, or x, y or the truth does not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_phase
+    >>> times, rng = np.linspace(0, 10, 101), np.random.default_rng(1)
+    >>> circle = np.stack([np.sin(times), np.cos(times)], axis=1)
+    >>> smoothed = xr.Dataset(
+    ...     {"d_states": (("chain", "draw", "d_time", "state"), circle + rng.normal(
+    ...         scale=0.1, size=(2, 100, 1, 2)
+    ...     ) * np.ones((101, 1)))},
+    ...     coords={"d_time": times, "state": ["position", "speed"]},
+    ... )
+    >>> idata = xr.DataTree.from_dict({"smoothed_states": smoothed})
+    >>> position = smoothed["d_states"].sel(state="position", drop=True)
+    >>> force = (2.0 * position + 0.5 * position**3).rename("restoring force")
+    >>> portrait = plot_phase(idata, "position", "speed", truth=circle.T)
+    >>> loop = plot_phase(idata, "position", force)
+    >>> loop.savefig("loop.png")  # doctest: +SKIP
+    """
+    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
+    group, results = group_of(idata, *groups)
+    states = results[f"{variable_of(results, var_name, '_states')}_states"]
+    both = [_quantity("x", x, states), _quantity("y", y, states)]
+    sizes = [dict(quantity.sizes) for quantity in both]
+    if sizes[0] != sizes[1]:
+        raise ModelError(f"y must be at the times of x and of its draws, got sizes {sizes}")
+    data = _on_axes(both).to_dataset(name="phase")
+    true = None if truth is None else _truth(truth, x, y, states)
+
+    collection = canvas(data, backend=backend, pc_kwargs=pc_kwargs, aes={}, size=(6.0, 5.0))
+    mark, style = (points_xy, DOTS) if group == "filtered_states" else (path_xy, PATHS)
+    style = {**style, "alpha": 0.25}  # beside the thick line
+    collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+    median = over_draws(data).sel(quantile=0.5)
+    lines = {"median": ({"color": "C0", "width": 2.5}, median)}
+    if true is not None:
+        lines["truth"] = ({**TRUTH, "width": 1.2}, true)
+    for label, (line_style, line) in lines.items():
+        collection.map(line_xy, label, data=line, **line_style)
+    collection.map(labelled_x, "x_label", text=str(both[0].name))
+    collection.map(labelled_y, "y_label", text=str(both[1].name))
+    thin = {**PATHS, "width": 1.5}
+    write_key(collection, {"draws": thin} | {k: style for k, (style, _) in lines.items()})
+    return collection
+
+
+def _on_axes(both: Sequence[xr.DataArray]) -> xr.DataArray:
+    """Lay x and y along the dimension "plot_axis", as arviz_plots has it."""
+    aligned = xr.align(*both, join="exact")
+    return xr.concat([a.rename("phase") for a in aligned], "plot_axis").assign_coords(
+        plot_axis=["x", "y"]
+    )
+
+
+def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) -> xr.DataArray:
+    """Return a state or what the user computed, over (chain, draw, time), with its name."""
+    time = time_of(states, "state")
+    if isinstance(given, xr.DataArray):
+        others = [dim for dim in given.dims if dim not in SAMPLE_DIMS]
+        if set(given.dims) - set(others) != set(SAMPLE_DIMS) or len(others) != 1:
+            raise ModelError(
+                f"{argument} must have dimensions (chain, draw, time), got {given.dims}"
+            )
+        name = given.name or argument
+        return given.rename({others[0]: "time"}).reset_coords(drop=True).rename(name)
+    (state,) = chosen(argument, [given], [str(state) for state in states["state"].values])
+    return states.sel(state=state, drop=True).rename({time: "time"}).rename(state)
+
+
+def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:
+    if isinstance(truth, xr.Dataset | xr.DataArray):
+        if not (isinstance(x, str) and isinstance(y, str)):
+            raise ModelError("truth must be a pair (x, y) where x or y is no name of a state")
+        times = states[time_of(states, "state")].values
+        names = [str(state) for state in states["state"].values]
+        known = truth_of(truth, "states", "state", names, times)
+        both = [known.sel(state=chosen("truth", [n], known["state"].values)[0]) for n in (x, y)]
+        return _on_axes([b.drop_vars("state") for b in both]).to_dataset(name="phase")
+    pair = [np.asarray(values, dtype=float) for values in truth]
+    if len(pair) != 2 or pair[0].ndim != 1 or pair[0].shape != pair[1].shape:
+        raise ModelError(
+            "truth must be two arrays of one length, the true x and y, got shapes "
+            f"{[p.shape for p in pair]}"
+        )
+    return xr.Dataset({"phase": (("plot_axis", "time"), pair)}, coords={"plot_axis": ["x", "y"]})
