@@ -153,7 +153,8 @@ def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:
         times = states[time_of(states, "state")].values
         names = [str(state) for state in states["state"].values]
         known = truth_of(truth, "states", "state", names, times)
-        both = [known.sel(state=chosen("truth", [n], known["state"].values)[0]) for n in (x, y)]
+        true_states = [str(state) for state in known["state"].values]
+        both = [known.sel(state=name) for name in chosen("truth", [x, y], true_states)]
         return _on_axes([b.drop_vars("state") for b in both]).to_dataset(name="phase")
     pair = [np.asarray(values, dtype=float) for values in truth]
     if len(pair) != 2 or pair[0].ndim != 1 or pair[0].shape != pair[1].shape:
