@@ -6,6 +6,7 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._ensemble_states import LAST_EVENT, summary_kernel
 from pymc_statespace_filters.filters._failures import OUT_OF_MEMORY
 from pymc_statespace_filters.filters._noise import STORE_NORMALS, NoiseSizes, n_stored
 from pymc_statespace_filters.filters._random import padded
@@ -85,21 +86,30 @@ class EnsembleFilter:
 
     def kernel(self, machine: Machine) -> Any:
         """Bind the filter's entry to the functions of one system."""
-        filter = self.algorithm(machine)
+        evaluate = self.algorithm(machine).watched(machine)
+
+        @compiled
+        def run(theta, steps, observed, inputs, t0, noise):
+            return evaluate(theta, steps, observed, inputs, t0, noise, (0, 0, 0))
+
+        return run
+
+    def watched(self, machine: Machine) -> Any:
+        """The same function with the addresses of a witness and its two vectors: `_witness`."""
         functions = machine_entries(machine)
-        for entry in (filter.entry, *(f for f in functions if f is not None)):
+        for entry in (self.entry, *(f for f in functions if f is not None)):
             entry.compile()
-        evaluate = filter.entry.external
+        evaluate = self.entry.external
         prepare, initialise, propagate, log_density = (f.symbol for f in functions[:4])
         observe = functions.observe.symbol if functions.observe is not None else ""
         free, dt = machine.free, machine.dt
         shape = (machine.n, machine.p, machine.n_inputs, machine.n_constants, free.size)
         constants = np.array([*shape, *[0] * (N_TABLE - len(shape)), *free], dtype=np.int64)
-        sizes = filter.noise_sizes(machine)
-        settings = np.array([filter.size(), *sizes, *filter.settings()], dtype=np.float64)
+        sizes = self.noise_sizes(machine)
+        settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
 
         @compiled
-        def run(theta, steps, observed, inputs, t0, noise):
+        def run(theta, steps, observed, inputs, t0, noise, watch):
             seed, normals = noise
             n_steps = steps[-1] if steps.size else np.int64(0)
             if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
@@ -114,12 +124,25 @@ class EnsembleFilter:
                 table.ctypes.data, dt, settings.ctypes.data, theta.ctypes.data, theta.size,
                 steps.ctypes.data, steps.size, observed.ctypes.data,
                 inputs.ctypes.data, inputs.shape[0], t0,
-                seed, normals.ctypes.data, normals.size, terms.ctypes.data, health.ctypes.data,
+                seed, normals.ctypes.data, normals.size, *watch,
+                terms.ctypes.data, health.ctypes.data,
             )  # fmt: skip
             _keep(table, normals)
             return terms, health
 
         return run
+
+    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
+
+        See `filters`, the room, for what it returns.
+        """
+        machine = ensemble_machine(system)
+        watched = self.algorithm(machine).watched(machine)
+        return Compiled(
+            summary_kernel(watched, system.n, self.size(), LAST_EVENT[moment]),
+            key_of(f"{moment} states {self!r}", machine.key),
+        )
 
     def stored_noise(self, system: StateSpaceModel) -> Compiled:
         """The function (steps, seed) -> the normals that an evaluation with this seed uses."""

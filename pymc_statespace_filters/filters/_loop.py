@@ -1,10 +1,13 @@
 """The loop of every ensemble filter: predict up to an observation, update, note the increment."""
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numba import carray, types
 
+from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._failures import NONE
 from pymc_statespace_filters.filters._missing import is_missing
 from pymc_statespace_filters.filters._noise import (
@@ -12,9 +15,12 @@ from pymc_statespace_filters.filters._noise import (
     initial_normals,
     noise_of,
     process_normals,
+    resampling_normals,
 )
 from pymc_statespace_filters.filters._random import FILL_NORMALS
+from pymc_statespace_filters.filters._resampling import resample_if_few, resampler
 from pymc_statespace_filters.filters._system import initialise, propagate, read_system
+from pymc_statespace_filters.filters._witness import FORECAST, RESAMPLED, UPDATED, tell
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, digest
 
 _ARGUMENTS = (
@@ -25,28 +31,88 @@ _ARGUMENTS = (
     NUMBERS, types.intp,  # rows of inputs
     types.float64,  # t0
     types.int64, NUMBERS, types.intp,  # seed, stored normals
+    types.intp, types.intp, types.intp,  # who watches, see `_witness`, and its two vectors
     NUMBERS, NUMBERS,  # terms, health
 )  # fmt: skip
 
 _N_LEADING = 6  # number of members and five of `NoiseSizes`
 
 
-def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: int) -> Entry:
+class Members(NamedTuple):
+    """The members of a filter, as columns, and what every update needs of them.
+
+    ``w`` and ``log_w`` are the normalised weights, of which ``log_w`` lasts from one observation to
+    the next. ``D`` (p, N), ``X_f`` (n, N), ``log_p`` and ``alive`` are an update's own: simulated
+    observations, the forecast that it started from, log p(d | x), and who is finite.
+    """
+
+    X: np.ndarray
+    D: np.ndarray
+    X_f: np.ndarray
+    w: np.ndarray
+    log_w: np.ndarray
+    log_p: np.ndarray
+    alive: np.ndarray
+
+
+@pasted
+def _members(n, p, N):
+    log_w = np.empty(N)
+    for i in range(N):
+        log_w[i] = -math.log(N)
+    return Members(
+        np.empty((n, N)), np.empty((p, N)), np.empty((n, N)),
+        np.empty(N), log_w, np.empty(N), np.empty(N, np.bool_),
+    )  # fmt: skip
+
+
+@pasted
+def _resampler(settings, n, N):
+    return resampler(settings[0], np.int64(settings[1]), n, N)
+
+
+@pasted
+def _resample(resampling, noise, j, k, n_effective, members):
+    z = resampling_normals(noise, j, k)
+    return resample_if_few(
+        resampling, n_effective, z, members.log_w, members.w, members.X, members.X_f
+    )
+
+
+class _NoResampling(NamedTuple):
+    ancestors: np.ndarray
+
+
+@pasted
+def _no_resampler(settings, n, N):
+    return _NoResampling(np.empty(0, np.int64))
+
+
+@pasted
+def _keep_all(resampling, noise, j, k, n_effective, members):
+    return False
+
+
+def filter_entry(
+    name: str, workspace: Callable, update: Callable, n_settings: int, *, resamples: bool
+) -> Entry:
     """A filter as one function for all systems and numbers of members.
 
     Parameters
     ----------
     name : str
     workspace : njit function ``(system, n_members, width, settings) -> tuple``
-        ``width`` is the number of members padded to whole blocks.
-        Allocates what ``update`` needs and keeps what lasts from one observation to the next
-        (weights), once an evaluation; the filter's settings go with it.
+        Allocates, once an evaluation, what ``update`` needs beside the members; the filter's
+        settings go with it. ``width`` is the number of members padded to whole blocks.
     update : njit function
-        ``(system, j, k, t, d, noise, X, work) -> (increment, n_effective, failure)``. Replaces the
-        forecast members X (n, N) by the analysis of observation j at step k and returns
-        log p(d_j | d_1 .. d_{j-1}).
+        ``(system, j, k, t, d, noise, members, work) -> (increment, n_effective, failure)``.
+        Replaces the forecast members by the analysis of observation j at step k, with normalised
+        weights, and returns log p(d_j | d_1 .. d_{j-1}).
     n_settings : int
         How many settings, as numbers, the filter has besides the number of members.
+    resamples : bool
+        Whether members are resampled after an update; the first two settings are then the
+        threshold and the number of the scheme.
 
     Returns
     -------
@@ -55,10 +121,12 @@ def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: i
         failing observation on; and ``health`` (3,): smallest effective number of particles,
         failure code, index of the failing observation or -1.
     """
+    make_resampler = _resampler if resamples else _no_resampler
+    resample = _resample if resamples else _keep_all
 
     def run(
         table, dt, settings, theta, n_theta, steps, n_observations, observed, inputs,
-        n_rows, t0, seed, normals, n_normals, terms, health,
+        n_rows, t0, seed, normals, n_normals, witness, counts, numbers, terms, health,
     ):  # fmt: skip
         given = carray(settings, (_N_LEADING + n_settings,))
         n_members, width = int(given[0]), int(given[1])
@@ -69,25 +137,33 @@ def filter_entry(name: str, workspace: Callable, update: Callable, n_settings: i
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
         n_steps = at[n_observations - 1] if n_observations else np.int64(0)
         noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps)
-        work = workspace(system, n_members, width, given[_N_LEADING:])
-        X = np.empty((system.n, n_members))
+        own = given[_N_LEADING:]
+        work = workspace(system, n_members, width, own)
+        resampling = make_resampler(own, system.n, n_members)
+        members = _members(system.n, system.p, n_members)
+        watched = (witness, counts, numbers)
         state[0], state[1], state[2] = n_members, NONE, -1
-        initialise(system, initial_normals(noise), sizes.width, X)
+        initialise(system, initial_normals(noise), sizes.width, members.X)
         k = np.int64(0)
+        tell(watched, FORECAST, -1, k, members, resampling.ancestors)
         for j in range(n_observations):
             while k < at[j]:
-                propagate(system, k, t0 + k * dt, process_normals(noise, k), sizes.width, X)
+                propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
                 k += 1
+                tell(watched, FORECAST, j, k, members, resampling.ancestors)
             if is_missing(record, j):
                 out[j] = 0.0
                 continue
             increment, n_effective, failure = update(
-                system, j, k, t0 + k * dt, record[j], noise, X, work
+                system, j, k, t0 + k * dt, record[j], noise, members, work
             )
             state[0] = min(state[0], n_effective)
             if failure != NONE:
                 state[1], state[2] = failure, j
                 break
             out[j] = increment
+            tell(watched, UPDATED, j, k, members, resampling.ancestors)
+            if resample(resampling, noise, j, k, n_effective, members):
+                tell(watched, RESAMPLED, j, k, members, resampling.ancestors)
 
     return Entry(run, _ARGUMENTS, name, digest(name), needs=(FILL_NORMALS,))

@@ -106,6 +106,15 @@ def fill_normals(seed, purpose, step, Z):
 
 
 @pasted
+def uniform_at(seed, purpose, step, component):
+    """A uniform number in (0, 1) of its own."""
+    k0, k1 = key_words(seed)
+    zero = np.uint64(0)
+    w0, w1, _, _ = philox(zero, np.uint64(component), np.uint64(step), purpose, k0, k1)
+    return open_unit(w0, w1)
+
+
+@pasted
 def exponential(z0, z1):
     """A standard exponential from two independent standard normals."""
     return 0.5 * (z0 * z0 + z1 * z1)

@@ -83,10 +83,11 @@ def resampler(fraction, scheme, n_states, n_particles):
 def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
     """Draw new particles of equal weight if the effective number is below the threshold.
 
-    ``z`` are the normals that a resampling takes; ``buffer`` is of the size of X.
+    ``z`` are the normals that a resampling takes; ``buffer`` is of the size of X. Returns whether
+    it was done; ``ancestors`` tell then who became whom.
     """
     if not (resampling.always or n_effective < resampling.threshold):
-        return
+        return False
     points, ancestors, N = resampling.points, resampling.ancestors, w.size
     if resampling.multinomial:
         multinomial(z, points)
@@ -100,6 +101,7 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
     copy_ancestors(ancestors, X, buffer)
     for i in range(N):
         log_w[i] = -math.log(N)
+    return True
 
 
 def smooth_resampling(filter: Any, n_states: int) -> Any:

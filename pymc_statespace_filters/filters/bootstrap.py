@@ -1,6 +1,5 @@
 """Bootstrap particle filter (thesis, section 4.4, Eqs. 4.27-4.28, 4.43-4.44): the unbiased one."""
 
-import math
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
@@ -12,13 +11,10 @@ from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._ensemble import mark_finite
 from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters._loop import filter_entry
-from pymc_statespace_filters.filters._noise import resampling_normals
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
     check_sortable,
     n_normals,
-    resample_if_few,
-    resampler,
     smooth_resampling,
 )
 from pymc_statespace_filters.filters._system import log_density
@@ -29,21 +25,12 @@ from pymc_statespace_filters.model import StateSpaceModel
 
 @pasted
 def _workspace(system, n_members, width, settings):
-    N = n_members
-    w, log_w, log_p = np.empty(N), np.empty(N), np.empty(N)
-    for i in range(N):
-        log_w[i] = -math.log(N)
-    alive = np.empty(N, np.bool_)
-    return (
-        (w, log_w, log_p, alive),
-        resampler(settings[0], np.int64(settings[1]), system.n, N),
-        np.empty((system.n, N)),
-    )
+    return ()
 
 
 @pasted
-def _update(system, j, k, t, d, noise, X, work):
-    (w, log_w, log_p, alive), resampling, buffer = work
+def _update(system, j, k, t, d, noise, members, work):
+    X, _, _, w, log_w, log_p, alive = members
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
     if mark_finite(X, X, alive) == 0:
@@ -54,9 +41,7 @@ def _update(system, j, k, t, d, noise, X, work):
     increment = normalise(log_w, w)
     if increment == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
-    n_effective = effective_number(w)  # Eq. 4.43
-    resample_if_few(resampling, n_effective, resampling_normals(noise, j, k), log_w, w, X, buffer)
-    return increment, n_effective, NONE
+    return increment, effective_number(w), NONE  # Eq. 4.43
 
 
 @dataclass(frozen=True)
@@ -100,7 +85,9 @@ class BootstrapPF(EnsembleFilter):
     resampling: str = "systematic"
 
     unbiased: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry("bootstrap_pf", _workspace, _update, n_settings=2)
+    entry: ClassVar[Entry] = filter_entry(
+        "bootstrap_pf", _workspace, _update, n_settings=2, resamples=True
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_particles", check_count("n_particles", self.n_particles))

@@ -58,16 +58,15 @@ def _gaussian_fit(d, moments, residual, n_alive):
 
 @pasted
 def _workspace(system, n_members, width, settings):
-    n, p, N = system.n, system.p, n_members
-    D, alive = np.empty((p, N)), np.empty(N, np.bool_)
-    weights = (np.empty(N), np.empty(N), np.empty(N))
+    n, p = system.n, system.p
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    return settings[0] == _ENSEMBLE, D, alive, weights, moments, np.empty(p)
+    return settings[0] == _ENSEMBLE, np.empty(n_members), moments, np.empty(p)
 
 
 @pasted
-def _update(system, j, k, t, d, noise, X, work):
-    of_ensemble, D, alive, (w, log_w, log_p), moments, residual = work
+def _update(system, j, k, t, d, noise, members, work):
+    X, D, _, w, _, log_p, alive = members
+    of_ensemble, log_share, moments, residual = work
 
     # Simulated observations
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.15
@@ -85,8 +84,8 @@ def _update(system, j, k, t, d, noise, X, work):
         log_density(system, k, t, d, X, log_p)
         log_N = math.log(alive.size)
         for i in range(alive.size):
-            log_w[i] = -log_N if alive[i] else -np.inf
-        increment, n_effective = _ensemble_mean(log_w, log_p, w)  # Eq. 4.26
+            log_share[i] = -log_N if alive[i] else -np.inf
+        increment, n_effective = _ensemble_mean(log_share, log_p, w)  # Eq. 4.26
     else:
         increment, n_effective = _gaussian_fit(d, moments, residual, n_alive)
     if not np.isfinite(increment):
@@ -136,7 +135,9 @@ class EnKF(EnsembleFilter):
 
     needs_simulated_observations: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry("enkf", _workspace, _update, n_settings=1)
+    entry: ClassVar[Entry] = filter_entry(
+        "enkf", _workspace, _update, n_settings=1, resamples=False
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_members", check_count("n_members", self.n_members))

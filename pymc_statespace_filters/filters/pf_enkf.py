@@ -26,13 +26,11 @@ from pymc_statespace_filters.filters._kernel_density import (
     scott_bandwidth,
 )
 from pymc_statespace_filters.filters._loop import filter_entry
-from pymc_statespace_filters.filters._noise import observation_normals, resampling_normals
+from pymc_statespace_filters.filters._noise import observation_normals
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
     check_sortable,
     n_normals,
-    resample_if_few,
-    resampler,
     smooth_resampling,
 )
 from pymc_statespace_filters.filters._system import log_density, observe
@@ -49,15 +47,6 @@ _LIKELIHOODS = ("predictive", "weights", "as_printed")
 _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 
-class _Weights(NamedTuple):
-    """Of every particle: weight, its log, log p(d | x), and whether the particle is finite."""
-
-    w: np.ndarray
-    log_w: np.ndarray
-    log_p: np.ndarray
-    alive: np.ndarray
-
-
 class _Scratch(NamedTuple):
     """Of one update: moments of the forecast, and what the densities of Eq. 4.36 need."""
 
@@ -71,28 +60,16 @@ class _Scratch(NamedTuple):
 @pasted
 def _workspace(system, n_members, width, settings):
     n, p, N, n_free = system.n, system.p, n_members, system.free.size
-    likelihood = np.int64(settings[2])
-    D, X_f = np.empty((p, N)), np.empty((n, N))
-    weights = _Weights(np.empty(N), np.empty(N), np.empty(N), np.empty(N, np.bool_))
-    for i in range(N):
-        weights.log_w[i] = -math.log(N)
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
     density = density_workspace(n_free, width)
     scratch = _Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
-    return (
-        likelihood,
-        D,
-        X_f,
-        weights,
-        scratch,
-        resampler(settings[0], np.int64(settings[1]), system.n, N),
-    )
+    return np.int64(settings[2]), scratch
 
 
 @pasted
-def _update(system, j, k, t, d, noise, X, work):
-    likelihood, D, X_f, weights, scratch, resampling = work
-    w, log_w, log_p, alive = weights
+def _update(system, j, k, t, d, noise, members, work):
+    X, D, X_f, w, log_w, log_p, alive = members
+    likelihood, scratch = work
 
     # Simulated observations and previous weights, of the particles that are alive
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.29
@@ -109,7 +86,7 @@ def _update(system, j, k, t, d, noise, X, work):
     log_forecast = log_alive + log_sum(log_w, log_p)
     copy_members(X, X_f)
     as_printed = likelihood == _AS_PRINTED
-    if not _move(system, k, t, d, D, X_f, X, weights, scratch, as_printed):  # Eqs. 4.30-4.36
+    if not _move(system, k, t, d, members, scratch, as_printed):  # Eqs. 4.30-4.36
         copy_members(X_f, X)
         log_density(system, k, t, d, X, log_p)
         for i in range(w.size):
@@ -123,19 +100,17 @@ def _update(system, j, k, t, d, noise, X, work):
         increment = log_sum(log_w, log_p)  # Eq. 4.42 to the letter
     if not (np.isfinite(increment) and np.isfinite(log_total)):
         return -np.inf, 0.0, ZERO_WEIGHTS
-    n_effective = effective_number(w)  # Eq. 4.43
-    resample_if_few(resampling, n_effective, resampling_normals(noise, j, k), log_w, w, X, X_f)
-    return increment, n_effective, NONE
+    return increment, effective_number(w), NONE  # Eq. 4.43
 
 
 @pasted
-def _move(system, k, t, d, D, X_f, X, weights, scratch, keeps_previous):
+def _move(system, k, t, d, members, scratch, keeps_previous):
     """Nudge X; leave the unnormalised weights in log_w and p(d | x^a) in log_p.
 
     ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if no
     proposal can be built.
     """
-    w, log_w, log_p, alive = weights
+    X, D, X_f, w, log_w, log_p, alive = members
     moments, w_equal, log_prior, log_proposal, density = scratch
     free, n, n_free = system.free, system.n, system.free.size
     P, x_mean = np.empty((n, n)), np.empty(n)
@@ -234,7 +209,9 @@ class PFEnKF(EnsembleFilter):
     likelihood: str = "predictive"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry("pf_enkf", _workspace, _update, n_settings=3)
+    entry: ClassVar[Entry] = filter_entry(
+        "pf_enkf", _workspace, _update, n_settings=3, resamples=True
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_particles", check_count("n_particles", self.n_particles))

@@ -11,6 +11,7 @@ from pymc_statespace_filters.machine_code.entries import (
 )
 from pymc_statespace_filters.machine_code.functions import Call, NativeFunction, make_call
 from pymc_statespace_filters.machine_code.keys import FAST_MATH, digest, key_of
+from pymc_statespace_filters.machine_code.many_calls import ManyCalls
 
 __all__ = [
     "COUNTS",
@@ -18,6 +19,7 @@ __all__ = [
     "NUMBERS",
     "Call",
     "Entry",
+    "ManyCalls",
     "NativeFunction",
     "address_of",
     "available_cores",

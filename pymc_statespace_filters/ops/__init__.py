@@ -10,6 +10,7 @@ from pymc_statespace_filters.ops.record import (
     check_record,
     evaluator,
 )
+from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.ops.stored_noise import LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapeReversal
 
@@ -20,6 +21,7 @@ __all__ = [
     "LogLikelihoodGradient",
     "LogLikelihoodOfNoise",
     "RecordOp",
+    "States",
     "StoredNoise",
     "TapeReversal",
     "TapedLogLikelihood",

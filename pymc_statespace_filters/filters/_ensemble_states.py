@@ -1,0 +1,128 @@
+"""States of an ensemble filter: moments and a draw of the weighted members, as they pass by."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import carray
+
+from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._failures import NONE
+from pymc_statespace_filters.filters._random import STATES, uniform_at
+from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.filters._witness import (
+    FORECAST,
+    RESAMPLED,
+    UPDATED,
+    WITNESS_ARGUMENTS,
+)
+from pymc_statespace_filters.machine_code import Entry, address_of, digest
+
+LAST_EVENT = {"predicted": int(FORECAST), "filtered": int(UPDATED)}
+"""The last event at a step that a moment knows of."""
+
+# The witness's whole numbers: states, members, rows, last event, seed of the draws, next row; then
+# the steps of the rows. Its real ones: mean, sd, draw, each (rows, n), and effective number (rows).
+_N_COUNTS = 6
+_NEXT = 5
+
+
+def _summarise(counts, numbers, event, j, k, members, log_weights, simulated, ancestors):
+    of = carray(counts, (_N_COUNTS,))
+    n, N, n_rows = of[0], of[1], of[2]
+    if event == RESAMPLED or event > of[3]:  # members before resampling say the same, more exactly
+        return
+    rows = carray(counts, (_N_COUNTS + n_rows,))[_N_COUNTS:]
+    while of[_NEXT] < n_rows and rows[of[_NEXT]] < k:
+        of[_NEXT] += 1
+    row = of[_NEXT]
+    if row == n_rows or rows[row] != k:
+        return
+    X = carray(members, (n, N))
+    log_w, w = carray(log_weights, (N,)).copy(), np.empty(N)
+    for i in range(N):
+        for a in range(n):
+            if not np.isfinite(X[a, i]):
+                log_w[i] = -np.inf
+    if normalise(log_w, w) == -np.inf:
+        return
+    out = carray(numbers, (3, n_rows, n))
+    u = uniform_at(of[4], STATES, k, 0)
+    _moments(w, X, out[0, row], out[1, row])
+    chosen = choose(w, u)
+    for a in range(n):
+        out[2, row, a] = X[a, chosen]
+    carray(numbers, ((3 * n + 1) * n_rows,))[3 * n * n_rows + row] = effective_number(w)
+
+
+@compiled
+def _moments(w, X, mean, sd):
+    """Weighted mean and deviation of each row, the variance over 1 - sum w^2."""
+    spread = 1.0 - 1.0 / effective_number(w)
+    for a in range(X.shape[0]):
+        mean[a] = 0.0
+        for i in range(w.size):
+            if w[i] > 0.0:
+                mean[a] += w[i] * X[a, i]
+        variance = 0.0
+        for i in range(w.size):
+            if w[i] > 0.0:
+                variance += w[i] * (X[a, i] - mean[a]) ** 2
+        sd[a] = math.sqrt(variance / spread) if spread > 0.0 else 0.0
+
+
+@compiled
+def choose(w, u):
+    """The member in whose share of the whole weight a number of (0, 1) falls."""
+    chosen, cumulative = 0, 0.0
+    for i in range(w.size):
+        if w[i] > 0.0:
+            chosen = i
+            cumulative += w[i]
+            if u < cumulative:
+                break
+    return chosen
+
+
+SUMMARISE = Entry(_summarise, WITNESS_ARGUMENTS, "summarise", digest("summarise"))
+
+
+def summary_kernel(evaluate: Any, n: int, n_members: int, last_event: int) -> Any:
+    """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
+
+    Parameters
+    ----------
+    evaluate : njit function
+        Of a filter and a system, see `EnsembleFilter.watched`.
+    n, n_members : int
+        Numbers of states and members.
+    last_event : int
+        See `LAST_EVENT`.
+    """
+    SUMMARISE.compile()
+    witness = SUMMARISE.symbol
+
+    @compiled
+    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+        R = rows.size
+        counts, numbers = np.empty(_N_COUNTS + R, np.int64), np.full((3 * n + 1) * R, np.nan)
+        counts[0], counts[1], counts[2] = n, n_members, R
+        counts[3], counts[4], counts[_NEXT] = last_event, draw_seed, 0
+        counts[_N_COUNTS:] = rows
+        watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
+        _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
+        moments = numbers[: 3 * n * R].reshape(3, R, n)
+        n_effective = numbers[3 * n * R :].copy()
+        _keep(counts)
+        if health[1] != NONE:
+            for row in range(R):
+                if rows[row] >= steps[int(health[2])]:
+                    moments[:, row], n_effective[row] = np.nan, np.nan
+        return moments[0].copy(), moments[1].copy(), moments[2].copy(), n_effective, health
+
+    return run
+
+
+@compiled
+def _keep(counts):
+    """Be the last reader of an array whose address was handed on."""

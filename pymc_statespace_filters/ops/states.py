@@ -1,0 +1,34 @@
+"""States along a record, by a filter: an operation without a derivative."""
+
+from typing import ClassVar
+
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.ops.record import RECORD_INPUTS, RecordOp
+
+
+class States(RecordOp):
+    """Mean, sd and a draw (R, n) of the state at ``rows``, n_effective (R,), and health (3,).
+
+    ``moment`` is "predicted" (observations at earlier steps than the row's are known), "filtered"
+    (those up to its own) or "smoothed" (all). ``draw_seed`` is the noise of the draw alone.
+    """
+
+    __props__: ClassVar[tuple[str, ...]] = ("system", "filter", "moment")
+    input_types = (*RECORD_INPUTS, ("rows", "int64", 1), ("draw_seed", "int64", 0))
+
+    def __init__(self, system: StateSpaceModel, filter: Filter, moment: str) -> None:
+        super().__init__(system, filter)
+        self.moment = moment
+
+    def compile(self) -> Compiled:
+        """The filter's machine code."""
+        return self.filter.compile_states(self.system, self.moment)
+
+    def results(self) -> list[Variable]:
+        """Three matrices and two vectors."""
+        return [pt.dmatrix(), pt.dmatrix(), pt.dmatrix(), pt.dvector(), pt.dvector()]
