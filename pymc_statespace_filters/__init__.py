@@ -38,6 +38,7 @@ from pymc_statespace_filters.plots import (
 from pymc_statespace_filters.records import nearest_steps
 from pymc_statespace_filters.sampling import DRAM, sample_dram, suggest_particles
 from pymc_statespace_filters.simulation import simulate
+from pymc_statespace_filters.states import filtered_states, forecast, smoothed_states
 
 __all__ = [
     "DRAM",
@@ -64,6 +65,8 @@ __all__ = [
     "compare_evidence",
     "cubic",
     "estimate_evidence",
+    "filtered_states",
+    "forecast",
     "freeplay",
     "hysteresis",
     "log_likelihood",
@@ -79,5 +82,6 @@ __all__ = [
     "prior_sensitivity",
     "sample_dram",
     "simulate",
+    "smoothed_states",
     "suggest_particles",
 ]

@@ -34,11 +34,13 @@ __all__ = [
     "resized",
     "smooth_filters",
     "state_space_names",
+    "state_space_nodes",
     "with_filter",
 ]
 
 
-def _state_space_nodes(model: pm.Model) -> dict[str, Any]:
+def state_space_nodes(model: pm.Model) -> dict[str, Any]:
+    """The application behind every StateSpace variable; parameters are its last five inputs."""
     return {
         rv.name: rv.owner
         for rv in model.basic_RVs
@@ -60,13 +62,13 @@ def log_density_terms(model: pm.Model) -> list[tuple[str, TensorVariable]]:
 
 def state_space_names(model: pm.Model) -> list[str]:
     """The names of the StateSpace variables."""
-    return list(_state_space_nodes(model))
+    return list(state_space_nodes(model))
 
 
 def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
     """The shared noise seed of every variable whose likelihood is a random estimate."""
     seeds = {}
-    for name, node in _state_space_nodes(model).items():
+    for name, node in state_space_nodes(model).items():
         if not node.op.filter.noisy:
             continue
         seed = node.inputs[-1]
@@ -81,7 +83,7 @@ def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
 
 def noisy_filters(model: pm.Model) -> dict[str, Filter]:
     """The filter of every variable whose likelihood is a random estimate."""
-    filters = {name: node.op.filter for name, node in _state_space_nodes(model).items()}
+    filters = {name: node.op.filter for name, node in state_space_nodes(model).items()}
     return {name: filter for name, filter in filters.items() if filter.noisy}
 
 
@@ -197,7 +199,7 @@ def with_filter(
         If a name is not that of a StateSpace variable, its likelihood is not in the graphs, or the
         filter cannot treat its system.
     """
-    variables = _state_space_nodes(model)
+    variables = state_space_nodes(model)
     for name, filter in filters.items():
         if name not in variables:
             raise ModelError(f"{name!r} is not a StateSpace variable: expected {list(variables)}")
@@ -233,12 +235,12 @@ def _is_same(a: Variable, b: Variable) -> bool:
 
 def smooth_filters(model: pm.Model) -> dict[str, Filter]:
     """Every noisy variable's filter in the version that `move_noise` puts in its place."""
-    nodes = _state_space_nodes(model)
+    nodes = state_space_nodes(model)
     ops = {name: nodes[name].op for name in noisy_filters(model)}
     return {name: op.filter.smooth(op.system) for name, op in ops.items()}
 
 
 def exactness(model: pm.Model) -> bool:
     """Whether sampling the model targets its posterior itself, without the bias of a filter."""
-    ops = [node.op for node in _state_space_nodes(model).values()]
+    ops = [node.op for node in state_space_nodes(model).values()]
     return all(op.filter.is_exact_for(op.system) for op in ops)

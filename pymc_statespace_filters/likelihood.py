@@ -125,7 +125,7 @@ def _evaluate(
     return terms, health
 
 
-def warn_of(filter: Filter, health: np.ndarray) -> None:
+def warn_of(filter: Filter, health: np.ndarray, *, stacklevel: int = 3) -> None:
     """One warning for what went wrong in some evaluations, given their health (n, 3)."""
     failed = health[:, 1] != 0
     if failed.any():
@@ -134,7 +134,7 @@ def warn_of(filter: Filter, health: np.ndarray) -> None:
         warnings.warn(
             f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
             FilterWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
     collapsed = ~failed & (health[:, 0] < COLLAPSED)
     if collapsed.any():
@@ -146,7 +146,7 @@ def warn_of(filter: Filter, health: np.ndarray) -> None:
             f"EKF() and EnKF(n, likelihood='gaussian') do not collapse, but have a bias of their "
             f"own where the state is not Gaussian.",
             FilterWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
 
 

@@ -159,6 +159,17 @@ def check_seed(name: str, seed: Any) -> np.ndarray:
     return array.astype("int64")
 
 
+def check_random_seed(random_seed: Any) -> np.random.Generator:
+    """The generator of a seed that a user gave."""
+    try:
+        return np.random.default_rng(random_seed)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"random_seed must be None, an integer that is not negative or a "
+            f"numpy.random.Generator, got {random_seed!r}"
+        ) from None
+
+
 def check_t0(t0: Any) -> float:
     """A finite time of step 0."""
     number = isinstance(t0, int | float | np.number) and not isinstance(t0, bool)

@@ -12,20 +12,75 @@ from pymc_statespace_filters.lowering import Compiled, ensemble_machine, jit, ob
 from pymc_statespace_filters.machine_code import key_of
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.parameters import flat_parameters
-from pymc_statespace_filters.records import check_inputs, check_system, check_t0, steps_of
+from pymc_statespace_filters.records import (
+    check_inputs,
+    check_random_seed,
+    check_system,
+    check_t0,
+    steps_of,
+)
 
 
 @lru_cache(maxsize=256)
-def simulator(system: StateSpaceModel) -> Compiled:
-    """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
+def continuation(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, x, first, steps, inputs, t0) -> states (R, n), observations (R, p).
+
+    It goes on from the state x (n,) of step ``first`` and keeps what it meets at ``steps``, which
+    increase from there on.
+    """
+    machine, sampler = ensemble_machine(system), _sampler(system)
+    prepare, propagate, observe = machine.prepare, machine.propagate, sampler.function
+    dt, n, m, p = system.dt, system.n, machine.m, system.p
+
+    def go_on(rng, theta, x, first, steps, inputs, t0):
+        c = prepare(theta)
+        states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
+        now, k = x.copy().reshape(n, 1), first
+        for j in range(steps.size):
+            while k < steps[j]:
+                propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), now)
+                k += 1
+            states[j] = now[:, 0]
+            observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
+        return states, observations
+
+    return Compiled(jit(go_on), key_of("go on", machine.key, sampler.key))
+
+
+@lru_cache(maxsize=256)
+def observer(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, states, steps, inputs, t0) -> an observation (R, p) of each state.
+
+    ``states`` (R, n) are those at ``steps`` (R,).
+    """
+    machine, sampler = ensemble_machine(system), _sampler(system)
+    prepare, observe, dt, p = machine.prepare, sampler.function, system.dt, system.p
+
+    def look(rng, theta, states, steps, inputs, t0):
+        c, observations = prepare(theta), np.empty((steps.size, p))
+        for i in range(steps.size):
+            x, k = states[i].copy().reshape(-1, 1), steps[i]
+            observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
+        return observations
+
+    return Compiled(jit(look), key_of("look", machine.key, sampler.key))
+
+
+def _sampler(system: StateSpaceModel) -> Compiled:
     if system.equations.observation is None and system.equations.observation_draw is None:
         raise ModelError(
             "the system has a density of observations (observation_logp) but nothing to draw "
             "them from; simulating needs `observation` with `observation_noise` too"
         )
+    return observation_sampler(system)
+
+
+@lru_cache(maxsize=256)
+def simulator(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
     machine = ensemble_machine(system)
     prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
-    sampler = observation_sampler(system)
+    sampler = _sampler(system)
     observe, dt, n, m, p = sampler.function, system.dt, system.n, machine.m, system.p
 
     def simulate(rng, theta, steps, inputs, t0):
@@ -102,13 +157,7 @@ def simulate(
         raise ModelError(
             f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}"
         )
-    try:
-        rng = np.random.default_rng(random_seed)
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"random_seed must be None, an integer that is not negative or a "
-            f"numpy.random.Generator, got {random_seed!r}"
-        ) from None
+    rng = check_random_seed(random_seed)
     states, observations = simulator(system).function(rng, theta, at, forces, t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(

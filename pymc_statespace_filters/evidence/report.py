@@ -18,14 +18,13 @@ from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
 from pymc_statespace_filters.evidence.posterior import (
     ModelDensity,
     Posterior,
-    noise_was_moved,
-    posterior_group,
     posterior_of,
 )
 from pymc_statespace_filters.evidence.posterior.data import data_fingerprint, observation_count
 from pymc_statespace_filters.evidence.posterior.support import Support
-from pymc_statespace_filters.evidence.progress import watched
 from pymc_statespace_filters.evidence.result import Evidence, store_evidence
+from pymc_statespace_filters.progress import watched
+from pymc_statespace_filters.stored_draws import noise_was_moved, posterior_group
 
 MAXIMUM = "maximum likelihood"
 

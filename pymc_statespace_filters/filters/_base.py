@@ -144,6 +144,10 @@ class EnsembleFilter:
             key_of(f"{moment} states {self!r}", machine.key),
         )
 
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """Name the method of the smoothed states."""
+        raise NotImplementedError
+
     def stored_noise(self, system: StateSpaceModel) -> Compiled:
         """The function (steps, seed) -> the normals that an evaluation with this seed uses."""
         return self.stored_normals(ensemble_machine(system))

@@ -13,8 +13,8 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence.posterior import density as module
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.machine_code import many_calls
 from tests.sampling.autoregression import autoregression
 
 DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])
@@ -61,7 +61,7 @@ def test_each_point_has_its_own_seeds(noisy, points):
 @pytest.mark.parametrize("n_threads", [1, 2, 5, 40])
 def test_threads_do_not_matter(noisy, points, n_threads, monkeypatch):
     expected = noisy.evaluate(*points)
-    monkeypatch.setattr(module, "available_cores", lambda: n_threads)
+    monkeypatch.setattr(many_calls, "available_cores", lambda: n_threads)
     np.testing.assert_array_equal(noisy.evaluate(*points), expected)
 
 

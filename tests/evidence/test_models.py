@@ -9,8 +9,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal, norm
 
+from pymc_statespace_filters import progress
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov, progress
+from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
 from tests.evidence.analytic import Regression, autoregressive
 
 RNG = np.random.default_rng(20)

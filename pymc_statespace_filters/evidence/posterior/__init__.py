@@ -4,8 +4,6 @@ from pymc_statespace_filters.evidence.posterior.density import ModelDensity, Row
 from pymc_statespace_filters.evidence.posterior.draws import (
     Posterior,
     Prior,
-    noise_was_moved,
-    posterior_group,
     posterior_of,
     unconstrained_draws,
 )
@@ -15,8 +13,6 @@ __all__ = [
     "Posterior",
     "Prior",
     "RowFunction",
-    "noise_was_moved",
-    "posterior_group",
     "posterior_of",
     "unconstrained_draws",
 ]

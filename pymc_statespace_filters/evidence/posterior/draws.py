@@ -17,6 +17,7 @@ from pymc.model.transform_values import unconstrain_values
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
+from pymc_statespace_filters.stored_draws import posterior_group
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats
@@ -73,35 +74,6 @@ class Posterior:
         """Every so manieth draw of each chain, that there are about `most` in all, or fewer."""
         step = -(-self.log_density.size // most)
         return replace(self, draws=self.draws[:, ::step], log_density=self.log_density[:, ::step])
-
-
-def posterior_group(idata: xr.DataTree) -> xr.Dataset:
-    """The draws, every variable with the dimensions chain and draw.
-
-    Raises
-    ------
-    ModelError
-        If `idata` is no DataTree, or has no such group.
-    """
-    if not isinstance(idata, xr.DataTree):
-        raise ModelError(
-            "idata must be a DataTree of posterior draws, as pm.sample and sample_dram return it, "
-            f"got {type(idata).__name__}"
-        )
-    if "posterior" not in idata.children:
-        raise ModelError(f"idata must have a group 'posterior', it has {sorted(idata.children)}")
-    posterior = idata["posterior"].to_dataset()
-    if not {"chain", "draw"} <= set(posterior.dims):
-        raise ModelError(
-            "the posterior of idata must have the dimensions chain and draw, it has "
-            f"{sorted(map(str, posterior.dims))}: select one chain as isel(chain=[0])"
-        )
-    return posterior
-
-
-def noise_was_moved(idata: xr.DataTree) -> bool:
-    """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
-    return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
 
 
 def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> Array:

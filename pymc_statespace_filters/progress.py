@@ -1,12 +1,11 @@
-"""A progress bar for evaluations of a log-density, whoever asks for them."""
+"""A progress bar for work that is done in threads, row by row."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
+from typing import Protocol
 
 from pymc.progress_bar import create_simple_progress
-
-from pymc_statespace_filters.evidence.posterior import ModelDensity
 
 PATIENCE = 2.0  # seconds without a progress bar
 
@@ -21,7 +20,7 @@ class _Bar:
         self.announce("", 0)
 
     def announce(self, task: str, total: int) -> None:
-        """Name what is evaluated next, and about how many evaluations that takes."""
+        """Name what is evaluated next, and about how many rows that takes."""
         if self._shown is not None:  # the number was a guess: what is done is done
             bar, row = self._shown
             bar.advance(row, advance=max(0, self._total - self._done))
@@ -41,14 +40,20 @@ class _Bar:
             bar.advance(row, advance=count)
 
 
-@contextmanager
-def watched(density: ModelDensity, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
-    """Show how many evaluations were made, and for what.
+class Watched(Protocol):
+    """Who tells ``watch``, in the main thread, how many rows were done since last told."""
 
-    Gives the function that names what comes next and about how many evaluations it will make.
+    watch: Callable[[int], None]
+
+
+@contextmanager
+def watched(work: Watched, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
+    """Show how many rows were done, and for what.
+
+    Gives the function that names what comes next and about how many rows that takes.
     """
     with ExitStack() as stack:
         bar = _Bar(stack)
         if enabled:
-            density.watch = bar.advance
+            work.watch = bar.advance
         yield bar.announce

@@ -1,0 +1,201 @@
+"""States along the record: given what came before, or given the whole record."""
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.likelihood import warn_of
+from pymc_statespace_filters.records import check_random_seed
+from pymc_statespace_filters.state_graphs import observed_variables, with_other_filter
+from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.states.result import state_dims, with_group
+from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+
+ROWS_AT = {"observations": lambda steps: steps, "steps": lambda steps: np.arange(steps[-1] + 1)}
+
+
+def filtered_states(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    var_name: str | None = None,
+    filter: Any = None,
+    at: str = "observations",
+    n_draws: int | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    """Estimate states given the observations up to their own time, at draws of the posterior.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Draws of the posterior, whoever made them.
+    model : pymc.Model, optional
+        The model of the draws, if not that of the context.
+    var_name : str, optional
+        A StateSpace variable; all of them if not given.
+    filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter, optional
+        Another filter than the variable's own.
+    at : {"observations", "steps"}
+        Which times: those of the observations, or every step from 0 to the last observation.
+    n_draws : int, optional
+        How many draws, spread evenly over every chain; all if not given.
+    random_seed : None, int or numpy.random.Generator
+    extend_inferencedata : bool
+        Whether `idata` gets the new group; otherwise a new DataTree has it alone.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the group ``filtered_states``. For a variable "d": ``d_mean`` and ``d_sd``, the
+        state's mean and standard deviation given the parameters of the draw; ``d_states``, one
+        state drawn from that law, so that all draws together have the posterior's law of the
+        state; dims (chain, draw, d_time, state). ``d_n_effective`` (chain, draw, d_time) is the
+        effective number of particles or members that carry an estimate, infinite for a
+        deterministic filter. Where the filter failed all are NaN. Over all draws the mean is that
+        of ``d_mean``, the variance the mean of ``d_sd**2`` plus the variance of ``d_mean``.
+
+    Raises
+    ------
+    ModelError
+        If draws, model and settings do not fit together.
+
+    Warns
+    -----
+    FilterWarning
+        If the filter failed, or its particles collapsed, at some draws.
+
+    Notes
+    -----
+    A filter with noise takes that of the draw's own estimate (``sample_stats["d_seed"]``), and
+    fresh noise where none is stored.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> walk = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> with pm.Model() as model:
+    ...     a = pm.Uniform("a", 0, 1)
+    ...     d = psf.StateSpace("d", walk, psf.EKF(), steps=[0, 2, 4], observed=[0.3, 1.2, 0.8])
+    ...     idata = psf.sample_dram(200, tune=200, chains=2, random_seed=1, progressbar=False)
+    >>> idata = psf.filtered_states(idata, model, at="steps", random_seed=2)
+    >>> idata["filtered_states"]["d_mean"].sizes
+    Frozen({'chain': 2, 'draw': 200, 'd_time': 5, 'state': 1})
+    """
+    return _add_states(
+        "filtered", idata, model, var_name, filter, at, n_draws, random_seed,
+        extend_inferencedata, progressbar,
+    )  # fmt: skip
+
+
+def smoothed_states(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    var_name: str | None = None,
+    filter: Any = None,
+    at: str = "observations",
+    n_draws: int | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    """Estimate states given the whole record, at draws of the posterior.
+
+    Parameters and errors are those of `filtered_states`, the result is the group
+    ``smoothed_states``.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the group ``smoothed_states``, of the form that `filtered_states` describes. A row of
+        ``d_states`` is a path: the states of one draw belong together. How the filter smooths is
+        in the attribute ``smoothing`` of ``d_states``.
+
+    See Also
+    --------
+    filtered_states : Given the observations so far alone.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> walk = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> with pm.Model() as model:
+    ...     a = pm.Uniform("a", 0, 1)
+    ...     d = psf.StateSpace("d", walk, psf.EKF(), steps=[0, 2, 4], observed=[0.3, 1.2, 0.8])
+    ...     idata = psf.sample_dram(200, tune=200, chains=2, random_seed=1, progressbar=False)
+    >>> states = psf.smoothed_states(idata, model, random_seed=2)["smoothed_states"]
+    >>> states["d_states"].sizes
+    Frozen({'chain': 2, 'draw': 200, 'd_time': 3, 'state': 1})
+    """
+    return _add_states(
+        "smoothed", idata, model, var_name, filter, at, n_draws, random_seed,
+        extend_inferencedata, progressbar,
+    )  # fmt: skip
+
+
+def _add_states(
+    moment: str,
+    idata: xr.DataTree,
+    model: pm.Model | None,
+    var_name: str | None,
+    filter: Any,
+    at: str,
+    n_draws: int | None,
+    random_seed: Any,
+    extend_inferencedata: bool,
+    progressbar: bool,
+) -> xr.DataTree:
+    model = pm.modelcontext(model)
+    if at not in ROWS_AT:
+        raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
+    rng = check_random_seed(random_seed)
+    draws = draws_of(idata, n_draws)
+    dims = state_dims(observed_variables(model))
+    parts = []
+    for variable in chosen_variables(model, var_name):
+        if filter is not None:
+            variable = with_other_filter(variable, filter)
+        at_draws = VariableAtDraws(model, variable, draws)
+        rows = ROWS_AT[at](at_draws.steps)
+        states = at_draws.states(moment, rows, rng, progressbar=progressbar)
+        name, system = variable.name, variable.system
+        time, state = variable.dims[0], dims[name]
+        part = draws.dataset(
+            {
+                f"{name}_states": ((time, state), states.drawn),
+                f"{name}_mean": ((time, state), states.mean),
+                f"{name}_sd": ((time, state), states.sd),
+                f"{name}_n_effective": ((time,), states.n_effective),
+            },
+            {time: at_draws.times(rows), state: list(system.states)},
+        )
+        part[f"{name}_states"].attrs = {"filter": repr(variable.filter)}
+        if moment == "smoothed":
+            part[f"{name}_states"].attrs["smoothing"] = variable.filter.smoothing_method(system)
+        parts.append(part)
+        warn_of(variable.filter, states.health, stacklevel=4)
+    return with_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

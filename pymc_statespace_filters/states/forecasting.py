@@ -1,0 +1,165 @@
+"""What comes after the record: states and observations, at draws of the posterior."""
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import xarray as xr
+from numpy.typing import NDArray
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.likelihood import warn_of
+from pymc_statespace_filters.records import check_inputs, check_random_seed, n_input_rows, steps_of
+from pymc_statespace_filters.simulation import continuation
+from pymc_statespace_filters.state_graphs import observed_variables, with_other_filter
+from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.states.result import state_dims, with_group
+from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+
+Array = NDArray[np.float64]
+
+
+def forecast(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    n_steps: int | None = None,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    var_name: str | None = None,
+    filter: Any = None,
+    n_draws: int | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    """Predict states and observations after the record, at draws of the posterior.
+
+    A state at the last observation is drawn for each draw, and goes on from there under the
+    equations, with noise of its own.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Draws of the posterior, whoever made them.
+    model : pymc.Model, optional
+        The model of the draws, if not that of the context.
+    n_steps : int, optional
+        The next so many steps after the last observation. Or give `steps`, or `times`.
+    steps : array_like of int, shape (R,), optional
+        Steps after the last observation, increasing.
+    times : array_like, shape (R,), optional
+        Their times, on the grid ``t0 + k * dt``.
+    inputs : array_like, shape (rows, n_inputs), optional
+        Of the record and of the future, row k during step k; needed if the model's own end before
+        the last step.
+    var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar
+        As in `filtered_states`.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the group ``predictions``. For a variable "d": ``d`` (chain, draw, d_time, observable),
+        simulated observations, and ``d_states`` (chain, draw, d_time, state), the path behind them.
+        NaN for a draw at which the filter failed.
+
+    Raises
+    ------
+    ModelError
+        If draws, model and settings do not fit together.
+
+    Warns
+    -----
+    FilterWarning
+        If the filter failed, or its particles collapsed, at some draws.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> walk = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> with pm.Model() as model:
+    ...     a = pm.Uniform("a", 0, 1)
+    ...     d = psf.StateSpace("d", walk, psf.EKF(), steps=[0, 2, 4], observed=[0.3, 1.2, 0.8])
+    ...     idata = psf.sample_dram(200, tune=200, chains=2, random_seed=1, progressbar=False)
+    >>> idata = psf.forecast(idata, model, n_steps=3, random_seed=2)
+    >>> idata["predictions"]["d"].sizes, idata["predictions"]["d_time"].values
+    (Frozen({'chain': 2, 'draw': 200, 'd_time': 3, 'observable': 1}), array([5., 6., 7.]))
+    """
+    model = pm.modelcontext(model)
+    rng = check_random_seed(random_seed)
+    draws = draws_of(idata, n_draws)
+    dims = state_dims(observed_variables(model))
+    parts = []
+    for variable in chosen_variables(model, var_name):
+        if filter is not None:
+            variable = with_other_filter(variable, filter)
+        name, system, (time, observable) = variable.name, variable.system, variable.dims
+        at_draws = VariableAtDraws(model, variable, draws)
+        last = at_draws.steps[-1:]
+        future = _future(n_steps, steps, times, int(last[0]), at_draws)
+        if inputs is not None:
+            rows = pt.as_tensor(check_inputs(inputs, system, future))
+            at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
+        begin = at_draws.states("filtered", last, rng, progressbar=progressbar)
+        paths, seen = _paths(at_draws, begin.drawn[:, 0], int(last[0]), future, rng)
+        parts.append(
+            draws.dataset(
+                {name: ((time, observable), seen), f"{name}_states": ((time, dims[name]), paths)},
+                {
+                    time: at_draws.times(future),
+                    dims[name]: list(system.states),
+                    observable: list(system.observables),
+                },
+            )
+        )
+        warn_of(variable.filter, begin.health, stacklevel=3)
+    return with_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
+
+
+def _future(
+    n_steps: int | None, steps: Any, times: Any, last: int, at_draws: VariableAtDraws
+) -> NDArray[np.int64]:
+    """The steps to predict."""
+    if sum(given is not None for given in (n_steps, steps, times)) != 1:
+        raise ModelError("give exactly one of n_steps, steps and times")
+    if n_steps is not None:
+        if isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1:
+            raise ModelError(f"n_steps must be an integer of at least 1, got {n_steps!r}")
+        return np.arange(last + 1, last + 1 + n_steps)
+    future = steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
+    if future[0] <= last:
+        raise ModelError(
+            f"a forecast begins after the last observation, at step {last}, but step {future[0]} "
+            f"is asked for; states up to there are those of filtered_states and smoothed_states"
+        )
+    return future
+
+
+def _paths(
+    at_draws: VariableAtDraws, begin: Array, first: int, future: NDArray, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """States (draws, R, n) and observations (draws, R, p) after the states `begin` (draws, n)."""
+    system = at_draws.variable.system
+    rows = at_draws.inputs()
+    if len(rows[0]) < n_input_rows(system, future) and system.n_inputs:
+        raise ModelError(
+            f"the model's inputs end after {len(rows[0])} rows, and step {future[-1]} needs "
+            f"{n_input_rows(system, future)}: give inputs= of the record and of the future"
+        )
+    theta, go_on = at_draws.parameters(), continuation(system).function
+    paths = np.full((len(begin), future.size, system.n), np.nan)
+    seen = np.full((len(begin), future.size, system.p), np.nan)
+    for i in np.flatnonzero(np.isfinite(begin).all(axis=1)):
+        one = rows[i if len(rows) > 1 else 0]
+        paths[i], seen[i] = go_on(rng, theta[i], begin[i], first, future, one, at_draws.t0)
+    return paths, seen

@@ -1,0 +1,133 @@
+"""A state-space variable at draws of the posterior: parameters, inputs, and states by a filter."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
+from pytensor.graph.replace import clone_replace
+from pytensor.graph.traversal import ancestors
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.machine_code import ManyCalls
+from pymc_statespace_filters.progress import watched
+from pymc_statespace_filters.state_graphs import StateSpaceVariable, observed_variables, states_of
+from pymc_statespace_filters.states.posterior import PosteriorDraws
+
+Array = NDArray[np.float64]
+
+
+class States(NamedTuple):
+    """Of every draw: mean, sd and a draw of the state (draws, R, n), effective number (draws, R).
+
+    ``health`` (draws, 3) is what the filter met.
+    """
+
+    mean: Array
+    sd: Array
+    drawn: Array
+    n_effective: Array
+    health: Array
+
+
+class VariableAtDraws:
+    """The numbers of one variable at draws of its model's posterior.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    variable : StateSpaceVariable
+    draws : PosteriorDraws
+
+    Attributes
+    ----------
+    variable : StateSpaceVariable
+    steps : ndarray of int, shape (J,)
+    t0 : float
+    """
+
+    def __init__(
+        self, model: pm.Model, variable: StateSpaceVariable, draws: PosteriorDraws
+    ) -> None:
+        self.variable = variable
+        self._draws = draws
+        known = set(ancestors([variable.theta, variable.inputs]))
+        free = [rv for rv in model.free_RVs if rv in known]
+        shapes = model.eval_rv_shapes()
+        self._columns = [draws.values(rv.name, tuple(map(int, shapes[rv.name]))) for rv in free]
+        # Every number of a draw is handed over as float64.
+        self._symbols = [pt.tensor(rv.name, dtype="float64", shape=rv.type.shape) for rv in free]
+        self._replaced = {
+            rv: pt.cast(symbol, rv.dtype) for rv, symbol in zip(free, self._symbols, strict=True)
+        }
+        steps, t0 = pytensor.function([], [variable.steps, variable.t0], mode="FAST_COMPILE")()
+        self.steps, self.t0 = np.asarray(steps, dtype=np.int64), float(t0)
+
+    def times(self, rows: NDArray[np.int64]) -> Array:
+        """The times of steps."""
+        return self.t0 + rows * self.variable.system.dt
+
+    def parameters(self) -> Array:
+        """The flat parameters of every draw, (draws, k)."""
+        return self._at_draws([self.variable.theta], {})[0]
+
+    def inputs(self) -> Array:
+        """The rows of inputs of every draw, (draws or 1, rows, n_inputs)."""
+        graph = self.variable.inputs
+        if set(self._replaced) & set(ancestors([graph])):
+            return self._at_draws([graph], {})[0]
+        return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
+
+    def states(
+        self, moment: str, rows: NDArray[np.int64], rng: np.random.Generator, *, progressbar: bool
+    ) -> States:
+        """States at steps `rows` by the variable's filter, with the noise of each draw's estimate.
+
+        Where none is stored the noise is fresh.
+        """
+        seed, draw_seed, row_steps = pt.lscalar("seed"), pt.lscalar("draw_seed"), pt.lvector("rows")
+        graphs = states_of(self.variable._replace(seed=seed), moment, row_steps, draw_seed)
+        n_draws = int(np.prod(self._draws.shape))
+        seeds = self._draws.own_seeds(self.variable.name) if self.variable.filter.noisy else None
+        fresh = rng.integers(np.iinfo(np.int64).max, size=(2, n_draws))
+        drawn = {seed: fresh[0] if seeds is None else seeds, draw_seed: fresh[1]}
+        results = self._at_draws(graphs, drawn, {row_steps: rows}, progressbar=progressbar)
+        return States(*results)
+
+    def _at_draws(
+        self,
+        graphs: Sequence[Variable],
+        drawn: Mapping[Variable, np.ndarray],
+        constant: Mapping[Variable, np.ndarray] | None = None,
+        *,
+        progressbar: bool = False,
+    ) -> list[Array]:
+        """Evaluate graphs at every draw; further inputs have a number a draw, or one for all."""
+        constant = constant or {}
+        bound = clone_replace(list(graphs), self._replaced)
+        inputs = [*self._symbols, *drawn, *constant]
+        function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
+        columns = [*self._columns, *drawn.values()]
+        calls = ManyCalls(function, [column[0] for column in columns], list(constant.values()))
+        with watched(calls, enabled=progressbar) as announce:
+            announce("states", len(columns[0]))
+            results = calls(*columns)
+        ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
+        parts = np.split(results, ends, axis=1)
+        return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
+
+
+def chosen_variables(model: pm.Model, name: str | None) -> list[StateSpaceVariable]:
+    """The observed variable of a name, or all of them."""
+    found = {variable.name: variable for variable in observed_variables(model)}
+    if not found:
+        raise ModelError("the model has no observed StateSpace variable")
+    if name is None:
+        return list(found.values())
+    if name not in found:
+        raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
+    return [found[name]]
