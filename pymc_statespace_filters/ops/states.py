@@ -1,7 +1,5 @@
 """States along a record, by a filter: an operation without a derivative."""
 
-from typing import ClassVar
-
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
@@ -18,7 +16,7 @@ class States(RecordOp):
     (those up to its own) or "smoothed" (all). ``draw_seed`` is the noise of the draw alone.
     """
 
-    __props__: ClassVar[tuple[str, ...]] = ("system", "filter", "moment")
+    __props__ = ("system", "filter", "moment")  # type: ignore[assignment]
     input_types = (*RECORD_INPUTS, ("rows", "int64", 1), ("draw_seed", "int64", 0))
 
     def __init__(self, system: StateSpaceModel, filter: Filter, moment: str) -> None:

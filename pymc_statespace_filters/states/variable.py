@@ -69,7 +69,7 @@ class VariableAtDraws:
 
     def times(self, rows: NDArray[np.int64]) -> Array:
         """The times of steps."""
-        return self.t0 + rows * self.variable.system.dt
+        return np.asarray(self.t0 + rows * self.variable.system.dt, dtype=np.float64)
 
     def parameters(self) -> Array:
         """The flat parameters of every draw, (draws, k)."""
