@@ -29,6 +29,7 @@ from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
 from pymc_statespace_filters.plots import (
     plot_average,
     plot_evidence,
+    plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
     plot_phase,
@@ -74,6 +75,7 @@ __all__ = [
     "nearest_steps",
     "plot_average",
     "plot_evidence",
+    "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",
     "plot_phase",

@@ -149,6 +149,16 @@ def note(
     )
 
 
+def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
+    """Return ticks in decades, or finer where there are few decades."""
+    low, high = logs.min() - 1e-9, logs.max() + 1e-9
+    digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    values = [digit * 10.0**decade for decade in decades for digit in digits]
+    shown = [value for value in values if low <= math.log10(value) <= high]
+    return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
+
+
 def written(prob: float) -> str:
     """Write a probability with the digits that matter, near zero and near one too."""
     if prob < 1e-6:

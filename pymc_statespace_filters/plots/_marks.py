@@ -23,18 +23,6 @@ DOTS = {"color": "C0", "alpha": 0.4, "diameter": 2}
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
-KEY: dict[str, dict[str, Any]] = {  # above the panels, in the words of each backend
-    "matplotlib": {"loc": "outside upper center", "frameon": False},
-    "plotly": {
-        "legend_orientation": "h",
-        "legend_y": 1.02,
-        "legend_yanchor": "bottom",
-        "legend_traceorder": "normal",
-        "margin": {"t": 60, "b": 60, "r": 30},
-    },
-    "bokeh": {"side": "above", "orientation": "horizontal", "border_line_alpha": 0.0},
-    "none": {},
-}
 
 
 def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
@@ -141,16 +129,32 @@ def in_key(style: Mapping[str, Any]) -> dict[str, Any]:
     return {**style, "linestyle": "C2", "width": 4}
 
 
-def write_key(collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write what the marks mean above the panels."""
+def write_key(
+    collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], n_columns: int = 1
+) -> None:
+    """Write what the marks mean above the panels, which are in so many columns."""
+    places: dict[str, dict[str, Any]] = {  # in the words of each backend
+        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": len(entries)},
+        "plotly": {
+            "legend_orientation": "h",
+            "legend_y": 1.02,
+            "legend_yanchor": "bottom",
+            "legend_traceorder": "normal",
+            "margin": {"t": 60, "b": 60, "r": 30},
+        },
+        "bokeh": {  # above one panel alone, and no wider
+            "side": "above",
+            "border_line_alpha": 0.0,
+            "ncols": len(entries) if n_columns == 1 else 2,
+        },
+        "none": {},
+    }
     drawing = import_module(f"arviz_plots.backend.{collection.backend}")
-    styles = list(entries.values())
-    settings = dict(KEY[collection.backend])
-    if collection.backend == "matplotlib":
-        settings["ncols"] = len(entries)
-    if collection.backend == "plotly":  # the only name that its legend does not translate
-        styles = [{"opacity" if k == "alpha" else k: v for k, v in s.items()} for s in styles]
-    drawing.legend(collection, styles, list(entries), update_visuals=False, **settings)
+    alpha = "opacity" if collection.backend == "plotly" else "alpha"  # not translated for legends
+    styles = [{alpha if k == "alpha" else k: v for k, v in s.items()} for s in entries.values()]
+    drawing.legend(
+        collection, styles, list(entries), update_visuals=False, **places[collection.backend]
+    )
 
 
 def write_axes(collection: PlotCollection, time: xr.DataArray) -> None:
@@ -161,5 +165,10 @@ def write_axes(collection: PlotCollection, time: xr.DataArray) -> None:
     (dim,) = collection.viz["plot"].dims
     n_columns = int(collection.viz["col_index"].max()) + 1
     lowest = collection.data.isel({dim: slice(-n_columns, None)})
-    text = f"time ({time.attrs['units']})" if "units" in time.attrs else "time"
-    collection.map(labelled_x, data=lowest, ignore_aes="all", text=text, store_artist=False)
+    settings = {"ignore_aes": "all", "store_artist": False}
+    collection.map(labelled_x, data=lowest, text=time_label(time), **settings)
+
+
+def time_label(time: xr.DataArray) -> str:
+    """Return the name of the axis of time, with its unit if xarray knows one."""
+    return f"time ({time.attrs['units']})" if "units" in time.attrs else "time"

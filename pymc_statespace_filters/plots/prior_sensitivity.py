@@ -1,6 +1,5 @@
 """Probabilities of rival models against what was assumed before the data."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,13 @@ from arviz_plots.visuals import labelled_x, labelled_y, set_xticks, set_ylim
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import prior_sensitivity
-from pymc_statespace_filters.plots._canvas import band, canvas, curve, interval
+from pymc_statespace_filters.plots._canvas import (
+    band,
+    canvas,
+    curve,
+    interval,
+    logarithmic_ticks,
+)
 
 LABELS = {
     "prob": "exponent α of the correction",
@@ -87,18 +92,8 @@ def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
         collection.map(labelled_y, data=probs[[name]], text="probability of the model", **settings)
     collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
     if "width_prob" in probs:
-        ticks = _logarithmic_ticks(probs["width"].values)
+        ticks = logarithmic_ticks(probs["width"].values)
         collection.map(set_xticks, data=probs[["width_prob"]], **ticks, **settings)
-
-
-def _logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
-    """Return ticks in decades, or finer where there are few decades."""
-    low, high = logs.min() - 1e-9, logs.max() + 1e-9
-    digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
-    decades = range(math.floor(low), math.ceil(high) + 1)
-    values = [digit * 10.0**decade for decade in decades for digit in digits]
-    shown = [value for value in values if low <= math.log10(value) <= high]
-    return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
 
 
 def _sensitivity(table: pd.DataFrame | xr.Dataset) -> xr.Dataset:

@@ -5,6 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import norm
 
 from pymc_statespace_filters import Evidence, average_models, compare_evidence
 
@@ -121,3 +122,22 @@ def forecast():
         coords={"d_time": TIMES[:31], "observable": observables},
     )
     return xr.DataTree.from_dict({"predictions": predictions, "observed_data": observed})
+
+
+@pytest.fixture(scope="session")
+def diagnostics():
+    """Of two observables and particles, as of a good filter; the first lacks an observation."""
+    residual = np.random.default_rng(4).normal(size=(41, 2))
+    residual[3, 0] = np.nan
+    over_time = ("d_time", "observable")
+    effective = np.arange(1.0, 101).reshape(2, 50)[:, :, None] * np.ones(41)
+    group = xr.Dataset(
+        {
+            "d_residual": (over_time, residual),
+            "d_pit": (over_time, norm.cdf(residual)),
+            "d_n_effective": (("chain", "draw", "d_time"), effective),
+        },
+        coords={"d_time": TIMES, "observable": ["position", "speed"]},
+    )
+    stats = xr.Dataset({"n_failed": (("chain", "draw"), np.full((2, 3), 2))})
+    return xr.DataTree.from_dict({"filter_diagnostics": group, "sample_stats": stats})

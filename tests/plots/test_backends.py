@@ -7,6 +7,7 @@ from arviz_plots import PlotCollection
 from pymc_statespace_filters import (
     plot_average,
     plot_evidence,
+    plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
     plot_phase,
@@ -31,6 +32,7 @@ PLOTS = [
     (plot_states, "states"),
     (plot_forecast, "forecast"),
     (portrait, "states"),
+    (plot_filter_health, "diagnostics"),
 ]
 
 

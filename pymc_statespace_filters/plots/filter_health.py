@@ -1,0 +1,255 @@
+"""Whether a filter does its work: its particles, and what it expected of the next observation."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from arviz_base.labels import NoVarLabeller
+from arviz_plots import PlotCollection
+from arviz_plots.plot_collection import backend_from_object
+from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
+from arviz_stats.base import array_stats
+from arviz_stats.ecdf_utils import (
+    compute_ecdf,
+    get_pointwise_confidence_band,
+    simulate_confidence_bands,
+)
+
+from pymc_statespace_filters.plots._canvas import (
+    PANELS_IN_LINE,
+    band,
+    canvas,
+    curve,
+    interval,
+    logarithmic_ticks,
+)
+from pymc_statespace_filters.plots._marks import bars, draw_bands, points, time_label, write_key
+from pymc_statespace_filters.plots._results import group_of, variable_of
+
+COLLAPSED = 3  # a filter with fewer effective particles says little
+PROB, TAIL = 0.95, 1.96  # of the bands that a calibrated filter keeps to
+MAX_LAG = 25
+PIT_GRID = np.linspace(0, 1, 101)
+N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their distribution
+SEEN = {"color": "C0"}
+EXPECTED = {"color": "B3", "alpha": 0.3}
+DIMS = ("time", "observable")
+LIMIT = {"color": "B1", "linestyle": "C1"}
+
+
+def plot_filter_health(
+    idata: xr.DataTree,
+    *,
+    var_name: str | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    r"""Draw what tells whether a filter and its model fit the record, before each observation.
+
+    For each observable three panels, with the band in which 95 % would be:
+
+    * the standardised residuals of one-step-ahead prediction over time. Too many outside the
+      band, or runs of one sign, tell when the model is wrong;
+    * their autocorrelation: that of white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
+    * the distribution function of the probability integral transform (PIT) less that of a uniform
+      one, which it would have, with a simultaneous band [1]_. Prediction that is too wide goes
+      below the band and then above it, one that is too narrow the other way round; a bias is a
+      bow to one side.
+
+    One more for filters with particles: their effective number, of all draws. Below 3 (the dashed
+    line) the filter has collapsed. Above it stands how many evaluations failed while sampling.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        With the group ``filter_diagnostics``.
+    var_name : str, optional
+        The StateSpace variable, where there are several.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        By default that of ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        For ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``expected`` and ``seen`` of the variables ``residual``, ``autocorrelation`` and
+        ``pit`` along ``observable``; ``band_90``, ``band_50``, ``median`` and ``collapsed`` of
+        ``effective``.
+
+    Raises
+    ------
+    ModelError
+        If there are no diagnostics.
+
+    References
+    ----------
+    .. [1] Saeilynoja, Buerkner and Vehtari, Graphical test for discrete uniformity and its
+       applications in goodness-of-fit evaluation and multiple sample comparison, Statistics and
+       Computing 32, 2022.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from scipy.stats import norm
+    >>> from pymc_statespace_filters import plot_filter_health
+    >>> rng = np.random.default_rng(1)
+    >>> residual = rng.normal(size=(100, 1))
+    >>> diagnostics = xr.Dataset(
+    ...     {
+    ...         "d_residual": (("d_time", "observable"), residual),
+    ...         "d_pit": (("d_time", "observable"), norm.cdf(residual)),
+    ...         "d_n_effective": (("chain", "draw", "d_time"), rng.uniform(30, 90, (2, 50, 100))),
+    ...     },
+    ...     coords={"d_time": np.arange(100) / 10, "observable": ["position"]},
+    ... )
+    >>> idata = xr.DataTree.from_dict({"filter_diagnostics": diagnostics})
+    >>> collection = plot_filter_health(idata)
+    >>> collection.savefig("health.png")  # doctest: +SKIP
+    """
+    _, results = group_of(idata, "filter_diagnostics")
+    name = variable_of(results, var_name, "_residual")
+    residual, pit = (
+        results[f"{name}_{kind}"].rename(
+            dict(zip(results[f"{name}_{kind}"].dims, DIMS, strict=True))
+        )
+        for kind in ("residual", "pit")
+    )
+    seen, expected = (
+        xr.merge(parts)
+        for parts in zip(_residuals(residual), _autocorrelations(residual), _pits(pit), strict=True)
+    )
+    effective = _log_effective(results, name)
+    data = seen if effective is None else seen.assign(effective=effective)
+
+    n_observables = residual.sizes["observable"]
+    n_panels = 3 * n_observables + (effective is not None)
+    in_line = 2 if n_observables == 1 else min(n_observables, PANELS_IN_LINE)
+    collection = canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={},
+        size=(4.2 * in_line, 0.6 + 2.7 * -(-n_panels // in_line)),
+        n_panels=n_panels,
+        panels_in_line=in_line,
+        cols=["__variable__", "observable"],
+    )
+    collection.map(band, "expected", data=expected, **EXPECTED)
+    collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
+    collection.map(bars, "seen", data=_from_zero(seen[["autocorrelation"]]), width=2, **SEEN)
+    collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
+    key = {"95 % if filter and model are right": {**EXPECTED, "width": 8}}
+    if effective is not None:
+        key |= _draw_effective(collection, data[["effective"]])
+        _note_failures(collection, data[["effective"]], idata)
+    _name_axes(collection, data, residual["time"])
+    write_key(collection, key, n_columns=in_line)
+    return collection
+
+
+def _residuals(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return residuals over time, and the band of a standard normal."""
+    bound = xr.full_like(residual, TAIL).to_dataset(name="residual")
+    return residual.to_dataset(name="residual"), interval(-bound, bound)
+
+
+def _autocorrelations(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return autocorrelations of the residuals that there are, and the band of white noise."""
+    n_lags = max(1, min(MAX_LAG, residual.sizes["time"] // 4))
+
+    def autocorrelation(values: np.ndarray) -> np.ndarray:
+        found = array_stats.autocorr(values[np.isfinite(values)])[1 : n_lags + 1]
+        return np.pad(found, (0, n_lags - found.size), constant_values=np.nan)
+
+    lags = xr.apply_ufunc(
+        autocorrelation,
+        residual,
+        input_core_dims=[["time"]],
+        output_core_dims=[["lag"]],
+        vectorize=True,
+    ).assign_coords(lag=np.arange(1, n_lags + 1))
+    bound = TAIL * residual.count("time") ** -0.5
+    bounds = bound.expand_dims(lag=lags["lag"]).to_dataset(name="autocorrelation")
+    return lags.to_dataset(name="autocorrelation"), interval(-bounds, bounds)
+
+
+def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return distribution functions less that of a uniform number, and their simultaneous band."""
+
+    def of_one(values: np.ndarray) -> np.ndarray:
+        values, inner = values[np.isfinite(values)], PIT_GRID[1:-1]
+        rng = np.random.default_rng(1)  # the same picture each time
+        level = simulate_confidence_bands(values.size, 1, inner, PROB, N_SIMULATIONS, rng)
+        found = [
+            compute_ecdf(values, inner),
+            *get_pointwise_confidence_band(level, values.size, inner),
+        ]
+        return np.pad(np.array(found) - inner, ((0, 0), (1, 1)))  # all meet at 0 and at 1
+
+    found = xr.apply_ufunc(
+        of_one,
+        pit,
+        input_core_dims=[["time"]],
+        output_core_dims=[["of", "u"]],
+        vectorize=True,
+    ).assign_coords(u=PIT_GRID)
+    seen, low, high = (found.isel(of=i).to_dataset(name="pit") for i in range(3))
+    return seen, interval(low, high)
+
+
+def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
+    """Return logs (not every backend has such an axis), or None: a filter without particles."""
+    effective = results.get(f"{name}_n_effective")
+    if effective is None or not np.isfinite(effective).any():
+        return None
+    effective = effective.where(np.isfinite(effective)).rename({effective.dims[-1]: "time"})
+    return xr.apply_ufunc(np.log10, effective)
+
+
+def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:
+    key = draw_bands(collection, logs)
+    limit = np.log10(COLLAPSED)
+    collection.map(hline, "collapsed", data=xr.Dataset({"effective": limit}), **LIMIT)
+    ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])
+    collection.map(
+        name_ticks, data=logs, ticks=logarithmic_ticks(ends), ignore_aes="all", store_artist=False
+    )
+    return {**key, f"collapse ({COLLAPSED} particles)": LIMIT}
+
+
+def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataTree) -> None:
+    """Write above the panel of particles how many evaluations failed while sampling."""
+    stats = idata.children.get("sample_stats")
+    n_failed = 0 if stats is None or "n_failed" not in stats else int(stats["n_failed"].sum())
+    if n_failed:
+        text = f"{n_failed} evaluations failed while sampling"
+        collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
+
+
+def name_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
+    """Write ticks at the y axis."""
+    backend_from_object(target).yticks(ticks["values"], ticks["labels"], target)
+
+
+def _from_zero(values: xr.Dataset) -> xr.Dataset:
+    return interval(xr.zeros_like(values), values)
+
+
+def _name_axes(collection: PlotCollection, data: xr.Dataset, time: xr.DataArray) -> None:
+    axes = {
+        "residual": (time_label(time), "standardised residual"),
+        "autocorrelation": ("lag (observations)", "autocorrelation"),
+        "pit": ("PIT", "ECDF less uniform"),
+        "effective": (time_label(time), "effective number"),
+    }
+    settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
+    for panel in map(str, data):
+        x_label, y_label = axes[panel]
+        collection.map(labelled_x, data=data[[panel]], text=x_label, **settings)
+        collection.map(labelled_y, data=data[[panel]], text=y_label, **settings)
+    if data.sizes["observable"] > 1:
+        of_observables = data.drop_vars("effective", errors="ignore")
+        labels = {"labeller": NoVarLabeller(), "subset_info": True}
+        collection.map(labelled_title, data=of_observables, **labels, **settings)
