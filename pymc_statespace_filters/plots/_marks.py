@@ -1,6 +1,6 @@
 """What pictures over time are made of: bands and bars of draws, points, paths, and their key."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from importlib import import_module
 from typing import Any
 
@@ -12,7 +12,7 @@ from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, labelled_y
 
 from pymc_statespace_filters.plots._canvas import BOUND, band, curve, interval
-from pymc_statespace_filters.plots._results import SAMPLE_DIMS, time_of
+from pymc_statespace_filters.plots._results import SAMPLE_DIMS
 
 # Blue and orange are told apart by everyone; what is certain is black.
 DRAWS = {"color": "C0"}
@@ -76,25 +76,30 @@ def some_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
 
 def bars(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
     """Draw a vertical line from bound to bound at each time."""
-    dim = time_of(da, BOUND)
+    dim = _dim_of(da, BOUND)
     low, high = da.transpose(BOUND, dim).values
     return _broken_line([da[dim].values] * 2, [low, high], target, **kwargs)
 
 
 def points(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
     """Draw values, of each path if there are some, as points over time."""
-    dim = time_of(da, "path")
+    dim = _dim_of(da, "path")
     times, values = xr.broadcast(da[dim], da)
     return _scatter(times.values.ravel(), values.values.ravel(), target, diameter, **kwargs)
 
 
 def paths(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
     """Draw each path as a line over time."""
-    dim = time_of(da, "path")
+    dim = _dim_of(da, "path")
     values = da.transpose(dim, "path").values
     return _broken_line(
         [[time] * values.shape[1] for time in da[dim].values], values, target, **kwargs
     )
+
+
+def _dim_of(da: xr.DataArray, *others: str) -> Hashable:
+    (dim,) = (dim for dim in da.dims if dim not in others)
+    return dim
 
 
 def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
@@ -106,7 +111,7 @@ def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
 
 def path_xy(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
     """Draw each path of x and y, the ends of the dimension "plot_axis", as a line."""
-    dim = time_of(da, "path", "plot_axis")
+    dim = _dim_of(da, "path", "plot_axis")
     x, y = da.transpose("plot_axis", dim, "path").values
     return _broken_line(x, y, target, **kwargs)
 

@@ -38,18 +38,17 @@ def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str = "") -> 
     return var_name
 
 
-def time_of(array: xr.DataArray, *others: Hashable) -> Hashable:
-    """Return the dimension of `array` that is neither of samples nor among `others`."""
-    (dim,) = (dim for dim in array.dims if dim not in (*SAMPLE_DIMS, *others))
-    return dim
+def named(array: xr.DataArray, *names: str) -> xr.DataArray:
+    """Return `array` with these names for its last dimensions: a model may call them otherwise."""
+    return array.rename(dict(zip(array.dims[-len(names) :], names, strict=True)))
 
 
 def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
     """Return the record of a variable if idata has it, with dimensions "time" and "observable"."""
-    if "observed_data" not in idata.children or name not in idata["observed_data"]:
+    if "observed_data" not in idata.children:
         return None
-    record = idata["observed_data"][name]
-    return record.rename(dict(zip(record.dims, ("time", "observable"), strict=True)))
+    record = idata["observed_data"].to_dataset().get(name)
+    return None if record is None else named(record, "time", "observable")
 
 
 def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:

@@ -24,7 +24,7 @@ from pymc_statespace_filters.plots._canvas import (
     logarithmic_ticks,
 )
 from pymc_statespace_filters.plots._marks import bars, draw_bands, points, time_label, write_key
-from pymc_statespace_filters.plots._results import group_of, variable_of
+from pymc_statespace_filters.plots._results import group_of, named, variable_of
 
 COLLAPSED = 3  # a filter with fewer effective particles says little
 PROB, TAIL = 0.95, 1.96  # of the bands that a calibrated filter keeps to
@@ -33,7 +33,6 @@ PIT_GRID = np.linspace(0, 1, 101)
 N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their distribution
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
-DIMS = ("time", "observable")
 LIMIT = {"color": "B1", "linestyle": "C1"}
 
 
@@ -111,10 +110,7 @@ def plot_filter_health(
     _, results = group_of(idata, "filter_diagnostics")
     name = variable_of(results, var_name, "_residual")
     residual, pit = (
-        results[f"{name}_{kind}"].rename(
-            dict(zip(results[f"{name}_{kind}"].dims, DIMS, strict=True))
-        )
-        for kind in ("residual", "pit")
+        named(results[f"{name}_{kind}"], "time", "observable") for kind in ("residual", "pit")
     )
     seen, expected = (
         xr.merge(parts)
@@ -204,8 +200,7 @@ def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
     effective = results.get(f"{name}_n_effective")
     if effective is None or not np.isfinite(effective).any():
         return None
-    effective = effective.where(np.isfinite(effective)).rename({effective.dims[-1]: "time"})
-    return xr.apply_ufunc(np.log10, effective)
+    return xr.apply_ufunc(np.log10, named(effective.where(np.isfinite(effective)), "time"))
 
 
 def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:

@@ -18,7 +18,7 @@ from pymc_statespace_filters.plots._marks import (
     write_axes,
     write_key,
 )
-from pymc_statespace_filters.plots._results import data_of, group_of, truth_of, variable_of
+from pymc_statespace_filters.plots._results import data_of, group_of, named, truth_of, variable_of
 
 PAST = 2.0  # so much of the record, in lengths of the forecast, is drawn
 FEWEST_OF_PAST = 10
@@ -59,8 +59,8 @@ def plot_forecast(
     Returns
     -------
     arviz_plots.PlotCollection
-        Visuals ``band_90``, ``band_50`` and ``median``, ``data``, ``end``, ``truth``, along
-        ``observable``.
+        Visuals ``band_90``, ``band_50`` and ``median`` (of a single time ``bar_90`` and
+        ``bar_50``), ``data``, ``end``, ``truth``, along ``observable``.
 
     Raises
     ------
@@ -91,9 +91,7 @@ def plot_forecast(
     _, results = group_of(idata, "predictions")
     predicted = results[[name for name in results if not str(name).endswith("_states")]]
     name = variable_of(predicted, var_name)
-    draws = predicted[name].rename(
-        dict(zip(predicted[name].dims[-2:], ("time", "observable"), strict=True))
-    )
+    draws = named(predicted[name], "time", "observable")
     observables = [str(observable) for observable in draws["observable"].values]
     if truth is not None:
         truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
@@ -110,7 +108,7 @@ def plot_forecast(
         panels_in_line=1,
         cols=["observable"],
     )
-    key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
+    key = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
     if record is not None:
         past = record.isel(time=slice(-_n_past(record, draws) if n_past is None else -n_past, None))
         end = record["time"][-1].expand_dims(observable=observables).drop_vars("time")

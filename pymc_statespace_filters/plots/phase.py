@@ -24,7 +24,7 @@ from pymc_statespace_filters.plots._results import (
     SAMPLE_DIMS,
     chosen,
     group_of,
-    time_of,
+    named,
     truth_of,
     variable_of,
 )
@@ -98,7 +98,8 @@ def plot_phase(
     """
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
-    states = results[f"{variable_of(results, var_name, '_states')}_states"]
+    name = variable_of(results, var_name, "_states")
+    states = named(results[f"{name}_states"], "time", "state")
     both = [_quantity("x", x, states), _quantity("y", y, states)]
     sizes = [dict(quantity.sizes) for quantity in both]
     if sizes[0] != sizes[1]:
@@ -133,7 +134,6 @@ def _on_axes(both: Sequence[xr.DataArray]) -> xr.DataArray:
 
 def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) -> xr.DataArray:
     """Return a state or what the user computed, over (chain, draw, time), with its name."""
-    time = time_of(states, "state")
     if isinstance(given, xr.DataArray):
         others = [dim for dim in given.dims if dim not in SAMPLE_DIMS]
         if set(given.dims) - set(others) != set(SAMPLE_DIMS) or len(others) != 1:
@@ -143,16 +143,15 @@ def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) ->
         name = given.name or argument
         return given.rename({others[0]: "time"}).reset_coords(drop=True).rename(name)
     (state,) = chosen(argument, [given], [str(state) for state in states["state"].values])
-    return states.sel(state=state, drop=True).rename({time: "time"}).rename(state)
+    return states.sel(state=state, drop=True).rename(state)
 
 
 def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:
     if isinstance(truth, xr.Dataset | xr.DataArray):
         if not (isinstance(x, str) and isinstance(y, str)):
             raise ModelError("truth must be a pair (x, y) where x or y is no name of a state")
-        times = states[time_of(states, "state")].values
         names = [str(state) for state in states["state"].values]
-        known = truth_of(truth, "states", "state", names, times)
+        known = truth_of(truth, "states", "state", names, states["time"].values)
         true_states = [str(state) for state in known["state"].values]
         both = [known.sel(state=name) for name in chosen("truth", [x, y], true_states)]
         return _on_axes([b.drop_vars("state") for b in both]).to_dataset(name="phase")

@@ -27,7 +27,7 @@ from pymc_statespace_filters.plots._results import (
     data_of,
     group_of,
     known,
-    time_of,
+    named,
     truth_of,
     variable_of,
 )
@@ -104,13 +104,12 @@ def plot_states(
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
-    draws = results[f"{name}_states"]
+    draws = named(results[f"{name}_states"], "time", "state")
     all_states = [str(state) for state in draws["state"].values]
     shown = chosen("states", states, all_states)
     record = _record(idata, name, observables, all_states)
-    times = draws[time_of(draws, "state")]
     if truth is not None:
-        truth = truth_of(truth, "states", "state", all_states, times.values)
+        truth = truth_of(truth, "states", "state", all_states, draws["time"].values)
 
     data = draws.sel(state=shown).to_dataset(name="states")
     collection = canvas(
@@ -140,7 +139,7 @@ def plot_states(
             **DATA,
         )
         key["data"] = in_key(DATA)
-    write_axes(collection, times)
+    write_axes(collection, draws["time"])
     write_key(collection, key)
     return collection
 

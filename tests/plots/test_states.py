@@ -97,6 +97,14 @@ def test_truth(form, states):
         np.testing.assert_array_equal(truth["speed"]["y"], -SINE)
 
 
+def test_dimensions_of_another_name(states):
+    group = states["smoothed_states"].to_dataset()
+    group = group.rename(d_time="month", state="d_state")
+    tree = xr.DataTree.from_dict({"smoothed_states": group})
+    one, other = (drawn(plot_states(s, backend="none"), "median") for s in (states, tree))
+    np.testing.assert_array_equal(one["speed"]["y"], other["speed"]["y"])
+
+
 def test_panels_and_their_names(states):
     states = states.copy(deep=True)
     states["smoothed_states"]["d_time"].attrs["units"] = "s"
