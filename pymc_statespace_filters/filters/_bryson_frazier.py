@@ -9,7 +9,8 @@ gain K and C = I - K H, an adjoint vector and matrix go back over the record fro
 
 and the smoothed law is N(m - P l, P - P L P), with (m, P) and (l, L) both after the observation of
 the step, or both before it. Nothing is divided by but S, so noise on the velocity alone, or a start
-that is known, are as good as any.
+that is known, are as good as any. The price is a difference: a variance that the data shrink by
+ten orders of magnitude keeps half of its digits.
 
 A whole path is drawn by simulation smoothing (Durbin and Koopman 2002, "A simple and efficient
 simulation smoother"): simulate a path and its record, and move the path by the difference of what

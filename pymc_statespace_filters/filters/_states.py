@@ -4,6 +4,8 @@ A pass leaves two tapes, each a row per state: ``before`` every observation, ``a
 observation, or the step where there is none.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytensor.tensor as pt
 
@@ -33,14 +35,29 @@ from pymc_statespace_filters.model import StateSpaceModel
 _ALONG, _AT_START = 0, 1
 
 
-def compile_states(recursion: Recursion, moment: str) -> Compiled:
-    """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
+@dataclass(frozen=True, eq=False)
+class StatesPass:
+    """What the states of all moments begin with: compiled once for a system."""
+
+    smoother: BrysonFrazier
+    noise: Compiled
+    forwards: Compiled
+
+
+def states_pass(recursion: Recursion) -> StatesPass:
+    """The pass forwards of a filter."""
     smoother = BrysonFrazier(recursion)
-    parts = {"noise": _noise(recursion.system), "forwards": _forwards(smoother)}
+    return StatesPass(smoother, _noise(recursion.system), _forwards(smoother))
+
+
+def compile_states(begin: StatesPass, moment: str) -> Compiled:
+    """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
+    recursion = begin.smoother.recursion
     if moment == "smoothed":
-        parts["read"] = _read_backwards(smoother)
+        read_states = _read_backwards(begin.smoother)
     else:
-        parts["read"] = _read_forwards(recursion.system.n, predicted=moment == "predicted")
+        read_states = _read_forwards(recursion.system.n, predicted=moment == "predicted")
+    parts = {"noise": begin.noise, "forwards": begin.forwards, "read": read_states}
     noise, forwards, read = (part.function for part in parts.values())
     n = recursion.system.n
 
@@ -142,10 +159,11 @@ def _read_backwards(smoother: BrysonFrazier) -> Compiled:
         c = parameters(theta)
         s_bar = end_of(c)
         j, r = steps.size - 1, rows.size - 1
+        informed = False  # where nothing later was seen, zero stays zero whatever comes there
         for k in range(n_steps, -1, -1):
             if r < 0:
                 break
-            if k < n_steps:
+            if informed:
                 s_bar = unpredict(c, inputs, k, t0 + k * dt, after, k, s_bar)
             if rows[r] == k:
                 m, variances, x = smooth(c, after, k, s_bar)
@@ -156,6 +174,7 @@ def _read_backwards(smoother: BrysonFrazier) -> Compiled:
             if j >= 0 and steps[j] == k:
                 if not is_missing(observed, j):
                     s_bar = unupdate(c, inputs, k, t0 + k * dt, observed[j], before, j, Z, k, s_bar)
+                    informed = True
                 j -= 1
         return rows.size
 

@@ -5,6 +5,7 @@ of the filter is one vector: the mean, then the lower triangle of the covariance
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
@@ -21,7 +22,7 @@ from pymc_statespace_filters.filters._linearised import (
 )
 from pymc_statespace_filters.filters._recursion import Recursion, compile_taped, compile_value
 from pymc_statespace_filters.filters._reverse import compile_gradient, compile_reverse
-from pymc_statespace_filters.filters._states import compile_states
+from pymc_statespace_filters.filters._states import StatesPass, compile_states, states_pass
 from pymc_statespace_filters.lowering import (
     Compiled,
     Graph,
@@ -104,7 +105,7 @@ class EKF:
         "filtered" or "smoothed". The draws of one ``draw_seed`` belong together: if smoothed, they
         are a path. See `_bryson_frazier` for how both are made.
         """
-        return compile_states(_recursion(system), moment)
+        return compile_states(_states_pass(system), moment)
 
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """What smoothed states are made by."""
@@ -162,3 +163,8 @@ def _recursion(system: StateSpaceModel) -> Recursion:
             True,
         ),
     )
+
+
+@lru_cache(maxsize=256)
+def _states_pass(system: StateSpaceModel) -> StatesPass:
+    return states_pass(_recursion(system))

@@ -29,14 +29,16 @@ NOISE_JAC = np.array([[1.0, 0.0], [0.5, 1.0]])
 
 
 def transition(x, q, u, t, k, cubic):
-    """A driven oscillator with a spring that stiffens."""
-    force = u[0] + 0.3 * pt.cos(t) - k * x[0] - cubic * x[0] ** 3 - 0.4 * x[1]
+    """A driven oscillator with a spring that stiffens, more so in time with what drives it."""
+    spring = k * x[0] + cubic * (1.0 + 0.5 * pt.cos(t) + 0.3 * u[0]) * x[0] ** 3
+    force = u[0] + 0.3 * pt.cos(t) - spring - 0.4 * x[1]
     return [x[0] + DT * x[1] + q[0], x[1] + DT * force + q[1]]
 
 
 def observation(x, e, u, bend, c):
     """Two sensors with general noise, one of which feels the input."""
-    return [x[0] + bend * x[0] ** 2 + e[0], 0.5 * x[0] + x[1] + c * u[0] + 0.5 * e[0] + e[1]]
+    bent = bend * (1.0 + 0.5 * u[0]) * x[0] ** 2
+    return [x[0] + bent + e[0], 0.5 * x[0] + x[1] + c * u[0] + 0.5 * e[0] + e[1]]
 
 
 SYSTEM = psf.StateSpaceModel(
@@ -202,14 +204,17 @@ def extended_smoother(params):
         if step in STEPS:
             d, u = OBSERVED[list(STEPS).index(step)], FORCE[step, 0]
             seen = ~np.isnan(d)
-            h = np.array([m[0] + bend * m[0] ** 2, 0.5 * m[0] + m[1] + c * u])[seen]
-            H = np.array([[1.0 + 2.0 * bend * m[0], 0.0], [0.5, 1.0]])[seen]
+            b = bend * (1.0 + 0.5 * u)
+            h = np.array([m[0] + b * m[0] ** 2, 0.5 * m[0] + m[1] + c * u])[seen]
+            H = np.array([[1.0 + 2.0 * b * m[0], 0.0], [0.5, 1.0]])[seen]
             gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R[np.ix_(seen, seen)])
             m, P = m + gain @ (d[seen] - h), P - gain @ H @ P
         analyses.append((m, P))
-        F = np.array([[1.0, DT], [-DT * (k + 3.0 * cubic * m[0] ** 2), 1.0 - 0.4 * DT]])
-        force = FORCE[step, 0] + 0.3 * np.cos(T0 + DT * step) - k * m[0] - cubic * m[0] ** 3
-        m = m + DT * np.array([m[1], force - 0.4 * m[1]])
+        wave, u = np.cos(T0 + DT * step), FORCE[step, 0]
+        stiff = cubic * (1.0 + 0.5 * wave + 0.3 * u)
+        F = np.array([[1.0, DT], [-DT * (k + 3.0 * stiff * m[0] ** 2), 1.0 - 0.4 * DT]])
+        force = u + 0.3 * wave - k * m[0] - stiff * m[0] ** 3 - 0.4 * m[1]
+        m = m + DT * np.array([m[1], force])
         P = F @ P @ F.T + process_cov(params)
         jacobians.append(F)
     smoothed = [analyses[-1]]
