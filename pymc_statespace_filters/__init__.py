@@ -1,5 +1,6 @@
 """Likelihoods, sampling and model choice for nonlinear state-space models in PyMC."""
 
+from pymc_statespace_filters.diagnostics import compute_log_likelihood, leave_future_out
 from pymc_statespace_filters.distribution import StateSpace
 from pymc_statespace_filters.errors import (
     CheckpointWarning,
@@ -64,12 +65,14 @@ __all__ = [
     "average_models",
     "chib_jeliazkov",
     "compare_evidence",
+    "compute_log_likelihood",
     "cubic",
     "estimate_evidence",
     "filtered_states",
     "forecast",
     "freeplay",
     "hysteresis",
+    "leave_future_out",
     "log_likelihood",
     "marginal_modes",
     "nearest_steps",

@@ -73,13 +73,13 @@ class VariableAtDraws:
 
     def parameters(self) -> Array:
         """The flat parameters of every draw, (draws, k)."""
-        return self._at_draws([self.variable.theta], {})[0]
+        return self.evaluate([self.variable.theta], {})[0]
 
     def inputs(self) -> Array:
         """The rows of inputs of every draw, (draws or 1, rows, n_inputs)."""
         graph = self.variable.inputs
         if set(self._replaced) & set(ancestors([graph])):
-            return self._at_draws([graph], {})[0]
+            return self.evaluate([graph], {})[0]
         return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
 
     def states(
@@ -95,15 +95,16 @@ class VariableAtDraws:
         seeds = self._draws.own_seeds(self.variable.name) if self.variable.filter.noisy else None
         fresh = rng.integers(np.iinfo(np.int64).max, size=(2, n_draws))
         drawn = {seed: fresh[0] if seeds is None else seeds, draw_seed: fresh[1]}
-        results = self._at_draws(graphs, drawn, {row_steps: rows}, progressbar=progressbar)
+        results = self.evaluate(graphs, drawn, {row_steps: rows}, progressbar=progressbar)
         return States(*results)
 
-    def _at_draws(
+    def evaluate(
         self,
         graphs: Sequence[Variable],
         drawn: Mapping[Variable, np.ndarray],
         constant: Mapping[Variable, np.ndarray] | None = None,
         *,
+        task: str = "states",
         progressbar: bool = False,
     ) -> list[Array]:
         """Evaluate graphs at every draw; further inputs have a number a draw, or one for all."""
@@ -114,7 +115,7 @@ class VariableAtDraws:
         columns = [*self._columns, *drawn.values()]
         calls = ManyCalls(function, [column[0] for column in columns], list(constant.values()))
         with watched(calls, enabled=progressbar) as announce:
-            announce("states", len(columns[0]))
+            announce(task, len(columns[0]))
             results = calls(*columns)
         ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
         parts = np.split(results, ends, axis=1)

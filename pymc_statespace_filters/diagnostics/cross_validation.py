@@ -1,0 +1,274 @@
+"""How well a model foretells the next observation from those before it."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from arviz_stats import ELPDDataLFO, SamplingWrapper, ess, lfo_cv
+from arviz_stats.base import array_stats
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from pymc_statespace_filters.diagnostics.pointwise_terms import SEQUENTIAL, terms_at
+from pymc_statespace_filters.diagnostics.shortened_record import record_of, shortened
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.states.variable import chosen_variables
+
+Refit = Callable[[pm.Model], xr.DataTree]
+
+
+def leave_future_out(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    min_observations: int,
+    var_name: str | None = None,
+    refit: Refit | None = None,
+) -> ELPDDataLFO:
+    r"""Score each observation by its density given those before it, the parameters integrated out.
+
+    Leave-future-out cross-validation one step ahead: the sum over :math:`j > L` of
+    :math:`\log p(d_j \mid d_1 \dots d_{j-1})
+    = \log E[p(d_j \mid d_1 \dots d_{j-1}, \theta)]`, where :math:`\theta` has the posterior given
+    :math:`d_1 \dots d_{j-1}` alone. This is the cross-validation that the sequential terms of a
+    state-space model belong to; taken for leave-one-out (``az.loo``) they give a number without a
+    meaning.
+
+    Without `refit` the posteriors of shorter records come from that of the whole one, whose draws
+    are weighted by :math:`\exp(-\sum_{i \ge j} \log p(d_i \mid d_1 \dots d_{i-1}, \theta))`,
+    Pareto-smoothed. That costs nothing and reaches back as far as the later data taught little;
+    what the draws cannot tell is NaN. With `refit` it is ``az.lfo_cv``: a first fit to the first
+    `min_observations`, weights that add later observations, and a new fit wherever those fail.
+
+    Each draw is taken with the noise of its own estimate. With an unbiased filter
+    (`BootstrapPF`) both ways are therefore exact as the draws grow in number, for any number of
+    particles: parameters and noise together have a posterior, and the estimates are its terms.
+
+    The sum from :math:`L` on is the logarithm of the evidence of the whole record over that of the
+    first :math:`L` observations; from :math:`L = 0` on it is the log-evidence, which
+    `estimate_evidence` finds by better ways. What is left out of it is the part that the width of
+    the priors decides.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        Draws of the posterior given the whole record. The terms of its group ``log_likelihood``
+        are used if `compute_log_likelihood` made it; else they are computed.
+    model : pymc.Model, optional
+        The model of the ``with`` block if not given.
+    min_observations : int
+        Observations before the first that is scored, not counting those wholly missing. At least 1
+        with `refit`, else 0. Models to be compared need the same.
+    var_name : str, optional
+        The StateSpace variable, if the model has several. Everything else that the model observed
+        counts as known from the beginning.
+    refit : callable, optional
+        Given a copy of the model whose record ends early (later rows are missing), returns draws of
+        its posterior, such as ``lambda model: psf.sample_dram(1000, model=model, random_seed=1)``.
+
+    Returns
+    -------
+    arviz_stats.ELPDDataLFO
+        ``elpd`` with ``se``, the error from the data being as few as they are, not that of the
+        computation; ``elpd_i`` and ``pareto_k`` by time; ``refits``; ``p``, by how much less the
+        score is than with parameters that know the whole record. ``az.compare`` takes several.
+
+    Raises
+    ------
+    ModelError
+        If `min_observations` leaves nothing to score, or the model has several StateSpace variables
+        and none is named; and as `compute_log_likelihood`.
+
+    Warns
+    -----
+    EvidenceWarning
+        If draws of the whole record cannot tell some of the scores, and which they can.
+
+    References
+    ----------
+    P.-C. Bürkner, J. Gabry and A. Vehtari, "Approximate leave-future-out cross-validation for
+    Bayesian time series models", *Journal of Statistical Computation and Simulation* 90 (2020).
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> record = psf.simulate(system, {"a": 0.8}, steps=range(40), random_seed=1)
+    >>> with pm.Model() as model:
+    ...     a = pm.Normal("a", 0, 0.5)
+    ...     d = psf.StateSpace(
+    ...         "d", system, psf.EKF(), steps=range(40), observed=record["observations"]
+    ...     )
+    ...     idata = psf.sample_dram(500, tune=500, random_seed=1, progressbar=False)
+    ...     score = psf.leave_future_out(idata, min_observations=20)
+    >>> score.elpd_i.sizes["d_time"], bool(score.pareto_k.max() < 0.7)
+    (20, True)
+    """
+    model = pm.modelcontext(model)
+    variable = _one_variable(model, var_name)
+    time, name = variable.dims[0], variable.name
+    seen = np.flatnonzero(~np.isnan(record_of(model, name)).all(axis=1))
+    _check_number(min_observations, 0 if refit is None else 1, seen.size, name)
+    terms = _stored(idata, name)
+    if terms is None:
+        terms = terms_at(model, variable, draws_of(idata, None))
+    terms = terms.isel({time: seen})
+    if refit is None:
+        return _backwards(idata, terms, min_observations)
+    with warnings.catch_warnings():
+        # Many refits are no reason for doubt, and no argument of ours makes them more.
+        warnings.filterwarnings("ignore", "LFO-CV triggered")
+        return lfo_cv(
+            xr.DataTree.from_dict({"log_likelihood": terms.to_dataset(name=name)}),
+            _Refits(model, variable, seen, refit),
+            min_observations,
+            forecast_horizon=1,
+            time_dim=time,
+            pointwise=True,
+            k_threshold=_good_k(terms),
+        )
+
+
+def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
+    variables = chosen_variables(model, var_name)
+    if len(variables) > 1:
+        names = [variable.name for variable in variables]
+        raise ModelError(f"var_name must be one of {names}, got None")
+    return variables[0]
+
+
+def _check_number(given: int, least: int, n_observations: int, name: str) -> None:
+    whole = isinstance(given, int) and not isinstance(given, bool)
+    if not (whole and least <= given < n_observations):
+        raise ModelError(
+            f"min_observations must be an integer from {least} to {n_observations - 1}, as "
+            f"{name!r} has {n_observations} observations, got {given!r}"
+        )
+
+
+def _stored(idata: xr.DataTree, name: str) -> xr.DataArray | None:
+    """Terms that `compute_log_likelihood` left, each with the noise of its draw."""
+    if "log_likelihood" not in idata.children or name not in idata["log_likelihood"]:
+        return None
+    terms = idata["log_likelihood"].to_dataset()[name]
+    ours = terms.attrs.get("terms") == SEQUENTIAL
+    return terms.transpose("chain", "draw", ...) if ours else None
+
+
+def _good_k(terms: xr.DataArray) -> float:
+    """The Pareto k up to which so many draws are reliable (Vehtari et al. 2024)."""
+    n_draws = terms.sizes["chain"] * terms.sizes["draw"]
+    return min(0.7, 1 - 1 / np.log10(n_draws))
+
+
+def _backwards(idata: xr.DataTree, terms: xr.DataArray, min_observations: int) -> ELPDDataLFO:
+    """Scores from draws of the whole record, whose weights forget its end."""
+    rows = terms.values.reshape(-1, terms.shape[-1])
+    scored = rows[:, min_observations:]
+    forgotten = np.cumsum(scored[:, ::-1], axis=1)[:, ::-1]
+    efficiency = _efficiency(idata)
+    weighted = [_smoothed(column, efficiency) for column in forgotten.T]
+    log_weights, pareto_k = map(np.array, zip(*weighted, strict=True))
+    good_k = _good_k(terms)
+    known = pareto_k <= good_k
+    scores = logsumexp(log_weights + scored.T, axis=1) - logsumexp(log_weights, axis=1)
+    elpd_i = np.where(known, scores, np.nan)
+    gained = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
+    if not known.all():
+        _warn(known, good_k, min_observations)
+
+    def by_time(values: NDArray[np.float64]) -> xr.DataArray:
+        time = terms.dims[-1]
+        coords = {time: terms[time][min_observations:]} if time in terms.coords else {}
+        return xr.DataArray(values, dims=[time], coords=coords)
+
+    return ELPDDataLFO(
+        elpd=float(elpd_i.sum()),
+        se=float(np.sqrt(elpd_i.size) * elpd_i.std()),
+        p=float(gained.sum()),
+        n_samples=len(rows),
+        n_data_points=elpd_i.size,
+        scale="log",
+        warning=not known.all(),
+        good_k=good_k,
+        elpd_i=by_time(elpd_i),
+        pareto_k=by_time(pareto_k),
+        forecast_horizon=1,
+        min_observations=min_observations,
+        refits=np.array([], dtype=int),
+        n_refits=0,
+        p_lfo_i=by_time(gained),
+    )
+
+
+def _smoothed(
+    log_likelihood: NDArray[np.float64], efficiency: float
+) -> tuple[NDArray[np.float64], float]:
+    """Pareto-smoothed logarithms of weights that divide by a likelihood, and Pareto's k."""
+    try:
+        return array_stats.psislw(log_likelihood, r_eff=efficiency)
+    except ValueError:  # the largest weights are one draw's, at which a chain stood
+        return -log_likelihood, np.inf
+
+
+def _efficiency(idata: xr.DataTree) -> float:
+    """Effective over actual number of draws, the mean over the parameters."""
+    posterior = idata["posterior"].to_dataset()
+    n_draws = posterior.sizes["chain"] * posterior.sizes["draw"]
+    sizes = ess(posterior, method="mean")
+    return float(np.nanmean(np.concatenate([np.ravel(v) for v in sizes.values()])) / n_draws)
+
+
+def _warn(known: NDArray[np.bool_], good_k: float, min_observations: int) -> None:
+    last_unknown = int(np.flatnonzero(~known)[-1])
+    least = min_observations + last_unknown + 1
+    from_there = f"take min_observations={least}, or " if last_unknown < known.size - 1 else ""
+    warnings.warn(
+        f"draws of the whole record cannot tell {np.sum(~known)} of the {known.size} scores "
+        f"(Pareto k above {good_k:.2f}), which are NaN, as is their sum: {from_there}give refit= "
+        "to sample posteriors of shorter records",
+        EvidenceWarning,
+        stacklevel=4,
+    )
+
+
+class _Refits(SamplingWrapper):
+    """What ArviZ asks of a model that it has fitted again; fits are draws."""
+
+    def __init__(
+        self, model: pm.Model, variable: StateSpaceVariable, seen: NDArray[np.int64], refit: Refit
+    ) -> None:
+        super().__init__(model)
+        self._variable, self._seen, self._refit = variable, seen, refit
+
+    def sel_observations(self, idx: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+        """The row at which the record ends, and the rows that are left out."""
+        left_out = self._seen[idx]
+        return int(left_out[0]), left_out
+
+    def sample(self, modified_observed_data: int) -> xr.DataTree:
+        """Draws given the record up to a row."""
+        return self._refit(shortened(self.model, self._variable.name, modified_observed_data))
+
+    def get_inference_data(self, fitted_model: xr.DataTree) -> xr.DataTree:
+        """They are what the user's function returns."""
+        return fitted_model
+
+    def log_likelihood__i(
+        self, excluded_obs: NDArray[np.int64], idata__i: xr.DataTree
+    ) -> xr.DataArray:
+        """Terms of later rows, with the noise of each draw of a shorter record."""
+        terms = terms_at(self.model, self._variable, draws_of(idata__i, None))
+        return terms.isel({self._variable.dims[0]: excluded_obs})
