@@ -6,7 +6,7 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._compile import compiled
-from pymc_statespace_filters.filters._ensemble_states import LAST_EVENT, summary_kernel
+from pymc_statespace_filters.filters._ensemble_states import summary_kernel
 from pymc_statespace_filters.filters._failures import OUT_OF_MEMORY
 from pymc_statespace_filters.filters._noise import STORE_NORMALS, NoiseSizes, n_stored
 from pymc_statespace_filters.filters._random import padded
@@ -138,11 +138,16 @@ class EnsembleFilter:
         See `filters`, the room, for what it returns.
         """
         machine = ensemble_machine(system)
-        watched = self.algorithm(machine).watched(machine)
-        return Compiled(
-            summary_kernel(watched, system.n, self.size(), LAST_EVENT[moment]),
-            key_of(f"{moment} states {self!r}", machine.key),
-        )
+        filter = self.algorithm(machine)
+        if moment == "smoothed":
+            kernel = filter.smoother(system, machine)
+        else:
+            kernel = summary_kernel(filter.watched(machine), system.n, self.size(), moment)
+        return Compiled(kernel, key_of(f"{moment} states {self!r}", machine.key))
+
+    def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
+        """Bind the smoother of this filter to one system."""
+        raise NotImplementedError
 
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """Name the method of the smoothed states."""

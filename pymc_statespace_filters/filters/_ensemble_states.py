@@ -10,16 +10,11 @@ from pymc_statespace_filters.filters._compile import compiled
 from pymc_statespace_filters.filters._failures import NONE
 from pymc_statespace_filters.filters._random import STATES, uniform_at
 from pymc_statespace_filters.filters._weights import effective_number, normalise
-from pymc_statespace_filters.filters._witness import (
-    FORECAST,
-    RESAMPLED,
-    UPDATED,
-    WITNESS_ARGUMENTS,
-)
+from pymc_statespace_filters.filters._witness import FORECAST, UPDATED, WITNESS_ARGUMENTS
 from pymc_statespace_filters.machine_code import Entry, address_of, digest
 
-LAST_EVENT = {"predicted": int(FORECAST), "filtered": int(UPDATED)}
-"""The last event at a step that a moment knows of."""
+# The last event at a step that a moment knows of.
+_LAST_EVENT = {"predicted": int(FORECAST), "filtered": int(UPDATED)}
 
 # The witness's whole numbers: states, members, rows, last event, seed of the draws, next row; then
 # the steps of the rows. Its real ones: mean, sd, draw, each (rows, n), and effective number (rows).
@@ -27,10 +22,10 @@ _N_COUNTS = 6
 _NEXT = 5
 
 
-def _summarise(counts, numbers, event, j, k, members, log_weights, simulated, ancestors):
+def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated, ancestors):
     of = carray(counts, (_N_COUNTS,))
     n, N, n_rows = of[0], of[1], of[2]
-    if event == RESAMPLED or event > of[3]:  # members before resampling say the same, more exactly
+    if event > of[3]:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + n_rows,))[_N_COUNTS:]
     while of[_NEXT] < n_rows and rows[of[_NEXT]] < k:
@@ -39,20 +34,37 @@ def _summarise(counts, numbers, event, j, k, members, log_weights, simulated, an
     if row == n_rows or rows[row] != k:
         return
     X = carray(members, (n, N))
-    log_w, w = carray(log_weights, (N,)).copy(), np.empty(N)
-    for i in range(N):
-        for a in range(n):
+    w = finite_weights(X, carray(log_weights, (N,)))
+    summarise_row(carray(numbers, ((3 * n + 1) * n_rows,)), n_rows, row, X, w, of[4], k)
+
+
+@compiled
+def finite_weights(X, log_w):
+    """Normalised weights of the members that are finite; all zero if none is."""
+    log_w, w = log_w.copy(), np.zeros(log_w.size)
+    for a in range(X.shape[0]):
+        for i in range(w.size):
             if not np.isfinite(X[a, i]):
                 log_w[i] = -np.inf
-    if normalise(log_w, w) == -np.inf:
+    normalise(log_w, w)
+    return w
+
+
+@compiled
+def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
+    """Write mean, deviation, a draw and the effective number of weighted members to their row.
+
+    The draw is the one that falls to the uniform number of ``place``.
+    """
+    n = X.shape[0]
+    out = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)
+    if not w.any():
         return
-    out = carray(numbers, (3, n_rows, n))
-    u = uniform_at(of[4], STATES, k, 0)
     _moments(w, X, out[0, row], out[1, row])
-    chosen = choose(w, u)
+    chosen = choose(w, uniform_at(draw_seed, STATES, place, 0))
     for a in range(n):
         out[2, row, a] = X[a, chosen]
-    carray(numbers, ((3 * n + 1) * n_rows,))[3 * n * n_rows + row] = effective_number(w)
+    numbers[3 * n * n_rows + row] = effective_number(w)
 
 
 @compiled
@@ -87,7 +99,7 @@ def choose(w, u):
 SUMMARISE = Entry(_summarise, WITNESS_ARGUMENTS, "summarise", digest("summarise"))
 
 
-def summary_kernel(evaluate: Any, n: int, n_members: int, last_event: int) -> Any:
+def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
     """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
 
     Parameters
@@ -96,11 +108,10 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, last_event: int) -> An
         Of a filter and a system, see `EnsembleFilter.watched`.
     n, n_members : int
         Numbers of states and members.
-    last_event : int
-        See `LAST_EVENT`.
+    moment : {"predicted", "filtered"}
     """
     SUMMARISE.compile()
-    witness = SUMMARISE.symbol
+    witness, last_event = SUMMARISE.symbol, _LAST_EVENT[moment]
 
     @compiled
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
@@ -111,18 +122,33 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, last_event: int) -> An
         counts[_N_COUNTS:] = rows
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
         _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        moments = numbers[: 3 * n * R].reshape(3, R, n)
-        n_effective = numbers[3 * n * R :].copy()
-        _keep(counts)
+        keep(counts)
         if health[1] != NONE:
             for row in range(R):
                 if rows[row] >= steps[int(health[2])]:
-                    moments[:, row], n_effective[row] = np.nan, np.nan
-        return moments[0].copy(), moments[1].copy(), moments[2].copy(), n_effective, health
+                    forget_row(numbers, n, R, row)
+        return results(numbers, n, R, health)
 
     return run
 
 
 @compiled
-def _keep(counts):
-    """Be the last reader of an array whose address was handed on."""
+def forget_row(numbers, n, n_rows, row):
+    """Leave a row unknown."""
+    for place in range(3):
+        for a in range(n):
+            numbers[(place * n_rows + row) * n + a] = np.nan
+    numbers[3 * n * n_rows + row] = np.nan
+
+
+@compiled
+def results(numbers, n, n_rows, health):
+    """What rows were summarised to, as the function of the states gives it."""
+    moments = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)
+    n_effective = numbers[3 * n * n_rows : (3 * n + 1) * n_rows].copy()
+    return moments[0].copy(), moments[1].copy(), moments[2].copy(), n_effective, health
+
+
+@compiled
+def keep(counts):
+    """Be the last reader of an array whose address was handed on; else it was freed before."""

@@ -20,7 +20,7 @@ from pymc_statespace_filters.filters._noise import (
 from pymc_statespace_filters.filters._random import FILL_NORMALS
 from pymc_statespace_filters.filters._resampling import resample_if_few, resampler
 from pymc_statespace_filters.filters._system import initialise, propagate, read_system
-from pymc_statespace_filters.filters._witness import FORECAST, RESAMPLED, UPDATED, tell
+from pymc_statespace_filters.filters._witness import ENDED, FORECAST, RESAMPLED, UPDATED, tell
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, digest
 
 _ARGUMENTS = (
@@ -145,12 +145,13 @@ def filter_entry(
         state[0], state[1], state[2] = n_members, NONE, -1
         initialise(system, initial_normals(noise), sizes.width, members.X)
         k = np.int64(0)
-        tell(watched, FORECAST, -1, k, members, resampling.ancestors)
+        nothing, ancestors = np.empty(0), resampling.ancestors
+        tell(watched, FORECAST, -1, k, members, nothing, ancestors)
         for j in range(n_observations):
             while k < at[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
                 k += 1
-                tell(watched, FORECAST, j, k, members, resampling.ancestors)
+                tell(watched, FORECAST, j, k, members, nothing, ancestors)
             if is_missing(record, j):
                 out[j] = 0.0
                 continue
@@ -162,8 +163,10 @@ def filter_entry(
                 state[1], state[2] = failure, j
                 break
             out[j] = increment
-            tell(watched, UPDATED, j, k, members, resampling.ancestors)
+            tell(watched, UPDATED, j, k, members, record[j], ancestors)
             if resample(resampling, noise, j, k, n_effective, members):
-                tell(watched, RESAMPLED, j, k, members, resampling.ancestors)
+                tell(watched, RESAMPLED, j, k, members, nothing, ancestors)
+        if state[1] == NONE:
+            tell(watched, ENDED, n_observations, k, members, nothing, ancestors)
 
     return Entry(run, _ARGUMENTS, name, digest(name), needs=(FILL_NORMALS,))

@@ -12,25 +12,27 @@ from numba import types
 from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, call_address
 
-FORECAST, UPDATED, RESAMPLED = (np.int64(event) for event in range(3))
+FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
 """Events at step k: members are there (at step 0, or moved there from step k - 1), an observation
-has updated members and weights, members have been resampled (``ancestors`` tells from whom)."""
+has updated members and weights, members have been resampled (``ancestors`` tells from whom), the
+record is over."""
 
 WITNESS_ARGUMENTS = (
     COUNTS, NUMBERS,  # the witness's own
     types.int64, types.int64, types.int64,  # event, observation, step
-    NUMBERS, NUMBERS, NUMBERS,  # X (n, N), log_w (N,), D (p, N)
+    NUMBERS, NUMBERS,  # X (n, N), log_w (N,)
+    NUMBERS, NUMBERS,  # the observation (p,) and D (p, N), to be read when updated alone
     COUNTS,  # ancestors (N,), to be read when resampled alone
 )  # fmt: skip
 
 
 @pasted
-def tell(watched, event, j, k, members, ancestors):
+def tell(watched, event, j, k, members, d, ancestors):
     """Call the witness, if there is one."""
     witness, counts, numbers = watched
     if witness != 0:
         arguments = (
             counts, numbers, event, np.int64(j), k,
-            members.X, members.log_w, members.D, ancestors,
+            members.X, members.log_w, d, members.D, ancestors,
         )  # fmt: skip
         call_address(witness, arguments)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,9 +24,12 @@ from pymc_statespace_filters.filters._failures import (
 from pymc_statespace_filters.filters._gaussian import log_gaussian
 from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals
+from pymc_statespace_filters.filters._past import past_kernel
 from pymc_statespace_filters.filters._system import log_density, observe
 from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.lowering import Machine
 from pymc_statespace_filters.machine_code import Entry
+from pymc_statespace_filters.model import StateSpaceModel
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0
@@ -150,3 +153,12 @@ class EnKF(EnsembleFilter):
     def settings(self) -> tuple[float, ...]:
         """Return the number of the likelihood."""
         return (_LIKELIHOODS.index(self.likelihood),)
+
+    def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
+        """Bind the ensemble Kalman smoother to one system."""
+        watched, never = self.watched(machine), np.iinfo(np.int64).max // 2
+        return past_kernel(watched, machine, self.n_members, nudges=True, lag=never)
+
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """Name the method of the smoothed states."""
+        return "ensemble Kalman smoother"
