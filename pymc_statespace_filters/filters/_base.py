@@ -96,15 +96,8 @@ class EnsembleFilter:
 
     def watched(self, machine: Machine) -> Any:
         """The same function with the addresses of a witness and its two vectors: `_witness`."""
-        functions = machine_entries(machine)
-        for entry in (self.entry, *(f for f in functions if f is not None)):
-            entry.compile()
-        evaluate = self.entry.external
-        prepare, initialise, propagate, log_density = (f.symbol for f in functions[:4])
-        observe = functions.observe.symbol if functions.observe is not None else ""
-        free, dt = machine.free, machine.dt
-        shape = (machine.n, machine.p, machine.n_inputs, machine.n_constants, free.size)
-        constants = np.array([*shape, *[0] * (N_TABLE - len(shape)), *free], dtype=np.int64)
+        self.entry.compile()
+        evaluate, make_table, dt = self.entry.external, system_table(machine), machine.dt
         sizes = self.noise_sizes(machine)
         settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
 
@@ -116,10 +109,7 @@ class EnsembleFilter:
                 raise ModelError("normals must be those of this filter, system and steps")
             terms, health = np.full(steps.size, -np.inf), np.empty(3)
             health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
-            table = constants.copy()
-            table[5], table[6] = address_of(prepare), address_of(initialise)
-            table[7], table[8] = address_of(propagate), address_of(log_density)
-            table[9] = address_of(observe)
+            table = make_table()
             evaluate(
                 table.ctypes.data, dt, settings.ctypes.data, theta.ctypes.data, theta.size,
                 steps.ctypes.data, steps.size, observed.ctypes.data,
@@ -175,6 +165,29 @@ class EnsembleFilter:
             return out
 
         return Compiled(stored, key_of(f"stored noise {sizes}", STORE_NORMALS.key))
+
+
+def system_table(machine: Machine) -> Any:
+    """A function () -> the table that `_system.read_system` reads."""
+    functions = machine_entries(machine)
+    for entry in functions:
+        if entry is not None:
+            entry.compile()
+    prepare, initialise, propagate, log_density = (f.symbol for f in functions[:4])
+    observe = functions.observe.symbol if functions.observe is not None else ""
+    shape = (machine.n, machine.p, machine.n_inputs, machine.n_constants, machine.free.size)
+    padding = [0] * (N_TABLE - len(shape))
+    constants = np.array([*shape, *padding, *machine.free], dtype=np.int64)
+
+    @compiled
+    def make_table():
+        table = constants.copy()
+        table[5], table[6] = address_of(prepare), address_of(initialise)
+        table[7], table[8] = address_of(propagate), address_of(log_density)
+        table[9] = address_of(observe)
+        return table
+
+    return make_table
 
 
 @compiled

@@ -256,7 +256,7 @@ def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool
 def _settlement(rows, steps, observed, lag):
     """At which observation each row is settled, and how many rows wait for that at most."""
     seen = np.array([j for j in range(steps.size) if not is_missing(observed, j)], np.int64)
-    settled_at, most = np.empty(rows.size, np.int64), np.int64(1)
+    settled_at, most = np.empty(rows.size, np.int64), 1
     first, until = 0, 0  # the first seen observation not before a row; rows there when it settles
     for row in range(rows.size):
         while first < seen.size and steps[seen[first]] < rows[row]:

@@ -1,7 +1,7 @@
 """Bootstrap particle filter (thesis, section 4.4, Eqs. 4.27-4.28, 4.43-4.44): the unbiased one."""
 
 from dataclasses import KW_ONLY, dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -11,6 +11,10 @@ from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._ensemble import mark_finite
 from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters._loop import filter_entry
+from pymc_statespace_filters.filters._particle_smoother import (
+    particle_smoother,
+    particle_smoothing_method,
+)
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
     check_sortable,
@@ -19,6 +23,7 @@ from pymc_statespace_filters.filters._resampling import (
 )
 from pymc_statespace_filters.filters._system import log_density
 from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.lowering import Machine
 from pymc_statespace_filters.machine_code import Entry
 from pymc_statespace_filters.model import StateSpaceModel
 
@@ -115,3 +120,11 @@ class BootstrapPF(EnsembleFilter):
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""
         return n_normals(self.resampling, self.n_particles)
+
+    def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
+        """Bind the smoother of this filter to one system."""
+        return particle_smoother(self, system, machine, nudges=False)
+
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """Name the method of the smoothed states."""
+        return particle_smoothing_method(system)

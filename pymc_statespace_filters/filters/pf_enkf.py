@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,10 @@ from pymc_statespace_filters.filters._kernel_density import (
 )
 from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals
+from pymc_statespace_filters.filters._particle_smoother import (
+    particle_smoother,
+    particle_smoothing_method,
+)
 from pymc_statespace_filters.filters._resampling import (
     SCHEMES,
     check_sortable,
@@ -281,3 +285,11 @@ class PFEnKF(EnsembleFilter):
         return BootstrapPF(
             self.n_particles, resample_below=self.resample_below, resampling=self.resampling
         )
+
+    def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
+        """Bind the smoother of this filter to one system."""
+        return particle_smoother(self, system, machine, nudges=True)
+
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """Name the method of the smoothed states."""
+        return particle_smoothing_method(system)

@@ -28,7 +28,7 @@ from pymc_statespace_filters.lowering.members import (
     machine_entries,
     one_state_entries,
 )
-from pymc_statespace_filters.lowering.noise import is_linear
+from pymc_statespace_filters.lowering.noise import is_linear, process_noise_reaches_every_state
 from pymc_statespace_filters.lowering.one_state import (
     OneState,
     has_additive_process_noise,
@@ -63,6 +63,7 @@ __all__ = [
     "observation_sampler",
     "one_state",
     "one_state_entries",
+    "process_noise_reaches_every_state",
     "semidefinite_cholesky",
     "symbols_of",
     "vector_functions",

@@ -1,8 +1,10 @@
 """What the Jacobians of a system tell: noises that can be drawn as one, and linearity."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
+import pytensor
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
@@ -13,6 +15,8 @@ from pymc_statespace_filters.lowering.graphs import SYMBOLS, call, jacobian_of, 
 from pymc_statespace_filters.lowering.source import depends_on
 from pymc_statespace_filters.lowering.unroll import NotUnrollableError
 from pymc_statespace_filters.model import StateSpaceModel
+
+_N_TRIALS = 5
 
 
 def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
@@ -45,6 +49,35 @@ def is_linear(system: StateSpaceModel) -> bool:
         for name in names
     ]
     return all(is_free_of(variables, jac, symbols) for jac in jacobians)
+
+
+@lru_cache(maxsize=256)
+def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
+    """Whether the noise of one step has a covariance of full rank, at a state somewhere.
+
+    Found by trial at a few points, for parameters may have any range; at points of its own, such as
+    a noise of zero, the rank may be less.
+    """
+    if system.m < system.n:
+        return False
+    symbols = symbols_of(system)
+    gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
+    cov = pt.as_tensor(np.eye(system.m))
+    if system.equations.process_noise is not None:
+        cov = call(system.equations.process_noise, system, symbols)
+    inputs = [symbols[name] for name in ("theta", "x", "q", "u", "t")]
+    noise_cov = pytensor.function(
+        inputs, gain @ cov @ gain.T, mode="FAST_COMPILE", on_unused_input="ignore"
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(_N_TRIALS):
+        point = [np.abs(rng.normal(size=value.type.shape)) for value in inputs]
+        found = noise_cov(*point)
+        if np.isfinite(found).all() and (found.diagonal() > 0).all():
+            sd = np.sqrt(found.diagonal())
+            if np.linalg.matrix_rank(found / np.outer(sd, sd), tol=1e-10) == system.n:
+                return True
+    return False
 
 
 def is_free_of(
