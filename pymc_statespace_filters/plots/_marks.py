@@ -20,6 +20,7 @@ DATA = {"color": "C1"}
 TRUTH = {"color": "B1", "width": 0.9}
 PATHS = {"color": "C0", "alpha": 0.4, "width": 0.6}
 DOTS = {"color": "C0", "alpha": 0.4, "diameter": 2}
+LONGEST_KEY = 5
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
@@ -138,8 +139,9 @@ def write_key(
     collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], n_columns: int = 1
 ) -> None:
     """Write what the marks mean above the panels, which are in so many columns."""
+    in_line = -(-len(entries) // (1 + (len(entries) > LONGEST_KEY)))  # or in two lines
     places: dict[str, dict[str, Any]] = {  # in the words of each backend
-        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": len(entries)},
+        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": in_line},
         "plotly": {
             "legend_orientation": "h",
             "legend_y": 1.02,
@@ -150,7 +152,7 @@ def write_key(
         "bokeh": {  # above one panel alone, and no wider
             "side": "above",
             "border_line_alpha": 0.0,
-            "ncols": len(entries) if n_columns == 1 else 2,
+            "ncols": in_line if n_columns == 1 else 2,
         },
         "none": {},
     }

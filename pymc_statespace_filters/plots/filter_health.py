@@ -127,7 +127,7 @@ def plot_filter_health(
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={},
-        size=(4.2 * in_line, 0.6 + 2.7 * -(-n_panels // in_line)),
+        size=(3.6 * in_line, 0.6 + 2.5 * -(-n_panels // in_line)),
         n_panels=n_panels,
         panels_in_line=in_line,
         cols=["__variable__", "observable"],
@@ -136,7 +136,7 @@ def plot_filter_health(
     collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
     collection.map(bars, "seen", data=_from_zero(seen[["autocorrelation"]]), width=2, **SEEN)
     collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
-    key = {"95 % if filter and model are right": {**EXPECTED, "width": 8}}
+    key = {"95 % if all is well": {**EXPECTED, "width": 8}}
     if effective is not None:
         key |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
@@ -211,7 +211,7 @@ def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, d
     collection.map(
         name_ticks, data=logs, ticks=logarithmic_ticks(ends), ignore_aes="all", store_artist=False
     )
-    return {**key, f"collapse ({COLLAPSED} particles)": LIMIT}
+    return {**key, "collapse": LIMIT}
 
 
 def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataTree) -> None:

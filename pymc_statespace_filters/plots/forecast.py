@@ -103,7 +103,7 @@ def plot_forecast(
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={},
-        size=(8.0, 1.5 + 2.0 * len(observables) ** 0.9),
+        size=(7.0, 1.3 + 2.0 * len(observables) ** 0.9),
         n_panels=len(observables),
         panels_in_line=1,
         cols=["observable"],
@@ -117,7 +117,7 @@ def plot_forecast(
         collection.map(vline, "end", data=end.to_dataset(name="end"), color="B2", linestyle="C1")
         collection.map(points, "data", data=past.to_dataset(name="data"), diameter=4, **DATA)
         key["data"] = in_key(DATA)
-        key["end of the record"] = {"color": "B2", "linestyle": "C1"}
+        key["end of record"] = {"color": "B2", "linestyle": "C1"}
     if truth is not None:
         came = truth.reindex(observable=observables).to_dataset(name="truth")
         collection.map(points, "truth", data=came, diameter=4, color=TRUTH["color"])

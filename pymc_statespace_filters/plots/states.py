@@ -66,7 +66,8 @@ def plot_states(
         default each observable that has the name of a state.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
         What `simulate` returned; a DataArray with a dimension ``state`` and another whose
-        coordinate is time; or an array of shape (number of times drawn, number of states).
+        coordinate is time; or an array of shape (number of times drawn, number of states). Drawn
+        from the first of these times to the last.
     n_draws : int
         So many draws beside the bands: paths of smoothed states; of filtered states, which are
         drawn at each time by itself, points.
@@ -110,6 +111,8 @@ def plot_states(
     record = _record(idata, name, observables, all_states)
     if truth is not None:
         truth = truth_of(truth, "states", "state", all_states, draws["time"].values)
+        begin, end = draws["time"].values[[0, -1]]
+        truth = truth.where((truth["time"] >= begin) & (truth["time"] <= end), drop=True)
 
     data = draws.sel(state=shown).to_dataset(name="states")
     collection = canvas(
@@ -117,7 +120,8 @@ def plot_states(
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={},
-        size=(8.0, 1.5 + 2.0 * len(shown) ** 0.9),
+        size=(7.0, 1.3 + 2.0 * len(shown) ** 0.9),
+        n_panels=len(shown),
         panels_in_line=1,
         cols=["state"],
     )
@@ -126,18 +130,12 @@ def plot_states(
         collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
     key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
     if truth is not None:
-        collection.map(
-            curve, "truth", data=truth.reindex(state=shown).to_dataset(name="truth"), **TRUTH
-        )
+        true = truth.reindex(state=shown).to_dataset(name="truth")
+        collection.map(curve, "truth", data=true, **TRUTH)
         key["truth"] = TRUTH
     if record is not None:
-        collection.map(
-            points,
-            "data",
-            data=record.reindex(state=shown).to_dataset(name="data"),
-            diameter=4,
-            **DATA,
-        )
+        seen = record.reindex(state=shown).to_dataset(name="data")
+        collection.map(points, "data", data=seen, diameter=4, **DATA)
         key["data"] = in_key(DATA)
     write_axes(collection, draws["time"])
     write_key(collection, key)

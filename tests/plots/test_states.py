@@ -97,6 +97,13 @@ def test_truth(form, states):
         np.testing.assert_array_equal(truth["speed"]["y"], -SINE)
 
 
+def test_truth_ends_where_the_states_do(states):
+    times = np.arange(-10, 60) / 10
+    true = xr.DataArray(times[:, None], coords=[("time", times), ("state", ["position"])])
+    truth = drawn(plot_states(states, truth=true, backend="none"), "truth")["position"]
+    np.testing.assert_allclose(truth["y"], TIMES, atol=1e-12)
+
+
 def test_dimensions_of_another_name(states):
     group = states["smoothed_states"].to_dataset()
     group = group.rename(d_time="month", state="d_state")
@@ -115,6 +122,14 @@ def test_panels_and_their_names(states):
     assert key == ["median", "50 %", "90 %", "data"]
     (axes,) = plot_states(states, states="speed").viz["figure"].item().axes
     assert axes.get_ylabel() == "speed"
+
+
+@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
+def test_many_states(backend):
+    values = np.random.default_rng(1).normal(size=(1, 5, 41, 12))
+    group = states_group(values, [f"x{i}" for i in range(12)])
+    tree = xr.DataTree.from_dict({"smoothed_states": group})
+    assert plot_states(tree, backend=backend, col_wrap=2).viz["median"]["states"].size == 12
 
 
 def test_what_is_refused(states):
