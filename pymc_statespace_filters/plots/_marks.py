@@ -152,7 +152,11 @@ def write_key(
         "bokeh": {  # above one panel alone, and no wider
             "side": "above",
             "border_line_alpha": 0.0,
-            "ncols": in_line if n_columns == 1 else 2,
+            "margin": 0,
+            "padding": 0,
+            "ncols": in_line if n_columns == 1 else 3,
+            "label_text_font_size": "12px" if n_columns == 1 else "10px",
+            "glyph_width": 20 if n_columns == 1 else 12,
         },
         "none": {},
     }
