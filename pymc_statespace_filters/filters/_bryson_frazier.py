@@ -20,7 +20,7 @@ the two records say. Of the simulated path only the filter's error e = x - m mat
     over a step     e <- F e + B q
     at an observation, where y+ = H e + v,  v ~ N(0, R),    e <- e - K y+
 
-and the path drawn is m + e - P n, where n is the adjoint l of the innovations y - y+. Before the
+and the path drawn is m + e - P l*, where l* is the adjoint l of the innovations y - y+. Before the
 smoothing, m + e is a draw of N(m, P), and no square root of P was taken.
 
 F, B and H are Jacobians at the filter's own means: exact for linear systems, otherwise the extended
@@ -34,7 +34,14 @@ from pytensor.graph.replace import graph_replace
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.filters._linearised import Symbols, move_from, pack, sight_from, unpack
+from pymc_statespace_filters.filters._linearised import (
+    Sight,
+    Symbols,
+    move_from,
+    pack,
+    sight_from,
+    unpack,
+)
 from pymc_statespace_filters.filters._recursion import Recursion
 from pymc_statespace_filters.lowering import Graph, VectorFunction
 
@@ -43,7 +50,7 @@ class BrysonFrazier:
     """The functions of the smoother of a Gaussian filter, which is given as a `Recursion`.
 
     The vector ``s`` is the filter's, then the simulated error (n,); the adjoint ``s_bar`` is l, the
-    lower triangle of L, then n. ``Z`` holds the noises of each step in its columns: q, then
+    lower triangle of L, then l*. ``Z`` holds the noises of each step in its columns: q, then
     standard normals for v.
     """
 
@@ -134,8 +141,11 @@ class BrysonFrazier:
         moved = move.state_jac @ self._error
         return moved + move.noise_jac @ self._z[: system.m] if system.m else moved
 
-    def _sight(self) -> tuple:
-        """The linearised observation, and the innovation y+ of the simulated record."""
+    def _sight(self) -> tuple[Sight, TensorVariable]:
+        """The linearised observation, and the innovation y+ of the simulated record.
+
+        Where nothing was seen y+ is noise alone, which the gain and H leave out.
+        """
         system = self.recursion.system
         sight = sight_from(system, self._symbols, *self._moments())
         noise = cholesky(sight.noise_cov, lower=True) @ self._z[system.m :]
@@ -155,13 +165,13 @@ class BrysonFrazier:
         sight, simulated = self._sight()
         back = sight.kept.T
 
-        def pull(rows: TensorVariable, b_ndim: int) -> TensorVariable:
-            """What S^-1/2 H and S^-1/2 are multiplied by from the left."""
+        def whitened(rows: TensorVariable, b_ndim: int) -> TensorVariable:
+            """S^-1/2 times rows."""
             return solve_triangular(sight.chol, rows, lower=True, b_ndim=b_ndim)
 
-        half = pull(sight.seen_jac, 2)  # H' S^-1 y = (S^-1/2 H)' (S^-1/2 y)
-        vector = back @ vector - half.T @ pull(sight.residual, 1)
-        drawn = back @ drawn - half.T @ pull(sight.residual - simulated, 1)
+        half = whitened(sight.seen_jac, 2)  # H' S^-1 y = (S^-1/2 H)' (S^-1/2 y)
+        vector = back @ vector - half.T @ whitened(sight.residual, 1)
+        drawn = back @ drawn - half.T @ whitened(sight.residual - simulated, 1)
         return pt.concatenate([pack(vector, back @ matrix @ back.T + half.T @ half), drawn])
 
     def _smoothed(self) -> list[TensorVariable]:

@@ -254,3 +254,33 @@ def test_impossible_parameters_have_no_states(states, moment):
     found = states(moment, REGULAR | {"spread": -0.1})
     assert all(np.isnan(values).all() for values in found[:4])
     np.testing.assert_array_equal(found.health, [np.inf, 2.0, 0.0])
+
+
+@pytest.mark.slow
+@MOMENTS
+def test_twenty_states_run_on_arrays(moment):
+    """Half of them known at the start, half without noise. Mostly compilation, half a minute."""
+    n = 20
+    A = 0.85 * np.eye(n) + 0.05 * np.roll(np.eye(n), 1, axis=1)
+    B, C, start = 0.3 * np.eye(n)[:, ::2], np.eye(n)[::4], np.diag(np.arange(n) % 2.0)
+    ring = psf.StateSpaceModel(
+        transition=lambda x, q: A @ x + B @ q,
+        process_noise=np.eye(n // 2),
+        observation=lambda x: C @ x,
+        observation_noise=0.2 * np.eye(5),
+        initial_mean=np.ones(n),
+        initial_cov=start,
+    )
+    steps, rows = np.array([0, 2, 5]), np.arange(6)
+    observed = np.random.default_rng(20).normal(size=(3, 5))
+    observed[1, 1] = np.nan
+    run = psf.EKF().compile_states(ring, moment).function
+    record = (np.zeros(0), steps, observed, np.zeros((0, 0)), 0.0, 0, rows)
+    found, law = States(*run(*record, 0)), (A, B @ B.T, C, 0.2 * np.eye(5), np.ones(n), start)
+    truth = linear_states(*law, steps=steps, observed=observed, rows=rows, moment=moment)
+    np.testing.assert_allclose(found.mean, truth.mean, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found.sd**2, truth.sd**2, rtol=0.0, atol=1e-12)
+    # Six rows, two tests each: a right one fails once in a thousand.
+    draws = np.array([States(*run(*record, seed)).drawn for seed in range(1000)])
+    for i in range(len(rows)):
+        assert_drawn_from(draws[:, i], truth.mean[i], truth.cov[i, :, i], 1e-3 / 12)
