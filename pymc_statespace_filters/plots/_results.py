@@ -51,6 +51,17 @@ def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
     return None if record is None else named(record, "time", "observable")
 
 
+def are_paths(group: str, results: xr.Dataset) -> bool:
+    """Tell whether a draw may be joined to a line: it is one path, and known at every step."""
+    return group != "filtered_states" and results.attrs.get("at") != "observations"
+
+
+def check_count(argument: str, count: Any) -> None:
+    """Raise an error for what is no number of things."""
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
+        raise ModelError(f"{argument} must be an integer of at least 0, got {count!r}")
+
+
 def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:
     """Return `names`, all of them if None, checked against what there is."""
     if names is None:

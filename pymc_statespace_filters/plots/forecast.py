@@ -18,7 +18,14 @@ from pymc_statespace_filters.plots._marks import (
     write_axes,
     write_key,
 )
-from pymc_statespace_filters.plots._results import data_of, group_of, named, truth_of, variable_of
+from pymc_statespace_filters.plots._results import (
+    check_count,
+    data_of,
+    group_of,
+    named,
+    truth_of,
+    variable_of,
+)
 
 PAST = 2.0  # so much of the record, in lengths of the forecast, is drawn
 FEWEST_OF_PAST = 10
@@ -88,6 +95,8 @@ def plot_forecast(
     >>> collection = plot_forecast(idata, truth=came[100:])
     >>> collection.savefig("forecast.png")  # doctest: +SKIP
     """
+    if n_past is not None:
+        check_count("n_past", n_past)
     _, results = group_of(idata, "predictions")
     predicted = results[[name for name in results if not str(name).endswith("_states")]]
     name = variable_of(predicted, var_name)
@@ -110,7 +119,7 @@ def plot_forecast(
     )
     key = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
     if record is not None:
-        past = record.isel(time=slice(-_n_past(record, draws) if n_past is None else -n_past, None))
+        past = record.tail(time=_n_past(record, draws) if n_past is None else n_past)
         end = record["time"][-1].expand_dims(observable=observables).drop_vars("time")
         if truth is not None:
             truth = truth.where(truth["time"] > record["time"][-1], drop=True)

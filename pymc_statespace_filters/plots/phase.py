@@ -22,6 +22,8 @@ from pymc_statespace_filters.plots._marks import (
 )
 from pymc_statespace_filters.plots._results import (
     SAMPLE_DIMS,
+    are_paths,
+    check_count,
     chosen,
     group_of,
     named,
@@ -45,7 +47,8 @@ def plot_phase(
     """Draw one quantity against another while time goes: the phase portrait, the loop of a force.
 
     The thin lines are draws, the thick line goes through the medians of both. Filtered states are
-    drawn at each time by itself, and so their draws are points instead.
+    drawn at each time by itself, and between observations alone nothing is known: such draws are
+    points.
 
     Parameters
     ----------
@@ -61,6 +64,7 @@ def plot_phase(
     truth : xarray.DataArray, xarray.Dataset or pair of array_like, optional
         What `simulate` returned (if x and y are names of states), or the true x and y over time.
     n_draws : int
+        So many draws beside the median.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         By default that of ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -96,6 +100,7 @@ def plot_phase(
     >>> loop = plot_phase(idata, "position", force)
     >>> loop.savefig("loop.png")  # doctest: +SKIP
     """
+    check_count("n_draws", n_draws)
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
@@ -108,7 +113,7 @@ def plot_phase(
     true = None if truth is None else _truth(truth, x, y, states)
 
     collection = canvas(data, backend=backend, pc_kwargs=pc_kwargs, aes={}, size=(6.0, 5.0))
-    mark, style = (points_xy, DOTS) if group == "filtered_states" else (path_xy, PATHS)
+    mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
     style = {**style, "alpha": 0.25}  # beside the thick line
     collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
     median = over_draws(data).sel(quantile=0.5)

@@ -23,6 +23,8 @@ from pymc_statespace_filters.plots._marks import (
     write_key,
 )
 from pymc_statespace_filters.plots._results import (
+    are_paths,
+    check_count,
     chosen,
     data_of,
     group_of,
@@ -69,8 +71,8 @@ def plot_states(
         coordinate is time; or an array of shape (number of times drawn, number of states). Drawn
         from the first of these times to the last.
     n_draws : int
-        So many draws beside the bands: paths of smoothed states; of filtered states, which are
-        drawn at each time by itself, points.
+        So many draws beside the bands: paths of smoothed states at every step; otherwise, and of
+        filtered states, which are drawn at each time by itself, points.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         By default that of ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -102,6 +104,7 @@ def plot_states(
     >>> collection = plot_states(idata, truth=np.sin(times))
     >>> collection.savefig("states.png")  # doctest: +SKIP
     """
+    check_count("n_draws", n_draws)
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
@@ -126,7 +129,7 @@ def plot_states(
         cols=["state"],
     )
     if n_draws:
-        mark, style = (points, DOTS) if group == "filtered_states" else (paths, PATHS)
+        mark, style = (paths, PATHS) if are_paths(group, results) else (points, DOTS)
         collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
     key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
     if truth is not None:

@@ -23,6 +23,8 @@ def test_so_much_of_the_record_is_drawn(forecast):
     data = drawn(plot_forecast(forecast, backend="none"), "data")
     np.testing.assert_allclose(data["speed"]["x"], TIMES[10:31])  # twice one second
     np.testing.assert_allclose(data["speed"]["y"], np.cos(TIMES[10:31]))
+    nothing = drawn(plot_forecast(forecast, n_past=0, backend="none"), "data")
+    assert set(nothing.values()) == {None}
     for n_past, first in ((3, 28), (100, 0)):
         data = drawn(plot_forecast(forecast, n_past=n_past, backend="none"), "data")
         np.testing.assert_allclose(data["position"]["x"], TIMES[first:31])
@@ -68,5 +70,7 @@ def test_what_is_refused(forecast):
         plot_forecast(xr.DataTree())
     with pytest.raises(ModelError, match="idata must be a DataTree of draws, got Dataset"):
         plot_forecast(xr.Dataset())
+    with pytest.raises(ModelError, match="n_past must be an integer of at least 0, got -1"):
+        plot_forecast(forecast, n_past=-1)
     with pytest.raises(ModelError, match=r"truth must have shape \(10, 2\).*got shape \(10,\)"):
         plot_forecast(forecast, truth=np.zeros(10))

@@ -73,6 +73,10 @@ def test_draws_are_paths_if_smoothed_and_points_if_filtered(states):
     points = drawn(filtered, "draws")["speed"]
     assert points["function"] == "scatter"
     assert points["y"].size == 27
+    group = states["smoothed_states"].to_dataset().assign_attrs(at="observations")
+    at_observations = xr.DataTree.from_dict({"smoothed_states": group})
+    points = drawn(plot_states(at_observations, n_draws=3, backend="none"), "draws")["speed"]
+    assert points["function"] == "scatter"  # a line would claim something for the time between
 
 
 @pytest.mark.parametrize("form", ["array", "data array", "simulate", "one state"])
@@ -139,6 +143,8 @@ def test_what_is_refused(states):
         plot_states(states, group="predictions")
     with pytest.raises(ModelError, match=r"var_name must be one of \['d'\], got 'y'"):
         plot_states(states, var_name="y")
+    with pytest.raises(ModelError, match=r"n_draws must be an integer of at least 0, got 0\.5"):
+        plot_states(states, n_draws=0.5)
     with pytest.raises(ModelError, match=r"states must be among \['position', 'speed'\], got \['v"):
         plot_states(states, states=["v"])
     with pytest.raises(ModelError, match=r"its values must be among \['position'\], got \['y0'\]"):
