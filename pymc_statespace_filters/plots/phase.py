@@ -113,9 +113,12 @@ def plot_phase(
     true = None if truth is None else _truth(truth, x, y, states)
 
     collection = canvas(data, backend=backend, pc_kwargs=pc_kwargs, aes={}, size=(6.0, 5.0))
-    mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
-    style = {**style, "alpha": 0.25}  # beside the thick line
-    collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+    key = {}
+    if n_draws:
+        mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
+        style = {**style, "alpha": 0.25}  # beside the thick line
+        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+        key["draws"] = {**PATHS, "width": 1.5}
     median = over_draws(data).sel(quantile=0.5)
     lines = {"median": ({"color": "C0", "width": 2.5}, median)}
     if true is not None:
@@ -124,8 +127,7 @@ def plot_phase(
         collection.map(line_xy, label, data=line, **line_style)
     collection.map(labelled_x, "x_label", text=str(both[0].name))
     collection.map(labelled_y, "y_label", text=str(both[1].name))
-    thin = {**PATHS, "width": 1.5}
-    write_key(collection, {"draws": thin} | {k: style for k, (style, _) in lines.items()})
+    write_key(collection, key | {label: style for label, (style, _) in lines.items()})
     return collection
 
 

@@ -79,3 +79,12 @@ def test_nothing_in_a_picture_overlaps(plot, table):
         assert not any(box.overlaps(other) for other in boxes[i + 1 :])
         assert figure.bbox.containsx(box.x0)
         assert figure.bbox.containsx(box.x1)
+
+
+@pytest.mark.parametrize(("plot", "result"), PLOTS[-4:])
+def test_the_key_is_beside_the_panels(plot, result, request):
+    figure = plot(request.getfixturevalue(result)).viz["figure"].item()
+    figure.canvas.draw()
+    (key,) = (legend.get_window_extent() for legend in figure.legends)
+    assert figure.bbox.x0 <= key.x0 < key.x1 <= figure.bbox.x1
+    assert not any(key.overlaps(axes.get_tightbbox()) for axes in figure.axes)
