@@ -120,6 +120,46 @@ def move(first, end, masses, mass, low, n):
     return out
 
 
+@reducing
+def _mean_over_gaussian(first, spacing, mean, sd, values):
+    """What `_add_gaussian` would add of a unit mass, times ``values``, summed."""
+    scale = spacing / sd
+    start = (first * spacing - mean) / sd
+    result = 0.0
+    for b in range(values.size):
+        z = start + b * scale
+        result += exp(-0.5 * z * z) * values[b]
+    return scale * _ONE_OVER_ROOT_TWO_PI * result
+
+
+@internal
+def gather(low, spacing, values, mean, sd, reach):
+    """Mean of ``values``, on a lattice, over N(mean_i, sd_i^2): the transpose of `spread`."""
+    out = np.zeros(mean.size)
+    for i in range(mean.size):
+        first, last = _target(mean[i], sd[i], spacing, reach)
+        first, last = max(first, float(low)), min(last, float(low + values.size))
+        if first < last:
+            target = values[np.int64(first) - low : np.int64(last) - low]
+            out[i] = _mean_over_gaussian(first, spacing, mean[i], sd[i], target)
+    return out
+
+
+@reducing
+def gather_rows(first, end, masses, low, values, n):
+    """The same as `gather`, with the first ``n`` rows of a kernel made before."""
+    out = np.empty(n)
+    for i in range(n):
+        start = max(first[i], low)
+        size = min(first[i] + end[i + 1] - end[i], low + values.size) - start
+        at, target = end[i] + start - first[i], start - low
+        result = 0.0
+        for b in range(size):
+            result += masses[at + b] * values[target + b]
+        out[i] = result
+    return out
+
+
 @internal
 def significant(mass, share):
     """The range [first, last) outside of which masses are below a share of the largest."""

@@ -78,6 +78,30 @@ def begin(system, spacing, reach):
 @internal
 def forecast(system, k, t, spacing, reach, grid, table):
     """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
+    low, _, mass = grid
+    tabled, mean, sd, shares, table = step_from(system, k, t, spacing, reach, grid, table)
+    lost = total(mass, shares)
+    if lost == np.inf:
+        return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
+    target, n = reached(mean, sd, mass, spacing, reach)
+    if n > MAX_POINTS:
+        target, n = _drop_escaping(system, k, t, mean, sd, mass, spacing, reach)
+    source = mean, sd, mass
+    if n == 0 or n > MAX_POINTS:
+        code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
+        return code, grid, source, table, lost
+    if tabled:
+        starts, ends, masses = rows_from(low, table)
+        out = move(starts, ends, masses, mass, target, n)
+    else:
+        out = spread(target, n, spacing, *source, reach)
+    i, j = significant(out, cut_of(reach))
+    return NONE, (target + i, spacing, out[i:j]), source, table, lost
+
+
+@pasted
+def step_from(system, k, t, spacing, reach, grid, table):
+    """What one step does to every point: (is it in the table?, mean, sd, shares, table)."""
     low, here, mass = grid
     tabled = system.same_every_step and here == spacing and mass.size > 1
     first, mean, sd, shares, rows = table
@@ -90,24 +114,14 @@ def forecast(system, k, t, spacing, reach, grid, table):
             rows = kernel(spacing, mean, sd, reach)
             table = first, mean, sd, shares, rows
     here_on = slice(low - first, low - first + mass.size)
-    mean, sd, shares = mean[here_on], sd[here_on], shares[here_on]
-    lost = total(mass, shares)
-    if lost == np.inf:
-        return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
-    target, n = reached(mean, sd, mass, spacing, reach)
-    if n > MAX_POINTS:
-        target, n = _drop_escaping(system, k, t, mean, sd, mass, spacing, reach)
-    source = mean, sd, mass
-    if n == 0 or n > MAX_POINTS:
-        code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
-        return code, grid, source, table, lost
-    if tabled:
-        starts, ends, masses = rows
-        out = move(starts[low - first :], ends[low - first :], masses, mass, target, n)
-    else:
-        out = spread(target, n, spacing, *source, reach)
-    i, j = significant(out, cut_of(reach))
-    return NONE, (target + i, spacing, out[i:j]), source, table, lost
+    return tabled, mean[here_on], sd[here_on], shares[here_on], table
+
+
+@pasted
+def rows_from(low, table):
+    """The rows of a table's kernel from point ``low`` on."""
+    first, _, _, _, (starts, ends, masses) = table
+    return starts[low - first :], ends[low - first :], masses
 
 
 @pasted

@@ -10,7 +10,6 @@ What the lattice must hold is watched, not assumed: an evaluation that finds it 
 short starts again with a finer or a longer one.
 """
 
-import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -18,24 +17,21 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._compile import compiled, internal, pasted
+from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._failures import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
     OUT_OF_MEMORY,
     ZERO_WEIGHTS,
 )
-from pymc_statespace_filters.filters._missing import is_missing
-from pymc_statespace_filters.filters._one_state import move_points, read_one_state
-from pymc_statespace_filters.filters._point_mass import (
-    REFINEMENT,
-    TOO_COARSE,
-    TOO_SHORT,
-    begin,
-    forecast,
-    no_table,
-    see,
+from pymc_statespace_filters.filters._grid_pass import (
+    attempt,
+    first_lattice,
+    keep_nothing,
+    next_lattice,
 )
+from pymc_statespace_filters.filters._grid_states import GRID_STATES, MOMENTS
+from pymc_statespace_filters.filters._one_state import read_one_state
 from pymc_statespace_filters.lowering import (
     Compiled,
     OneState,
@@ -46,10 +42,6 @@ from pymc_statespace_filters.lowering import (
 )
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, address_of, digest, key_of
 from pymc_statespace_filters.model import StateSpaceModel
-
-_LENGTHENING = 1.6
-_SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
-_PER_STEP = 1e-5  # of the tolerance, what one step's error is planned for
 
 _ARGUMENTS = (
     types.intp, types.intp, types.intp,  # addresses of the system's functions
@@ -148,6 +140,21 @@ class GridFilter:
         functions = one_state(system)
         return Compiled(_bound(functions, self.tolerance), key_of(repr(self), functions.key))
 
+    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
+
+        States are (mean (R, 1), sd (R, 1), drawn (R, 1), n_effective (R,), health (3,)) of the law
+        at the steps ``rows``; ``moment`` is "predicted", "filtered" or "smoothed". The draws of one
+        ``draw_seed`` are independent, but a path if smoothed. See `_grid_states`.
+        """
+        functions = one_state(system)
+        key = key_of(f"{self} {moment} states", functions.key)
+        return Compiled(_bound_states(functions, self.tolerance, MOMENTS[moment]), key)
+
+    def smoothing_method(self, system: StateSpaceModel) -> str:
+        """How smoothed states are found, in words."""
+        return "point masses, forwards and back"
+
 
 def _bound(functions: OneState, tolerance: float) -> Any:
     """Bind the filter's entry to the functions of one system."""
@@ -170,6 +177,35 @@ def _bound(functions: OneState, tolerance: float) -> Any:
             inputs.ctypes.data, inputs.shape[0], t0, terms.ctypes.data, health.ctypes.data,
         )  # fmt: skip
         return terms, health
+
+    return run
+
+
+def _bound_states(functions: OneState, tolerance: float, moment: int) -> Any:
+    """Bind the entry of the states to the functions of one system."""
+    entries = one_state_entries(functions)
+    for entry in (GRID_STATES, *entries):
+        entry.compile()
+    evaluate = GRID_STATES.external
+    start, move, log_density = (entry.symbol for entry in entries)
+    n_inputs, p, dt = functions.n_inputs, functions.p, functions.dt
+    same_every_step = int(functions.same_every_step)
+
+    @compiled
+    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+        # One state: what is (R, 1) for the caller is a vector here.
+        mean, sd = np.full((rows.size, 1), np.nan), np.full((rows.size, 1), np.nan)
+        drawn, health = np.full((rows.size, 1), np.nan), np.empty(3)
+        health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
+        evaluate(
+            address_of(start), address_of(move), address_of(log_density),
+            p, n_inputs, same_every_step, dt, tolerance, moment,
+            theta.ctypes.data, theta.size, steps.ctypes.data, steps.size, observed.ctypes.data,
+            inputs.ctypes.data, inputs.shape[0], t0, rows.ctypes.data, rows.size, draw_seed,
+            mean.ctypes.data, sd.ctypes.data, drawn.ctypes.data, health.ctypes.data,
+        )  # fmt: skip
+        n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
+        return mean, sd, drawn, n_effective, health
 
     return run
 
@@ -197,64 +233,14 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
     if not system.is_valid:
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    spacing, reach = np.inf, _SHORTEST_REACH
-    if steps.size:
-        spacing = _first_spacing(system, t0, steps[-1], tolerance)
+    spacing, reach = first_lattice(system, steps, t0, tolerance)
     while True:
-        code, j = _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms)
-        if code == TOO_COARSE:
-            spacing *= REFINEMENT
-        elif code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
-            reach *= _LENGTHENING
-        else:
+        code, j = attempt(
+            system, steps, observed, t0, spacing, reach, tolerance, terms, keep_nothing, None
+        )
+        again, spacing, reach = next_lattice(code, spacing, reach)
+        if not again:
             return code, j
-
-
-@internal
-def _first_spacing(system, t0, n_steps, tolerance):
-    """The spacing that the first step asks for around the start; see `_lattice.aliasing`."""
-    spacing = np.inf
-    if n_steps == 0:
-        return spacing
-    sd = system.sd
-    X, M = np.empty((1, 3)), np.empty((2, 3))
-    for i in range(3):
-        X[0, i] = system.mean + (i - 1) * sd
-    move_points(system, 0, t0, X, M)
-    slope = (M[0, 2] - M[0, 0]) / (2.0 * sd) if sd > 0.0 else 1.0
-    for i in range(3):
-        width = math.sqrt(M[1, i] / (1.0 + slope * slope))
-        if width > 0.0:
-            spacing = min(spacing, width)
-    return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-
-
-@pasted
-def _attempt(system, steps, observed, t0, spacing, reach, tolerance, terms):
-    """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
-    k = np.int64(0)
-    code, grid, source = begin(system, spacing, reach)
-    table = no_table()
-    error = 0.0
-    for j in range(steps.size):
-        while k < steps[j] and code == NONE:
-            t = t0 + k * system.dt
-            code, grid, source, table, lost = forecast(system, k, t, spacing, reach, grid, table)
-            error += lost
-            if code == NONE and error > tolerance:
-                code = TOO_COARSE
-            k += 1
-        if code != NONE:
-            return code, j
-        if is_missing(observed, j):
-            terms[j] = 0.0
-            continue
-        t = t0 + k * system.dt
-        code, grid, terms[j] = see(system, k, t, observed[j], reach, grid, source, error, tolerance)
-        if code != NONE:
-            return code, j
-        error = 0.0
-    return code, steps.size
 
 
 POINT_MASS = Entry(_point_mass, _ARGUMENTS, "point_mass", digest("point_mass"))
