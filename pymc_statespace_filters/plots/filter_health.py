@@ -1,5 +1,6 @@
 """Whether a filter does its work: its particles, and what it expected of the next observation."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -175,14 +176,9 @@ def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
     """Return distribution functions less that of a uniform number, and their simultaneous band."""
 
     def of_one(values: np.ndarray) -> np.ndarray:
-        values, inner = values[np.isfinite(values)], PIT_GRID[1:-1]
-        rng = np.random.default_rng(1)  # the same picture each time
-        level = simulate_confidence_bands(values.size, 1, inner, PROB, N_SIMULATIONS, rng)
-        found = [
-            compute_ecdf(values, inner),
-            *get_pointwise_confidence_band(level, values.size, inner),
-        ]
-        return np.pad(np.array(found) - inner, ((0, 0), (1, 1)))  # all meet at 0 and at 1
+        values = values[np.isfinite(values)]
+        found = [compute_ecdf(values, PIT_GRID[1:-1]), *_uniform_band(values.size)]
+        return np.pad(np.array(found) - PIT_GRID[1:-1], ((0, 0), (1, 1)))  # all meet at 0 and at 1
 
     found = xr.apply_ufunc(
         of_one,
@@ -193,6 +189,14 @@ def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
     ).assign_coords(u=PIT_GRID)
     seen, low, high = (found.isel(of=i).to_dataset(name="pit") for i in range(3))
     return seen, interval(low, high)
+
+
+@lru_cache(maxsize=16)
+def _uniform_band(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the band in which the distribution function of n uniform numbers stays."""
+    rng = np.random.default_rng(1)  # the same picture each time
+    level = simulate_confidence_bands(n, 1, PIT_GRID[1:-1], PROB, N_SIMULATIONS, rng)
+    return get_pointwise_confidence_band(level, n, PIT_GRID[1:-1])
 
 
 def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:

@@ -128,12 +128,12 @@ def test_panels_and_their_names(states):
     assert axes.get_ylabel() == "speed"
 
 
-@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
-def test_many_states(backend):
+def test_many_states():
     values = np.random.default_rng(1).normal(size=(1, 5, 41, 12))
     group = states_group(values, [f"x{i}" for i in range(12)])
     tree = xr.DataTree.from_dict({"smoothed_states": group})
-    assert plot_states(tree, backend=backend, col_wrap=2).viz["median"]["states"].size == 12
+    collection = plot_states(tree, backend="plotly")  # it limits the room between panels
+    assert collection.viz["median"]["states"].size == 12
 
 
 def test_what_is_refused(states):
