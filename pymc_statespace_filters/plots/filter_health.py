@@ -223,7 +223,7 @@ def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataT
     stats = idata.children.get("sample_stats")
     n_failed = 0 if stats is None or "n_failed" not in stats else int(stats["n_failed"].sum())
     if n_failed:
-        text = f"{n_failed} evaluations failed while sampling"
+        text = f"{n_failed} evaluations failed"
         collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
 
 
