@@ -1,6 +1,10 @@
 """Likelihoods, sampling and model choice for nonlinear state-space models in PyMC."""
 
-from pymc_statespace_filters.diagnostics import compute_log_likelihood, leave_future_out
+from pymc_statespace_filters.diagnostics import (
+    compute_log_likelihood,
+    filter_diagnostics,
+    leave_future_out,
+)
 from pymc_statespace_filters.distribution import StateSpace
 from pymc_statespace_filters.errors import (
     CheckpointWarning,
@@ -68,6 +72,7 @@ __all__ = [
     "compute_log_likelihood",
     "cubic",
     "estimate_evidence",
+    "filter_diagnostics",
     "filtered_states",
     "forecast",
     "freeplay",

@@ -1,6 +1,7 @@
 """What draws and data say of the filter and of the model: one step ahead, observation by one."""
 
 from pymc_statespace_filters.diagnostics.cross_validation import leave_future_out
+from pymc_statespace_filters.diagnostics.filter_health import filter_diagnostics
 from pymc_statespace_filters.diagnostics.pointwise_terms import compute_log_likelihood
 
-__all__ = ["compute_log_likelihood", "leave_future_out"]
+__all__ = ["compute_log_likelihood", "filter_diagnostics", "leave_future_out"]

@@ -12,7 +12,8 @@ from scipy.stats import norm
 import pymc_statespace_filters as psf
 from tests.sampling.autoregression import autoregression
 
-SYSTEM = autoregression(process_noise=[[0.5]])
+SYSTEM = autoregression()
+SPREAD = 0.7
 PRIOR = norm(0.4, 0.4)
 PHI = np.linspace(PRIOR.ppf(1e-12), PRIOR.isf(1e-12), 1201)
 STEPS = np.arange(1, 25)
@@ -21,7 +22,7 @@ MISSING = 7  # the row of the record that is wholly missing
 
 @cache
 def record():
-    simulated = psf.simulate(SYSTEM, {"phi": 0.7}, steps=STEPS, random_seed=4)
+    simulated = psf.simulate(SYSTEM, {"phi": 0.7, "spread": SPREAD}, steps=STEPS, random_seed=4)
     observed = simulated["observations"].values[:, 0]
     observed[MISSING] = np.nan
     return observed
@@ -30,14 +31,17 @@ def record():
 def model_with(filter):
     with pm.Model() as model:
         pm.Normal("phi", *PRIOR.args)
-        psf.StateSpace("d", SYSTEM, filter, steps=STEPS, observed=record())
+        known = {"spread": SPREAD}
+        psf.StateSpace("d", SYSTEM, filter, params=known, steps=STEPS, observed=record())
     return model
 
 
 @cache
 def log_joint():
     """Log-density (J + 1, points of PHI) of phi and the first j rows."""
-    terms = psf.log_likelihood(SYSTEM, psf.EKF(), {"phi": PHI}, record(), steps=STEPS)
+    terms = psf.log_likelihood(
+        SYSTEM, psf.EKF(), {"phi": PHI, "spread": SPREAD}, record(), steps=STEPS
+    )
     return PRIOR.logpdf(PHI) + np.cumsum(np.insert(terms, 0, 0.0, axis=1), axis=1).T
 
 
@@ -68,7 +72,8 @@ def noisy_draws(filter, n_rows, rng, shape=(4, 1000)):
     phi = PRIOR.rvs(n_candidates, random_state=rng)
     seeds = rng.integers(2**62, size=n_candidates)
     observed, steps = record()[:n_rows], STEPS[:n_rows]
-    terms = psf.log_likelihood(SYSTEM, filter, {"phi": phi}, observed, steps=steps, seed=seeds)
+    params = {"phi": phi, "spread": SPREAD}
+    terms = psf.log_likelihood(SYSTEM, filter, params, observed, steps=steps, seed=seeds)
     log_weights = terms.sum(axis=1)
     weights = np.exp(log_weights - logsumexp(log_weights))
     # Systematic: nothing of the weights is left to chance but fractions.

@@ -10,7 +10,9 @@ from pymc_statespace_filters.diagnostics.shortened_record import record_of, shor
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from tests.diagnostics.records import (
     MISSING,
+    SPREAD,
     STEPS,
+    SYSTEM,
     log_evidences,
     model_with,
     noisy_draws,
@@ -157,9 +159,8 @@ def test_a_shortened_model_differs_by_its_record_alone(noisy):
     assert short.coords == noisy.coords
     assert psf.inspection.noise_seeds(short).keys() == {"d"}
     prior, point = short.compile_logp(vars=[short["phi"]]), {"phi": 0.5}
-    terms = psf.log_likelihood(
-        short["d"].owner.op.system, UNBIASED, point, record()[:10], steps=STEPS[:10]
-    )
+    params = {**point, "spread": SPREAD}
+    terms = psf.log_likelihood(SYSTEM, UNBIASED, params, record()[:10], steps=STEPS[:10])
     expected = prior(point) + terms.sum()
     assert short.compile_logp()(point) == pytest.approx(expected, rel=1e-12)
 
