@@ -136,6 +136,16 @@ def test_a_surprise_moves_the_states_before_it(deviations):
     assert_law(found, *linear_law(system, steps, data, rows, "smoothed"), 1e-8)
 
 
+@pytest.mark.parametrize("gap", [2, 4])
+def test_states_before_a_surprise_may_need_a_longer_grid_than_the_filter(gap):
+    """Where the filter's masses end, with nothing that it can see of it at the observation."""
+    system = linear(1.0, 0.35, 0.03, 1.0)
+    steps, rows = np.array([gap]), np.arange(gap + 1)
+    data = 0.4 + 8.25 * np.sqrt([1.0 + gap * 0.35**2 + 0.03**2])
+    found = well_states(system, steps, data, rows, "smoothed")
+    assert_law(found, *linear_law(system, steps, data, rows, "smoothed"), 1e-9)
+
+
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_inputs(moment):
     rows = np.arange(7)[:6]
