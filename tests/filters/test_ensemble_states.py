@@ -75,7 +75,7 @@ def exact(moment, rows=ROWS, **changes):
 
 def exact_swing(moment, rows, steps, observed):
     return linear_states(
-        [[1.0, 0.3], [-0.3, 0.94]], np.diag([0.0, 0.2]), [[1.0, 0.0]], [[0.3]], [1.0, 0.0],
+        [[1.0, 0.3], [-0.36, 0.94]], np.diag([0.0, 0.2]), [[1.0, 0.0]], [[0.3]], [1.0, 0.0],
         np.zeros((2, 2)), steps=steps, observed=observed, rows=rows, moment=moment,
     )  # fmt: skip
 
