@@ -1,8 +1,8 @@
 """The errors that estimators of the evidence report are those that they make.
 
 What the slow tests measure is kept in ``docs/reference/evidence-calibration.md``. For 200
-independent normal scores the mean square is within [0.7, 1.4] and the mean within 0.25 of zero but for one time in a
-thousand, and for fewer the limits are as wide; seeds are fixed.
+independent normal scores the mean square is within [0.7, 1.4] and the mean within 0.25 of zero
+but for one time in a thousand, and for fewer the limits are as wide; seeds are fixed.
 """
 
 import pytest

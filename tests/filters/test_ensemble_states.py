@@ -14,8 +14,12 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters._past import LAG, _settlement
 from pymc_statespace_filters.ops import LogLikelihood, evaluator
 from pymc_statespace_filters.ops import States as StatesOp
+from pymc_statespace_filters.parameters import flat_parameters
 from tests.filters.test_ekf_states import assert_drawn_from
+from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
+from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
+from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 ROWS = np.arange(7)
@@ -232,3 +236,38 @@ def test_smoothing_methods():
     assert psf.EnKF(50).smoothing_method(PAIR) == "ensemble Kalman smoother"
     for filter in (psf.BootstrapPF(50), psf.PFEnKF(50)):
         assert filter.smoothing_method(PAIR) == "backward simulation"
+
+
+def double_well_errors(filter, moment, n_seeds):
+    """Errors of means and deviations (seed, R) in deviations of the exact law on a grid."""
+    record, reference = broad_double_well(), BROAD_DOUBLE_WELL
+    rows = record.steps
+    truth = getattr(GridStates(reference.point_mass_filter(), *record, rows), moment)()
+    theta = flat_parameters(DOUBLE_WELL_SYSTEM, double_well_parameters(reference))
+    arguments = (DOUBLE_WELL_SYSTEM, theta, record.steps, record.observed[:, None], rows)
+    found = [states(moment, filter, *arguments, seed=i, draw_seed=i) for i in range(n_seeds)]
+    errors = [[s.mean[:, 0] - truth.mean for s in found], [s.sd[:, 0] - truth.sd for s in found]]
+    return np.array(errors) / truth.sd
+
+
+@pytest.mark.parametrize("moment", ["filtered", "smoothed"])
+def test_two_wells(moment):
+    """A law of two modes, which a particle filter finds and an ensemble Kalman filter does not."""
+    errors = double_well_errors(psf.BootstrapPF(1000), moment, 8)
+    assert_unbiased(errors[0], 0.0, 1.0, 0.02)
+    assert_unbiased(errors[1], 0.0, 1.0, 0.02)
+    assert np.sqrt((errors[0] ** 2).mean()) < 0.25
+    ensemble = double_well_errors(psf.EnKF(1000), moment, 2)
+    assert np.sqrt((ensemble[0] ** 2).mean()) > 0.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["filtered", "smoothed"])
+def test_errors_of_particles_fall_with_the_root_of_their_number(moment):
+    sizes = np.array([250, 1000, 4000])
+    rms = [
+        np.sqrt((double_well_errors(psf.BootstrapPF(int(N)), moment, 32)[0] ** 2).mean())
+        for N in sizes
+    ]
+    slope, _ = np.polyfit(np.log(sizes), np.log(rms), 1)
+    assert -0.6 < slope < -0.4
