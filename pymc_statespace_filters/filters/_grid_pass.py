@@ -78,12 +78,13 @@ def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep,
     if code == NONE:
         keep(tape, k, grid, False)
     table = no_table()
-    error = 0.0
+    error, n_grids = 0.0, 1
     for j in range(steps.size):
         while k < steps[j] and code == NONE:
             t = t0 + k * system.dt
             code, grid, source, table, lost = forecast(system, k, t, spacing, reach, grid, table)
             error += lost
+            n_grids += 1
             if code == NONE and error > tolerance:
                 code = TOO_COARSE
             k += 1
@@ -95,9 +96,11 @@ def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep,
             terms[j] = 0.0
             continue
         t = t0 + k * system.dt
-        code, grid, terms[j] = see(system, k, t, observed[j], reach, grid, source, error, tolerance)
+        code, grid, terms[j] = see(
+            system, k, t, observed[j], reach, grid, source, n_grids, error, tolerance
+        )
         if code != NONE:
             return code, j
         keep(tape, k, grid, True)
-        error = 0.0
+        error, n_grids = 0.0, 1
     return code, steps.size

@@ -159,14 +159,19 @@ def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
 
 
 @internal
-def see(system, k, t, d, reach, grid, source, error, tolerance):
+def see(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
     """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
 
-    ``error`` is the mass that the steps since the last update may have misplaced: it may lie
-    where the observation looks.
+    ``error`` is the mass that the steps since the last update may have misplaced, and of each of
+    the ``n_grids`` since then the ends were cut off: they may lie where the observation looks.
     """
     low, spacing, mass = grid
     cut = cut_of(reach)
+    log_cut, log_error, log_tolerance = (
+        math.log(n_grids * cut),
+        math.log(error),
+        math.log(tolerance),
+    )
     while True:
         log_likelihood = np.empty(mass.size)
         log_density(system, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
@@ -179,7 +184,10 @@ def see(system, k, t, d, reach, grid, source, error, tolerance):
         if not known and posterior[0] + posterior[-1] > tolerance:
             return TOO_SHORT, grid, term
         if known or coarseness(posterior) <= tolerance:
-            if math.log(error) + highest(log_likelihood) - term > math.log(tolerance):
+            surprise = highest(log_likelihood) - term
+            if not known and log_cut + surprise > log_tolerance:
+                return TOO_SHORT, grid, term
+            if log_error + surprise > log_tolerance:
                 return TOO_COARSE, grid, term
             return NONE, (low + first, spacing, posterior[first:last]), term
         start, end = (low + first - 2) * spacing, (low + last + 1) * spacing

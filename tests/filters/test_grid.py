@@ -362,3 +362,13 @@ def test_exact_means_smooth_equations_and_a_density_without_approximation():
     assert grid.is_exact_for(DOUBLE_WELL_SYSTEM)
     assert not grid.is_exact_for(system(lambda x, q: [0.9 * abs(x[0]) + q[0]]))
     assert not grid.is_exact_for(system(observation=lambda x, e: [x[0] * pt.exp(e[0])]))
+
+
+def test_tails_that_a_surprise_asks_for_were_not_cut_off_before():
+    """An observation eight deviations off, several steps after the last."""
+    system, steps = linear(1.0, 0.35, 0.03, 1.0), np.array([4])
+    for deviations in (6.0, 7.25, 8.25, 9.5):
+        sd = np.sqrt(1.0 + 4 * 0.35**2 + 0.03**2)
+        data = np.array([0.4 + deviations * sd])
+        expected = kalman_terms(system, data, steps)
+        np.testing.assert_allclose(grid_terms(system, data, steps), expected, rtol=1e-9)
