@@ -1,5 +1,6 @@
 """The record that a system is compared with: observation steps, data, inputs; checked once."""
 
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -168,6 +169,11 @@ def check_random_seed(random_seed: Any) -> np.random.Generator:
             f"random_seed must be None, an integer that is not negative or a "
             f"numpy.random.Generator, got {random_seed!r}"
         ) from None
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a value is an integer, Python's or NumPy's."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def check_t0(t0: Any) -> float:

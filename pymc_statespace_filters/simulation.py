@@ -1,6 +1,6 @@
 """Forward simulation of a system, in machine code."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -9,7 +9,7 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.lowering import Compiled, ensemble_machine, jit, observation_sampler
-from pymc_statespace_filters.machine_code import key_of
+from pymc_statespace_filters.machine_code import kept, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import (
@@ -44,7 +44,7 @@ def continuation(system: StateSpaceModel) -> Compiled:
             observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
         return states, observations
 
-    return Compiled(jit(go_on), key_of("go on", machine.key, sampler.key))
+    return _kept(go_on, key_of("go on", machine.key, sampler.key))
 
 
 @lru_cache(maxsize=256)
@@ -63,7 +63,13 @@ def observer(system: StateSpaceModel) -> Compiled:
             observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
         return observations
 
-    return Compiled(jit(look), key_of("look", machine.key, sampler.key))
+    return _kept(look, key_of("look", machine.key, sampler.key))
+
+
+def _kept(function: Callable, key: str | None) -> Compiled:
+    """Compiled, from disk if any process did so before."""
+    compiled = jit(function)
+    return Compiled(compiled if key is None else kept(compiled, key), key)
 
 
 def _sampler(system: StateSpaceModel) -> Compiled:

@@ -170,7 +170,7 @@ def _add_states(
     progressbar: bool,
 ) -> xr.DataTree:
     model = pm.modelcontext(model)
-    if at not in ROWS_AT:
+    if at not in list(ROWS_AT):
         raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
     rng = check_random_seed(random_seed)
     draws = draws_of(idata, n_draws)

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.likelihood import warn_of
-from pymc_statespace_filters.records import check_inputs, check_random_seed, n_input_rows, steps_of
+from pymc_statespace_filters.records import (
+    check_inputs,
+    check_random_seed,
+    is_whole,
+    n_input_rows,
+    steps_of,
+)
 from pymc_statespace_filters.simulation import continuation
 from pymc_statespace_filters.state_graphs import observed_variables, with_other_filter
 from pymc_statespace_filters.states.posterior import draws_of
@@ -110,8 +116,9 @@ def forecast(
         if inputs is not None:
             rows = pt.as_tensor(check_inputs(inputs, system, future))
             at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
+        forces = _forces(at_draws, future)
         begin = at_draws.states("filtered", last, rng, progressbar=progressbar)
-        paths, seen = _paths(at_draws, begin.drawn[:, 0], int(last[0]), future, rng)
+        paths, seen = _paths(at_draws, begin.drawn[:, 0], int(last[0]), future, forces, rng)
         parts.append(
             draws.dataset(
                 {name: ((time, observable), seen), f"{name}_states": ((time, dims[name]), paths)},
@@ -133,7 +140,7 @@ def _future(
     if sum(given is not None for given in (n_steps, steps, times)) != 1:
         raise ModelError("give exactly one of n_steps, steps and times")
     if n_steps is not None:
-        if isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1:
+        if not is_whole(n_steps) or n_steps < 1:
             raise ModelError(f"n_steps must be an integer of at least 1, got {n_steps!r}")
         return np.arange(last + 1, last + 1 + n_steps)
     future = steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
@@ -145,17 +152,27 @@ def _future(
     return future
 
 
-def _paths(
-    at_draws: VariableAtDraws, begin: Array, first: int, future: NDArray, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """States (draws, R, n) and observations (draws, R, p) after the states `begin` (draws, n)."""
-    system = at_draws.variable.system
-    rows = at_draws.inputs()
+def _forces(at_draws: VariableAtDraws, future: NDArray[np.int64]) -> Array:
+    """The inputs (draws or 1, rows, n_inputs), which must reach into the future."""
+    system, rows = at_draws.variable.system, at_draws.inputs()
     if len(rows[0]) < n_input_rows(system, future) and system.n_inputs:
         raise ModelError(
             f"the model's inputs end after {len(rows[0])} rows, and step {future[-1]} needs "
             f"{n_input_rows(system, future)}: give inputs= of the record and of the future"
         )
+    return rows
+
+
+def _paths(
+    at_draws: VariableAtDraws,
+    begin: Array,
+    first: int,
+    future: NDArray[np.int64],
+    rows: Array,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """States (draws, R, n) and observations (draws, R, p) after the states `begin` (draws, n)."""
+    system = at_draws.variable.system
     theta, go_on = at_draws.parameters(), continuation(system).function
     paths = np.full((len(begin), future.size, system.n), np.nan)
     seen = np.full((len(begin), future.size, system.p), np.nan)

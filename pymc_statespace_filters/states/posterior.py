@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.records import is_whole
 from pymc_statespace_filters.stored_draws import noise_was_moved, posterior_group
 
 SAMPLE_DIMS = ("chain", "draw")
@@ -71,8 +72,10 @@ def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
     posterior = posterior_group(idata).transpose(*SAMPLE_DIMS, ...)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
     n_chains, length = posterior.sizes["chain"], posterior.sizes["draw"]
+    if not n_chains * length:
+        raise ModelError("the posterior of idata has no draws")
     if n_draws is not None:
-        if not isinstance(n_draws, int) or not 1 <= n_draws <= n_chains * length:
+        if not is_whole(n_draws) or not 1 <= n_draws <= n_chains * length:
             raise ModelError(
                 f"n_draws must be an integer from 1 to {n_chains * length}, the draws that there "
                 f"are, or None for all of them; got {n_draws!r}"

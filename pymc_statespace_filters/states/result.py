@@ -10,8 +10,12 @@ from pymc_statespace_filters.state_graphs import StateSpaceVariable
 
 def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     """By variable of a model, the name of its dimension of states: a name has one list of them."""
-    first = variables[0].system.states
-    return {v.name: "state" if v.system.states == first else f"{v.name}_state" for v in variables}
+    # Observables come first: their dimension may have that name in the model.
+    lists = [v.system.observables for v in variables if "state" in v.dims]
+    lists += [v.system.states for v in variables]
+    return {
+        v.name: "state" if v.system.states == lists[0] else f"{v.name}_state" for v in variables
+    }
 
 
 def with_group(

@@ -55,13 +55,15 @@ class VariableAtDraws:
     ) -> None:
         self.variable = variable
         self._draws = draws
-        known = set(ancestors([variable.theta, variable.inputs]))
+        # What a free variable depends on in the prior is no longer asked for: it has its draws.
+        known = set(ancestors([variable.theta, variable.inputs], blockers=model.basic_RVs))
         free = [rv for rv in model.free_RVs if rv in known]
         shapes = model.eval_rv_shapes()
         self._columns = [draws.values(rv.name, tuple(map(int, shapes[rv.name]))) for rv in free]
         # Every number of a draw is handed over as float64.
         self._symbols = [pt.tensor(rv.name, dtype="float64", shape=rv.type.shape) for rv in free]
-        self._replaced = {
+        self._replaced = {rv: model.rvs_to_values[rv] for rv in model.observed_RVs if rv in known}
+        self._replaced |= {
             rv: pt.cast(symbol, rv.dtype) for rv, symbol in zip(free, self._symbols, strict=True)
         }
         steps, t0 = pytensor.function([], [variable.steps, variable.t0], mode="FAST_COMPILE")()
@@ -110,9 +112,10 @@ class VariableAtDraws:
         """Evaluate graphs at every draw; further inputs have a number a draw, or one for all."""
         constant = constant or {}
         bound = clone_replace(list(graphs), self._replaced)
-        inputs = [*self._symbols, *drawn, *constant]
+        # Its number is a column of every draw, even of those that differ in nothing else.
+        inputs = [pt.lscalar("number"), *self._symbols, *drawn, *constant]
         function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
-        columns = [*self._columns, *drawn.values()]
+        columns = [np.arange(np.prod(self._draws.shape)), *self._columns, *drawn.values()]
         calls = ManyCalls(function, [column[0] for column in columns], list(constant.values()))
         with watched(calls, enabled=progressbar) as announce:
             announce(task, len(columns[0]))
@@ -129,6 +132,6 @@ def chosen_variables(model: pm.Model, name: str | None) -> list[StateSpaceVariab
         raise ModelError("the model has no observed StateSpace variable")
     if name is None:
         return list(found.values())
-    if name not in found:
+    if name not in list(found):  # a list cannot be looked up
         raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
     return [found[name]]
