@@ -106,7 +106,7 @@ def simulator(system: StateSpaceModel) -> Compiled:
                 propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), x)
         return states, observations
 
-    return Compiled(jit(simulate), key_of("simulate", machine.key, sampler.key))
+    return _kept(simulate, key_of("simulate", machine.key, sampler.key))
 
 
 def simulate(

@@ -6,13 +6,18 @@ import pymc as pm
 
 import pymc_statespace_filters as psf
 from tests.references.linear_states import linear_states
-from tests.small_systems import FORCE, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
+from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 
 EKF = psf.EKF()
 ALL_STEPS = np.arange(7)
-# Times that are no step numbers; the record's step 0 is at T0.
+# Times that are no step numbers, with step 0 at T0; inputs and time enter everywhere.
 DT, T0 = 0.5, 10.0
-PUSHED = forced(dt=DT)
+FORCE = np.array([0.5, -0.2, 0.1, 0.3, 0.0, -0.4, 0.7])
+PUSHED = forced(
+    dt=DT,
+    transition=lambda x, q, u, t, a: [a * x[0] + u[0] + 0.1 * t + q[0]],
+    observation=lambda x, u, t: [x[0] + 2.0 * u[0] - 0.3 * t],
+)
 SHAPE = (2, 3)  # chains, draws: no square, and every number another
 A = np.random.default_rng(1).uniform(-0.5, 0.9, SHAPE)
 B = np.random.default_rng(2).uniform(-0.5, 0.9, SHAPE)
@@ -51,10 +56,17 @@ def pair_law(moment, rows, a, b=0.2, observed=PAIR_DATA, steps=STEPS):
 
 def pushed_law(moment, rows, a, force=FORCE):
     """The exact law of PUSHED's state."""
+    push = np.asarray(force) + 0.1 * (T0 + DT * np.arange(len(force)))
     return linear_states(
-        [[a]], [[1.0]], [[1.0]], [[0.5]], [0.0], [[1.0]], steps=STEPS, observed=FORCED_DATA,
-        rows=rows, moment=moment, forcing=np.reshape(force, (-1, 1)),
+        [[a]], [[1.0]], [[1.0]], [[0.5]], [0.0], [[1.0]], steps=STEPS,
+        observed=FORCED_DATA - shown(STEPS, force), rows=rows, moment=moment,
+        forcing=push[:, None],
     )  # fmt: skip
+
+
+def shown(steps, force):
+    """What an observation of PUSHED shows beside the state."""
+    return 2.0 * np.asarray(force)[steps] - 0.3 * (T0 + DT * steps)
 
 
 def assert_exact(group, laws, name="d"):

@@ -7,11 +7,12 @@ import pytest
 
 import pymc_statespace_filters as psf
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.small_systems import FORCE, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     DATA_NOISE,
     DT,
     EKF,
+    FORCE,
     PUSHED,
     SHAPE,
     T0,
@@ -21,23 +22,30 @@ from tests.states.models import (
     posterior,
     pushed_law,
     pushed_model,
+    shown,
 )
 
 RATE = 1e-3  # of right implementations fail each statistical test
 FUTURE = np.array([7, 8, 11])  # after step 6, with a gap
-LONG_FORCE = np.append(FORCE, [2.0, -1.0, 0.0, 3.0, 1.0])
+LONG_FORCE = np.append(FORCE, [-1.0, 0.0, 3.0, 1.0, 2.0])
 
 
 def predictions(*args, **kwargs):
     return psf.forecast(*args, random_seed=1, **kwargs)["predictions"]
 
 
-def joint_law(states, noise):
-    """Mean and covariance of (states (R, n), observations (R, n)) of a system that sees states."""
+def joint_law(states, noise, beside=0.0):
+    """Mean and covariance of (states (R, n), observations (R, n)), which show states and more."""
     R, n = states.mean.shape
     cov = states.cov.reshape(R * n, R * n)
     seen = cov + np.kron(np.eye(R), noise)
-    return np.tile(states.mean.ravel(), 2), np.block([[cov, cov], [cov, seen]])
+    mean = np.concatenate([states.mean.ravel(), states.mean.ravel() + beside])
+    return mean, np.block([[cov, cov], [cov, seen]])
+
+
+def pushed_joint_law(force, rows=FUTURE):
+    """That of PUSHED with a = 0.7."""
+    return joint_law(pushed_law("smoothed", rows, 0.7, force), [[0.5]], shown(rows, force))
 
 
 def joined(group):
@@ -85,8 +93,7 @@ def test_inputs_of_the_record_and_of_the_future():
     changed[:6] += [0.0, 0.0, 0.0, 0.0, 4.0, 4.0]
     for force in (LONG_FORCE, changed):
         group = predictions(idata, model, steps=FUTURE, inputs=force)
-        mean, cov = joint_law(pushed_law("smoothed", FUTURE, 0.7, force), np.array([[0.5]]))
-        assert_drawn_from(joined(group), mean, cov, RATE)
+        assert_drawn_from(joined(group), *pushed_joint_law(force), RATE)
 
 
 def test_inputs_of_the_model_reach_beyond_its_record():
@@ -100,10 +107,9 @@ def test_inputs_of_the_model_reach_beyond_its_record():
     gains = np.array([0.5, 2.0])
     group = predictions(posterior(gain=np.tile(gains, (2, 1500))), model, steps=FUTURE)
     for i in (0, 1):
-        law = pushed_law("smoothed", FUTURE, 0.7, gains[i] * LONG_FORCE)
         part = group.to_dataset().isel(draw=slice(i, None, 2))
-        assert_drawn_from(joined(part), *joint_law(law, np.array([[0.5]])), RATE)
-    with pytest.raises(psf.ModelError, match=r"end after 11 rows, and step 12 needs 12: give inp"):
+        assert_drawn_from(joined(part), *pushed_joint_law(gains[i] * LONG_FORCE), RATE)
+    with pytest.raises(psf.ModelError, match=r"end after 12 rows, and step 12 needs 13: give inp"):
         predictions(posterior(gain=A), model, n_steps=6)
 
 
@@ -194,9 +200,9 @@ WRONG = [
     (dict(steps=[7.5]), "steps must be a vector of integers"),
     (dict(times=[T0]), "begins after the last observation, at step 6, but step 0 is asked for"),
     (dict(times=[13.6]), r"times\[0\] = .*13.6.* is off the grid t0 \+ k\*dt with t0 = 10"),
-    (dict(n_steps=2), "the model's inputs end after 6 rows, and step 8 needs 8"),
-    (dict(n_steps=2, inputs=FORCE), "inputs has 6 rows, but .* step 8 .*needs 8"),
-    (dict(n_steps=2, inputs=np.zeros((9, 2))), r"inputs must have shape \(steps, 1\)"),
+    (dict(n_steps=2), "the model's inputs end after 7 rows, and step 8 needs 9"),
+    (dict(n_steps=2, inputs=FORCE), "inputs has 7 rows, but .* step 8 .*needs 9"),
+    (dict(n_steps=2, inputs=np.zeros((10, 2))), r"inputs must have shape \(steps, 1\)"),
     (dict(n_steps=2, inputs="none"), "inputs must be numbers"),
 ]
 

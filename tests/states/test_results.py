@@ -6,10 +6,12 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from tests.small_systems import FORCE, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     EKF,
+    FORCE,
     PUSHED,
+    T0,
     A,
     B,
     assert_exact,
@@ -45,7 +47,7 @@ def two_systems():
         psf.StateSpace("d", PAIR, EKF, steps=STEPS, observed=PAIR_DATA)
         psf.StateSpace(
             "e", PUSHED, EKF, params={"a": model["b"]}, steps=STEPS, observed=FORCED_DATA,
-            inputs=FORCE, dims=("e_time", "sensor"),
+            inputs=FORCE, t0=T0, dims=("e_time", "sensor"),
         )  # fmt: skip
         psf.StateSpace(
             "f", PAIR, EKF, params={"a": model["b"], "b": model["a"]}, steps=STEPS,
@@ -72,7 +74,7 @@ def test_one_variable_of_several_keeps_its_dimensions():
     assert_exact(group, laws_of(lambda a: pushed_law("filtered", STEPS, a), B), "e")
     assert group["e_mean"].dims == ("chain", "draw", "e_time", "e_state")
     future = psf.forecast(
-        idata, model, n_steps=2, var_name="e", inputs=np.zeros(8), extend_inferencedata=False
+        idata, model, n_steps=2, var_name="e", inputs=np.zeros(9), extend_inferencedata=False
     )["predictions"]
     assert future["e"].dims == ("chain", "draw", "e_time", "sensor")
     assert future["e_states"].dims == ("chain", "draw", "e_time", "e_state")

@@ -10,11 +10,12 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops import LogLikelihood, evaluator
-from tests.small_systems import FORCE, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     ALL_STEPS,
     DT,
     EKF,
+    FORCE,
     PUSHED,
     SHAPE,
     T0,

@@ -1,0 +1,171 @@
+"""Many draws at once: in any number of threads, watched, stopped, and failing."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.compile.ops import wrap_py
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters import progress
+from pymc_statespace_filters.machine_code import ManyCalls, many_calls
+from pymc_statespace_filters.state_graphs import observed_variables
+from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.states.variable import VariableAtDraws
+from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.states.models import EKF, pair_model, posterior
+
+MANY = np.random.default_rng(5).uniform(-0.5, 0.9, (3, 5))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    idata = psf.filtered_states(posterior(a=MANY), pair_model(), random_seed=1)
+    return idata["filtered_states"].to_dataset()
+
+
+@pytest.mark.parametrize("n_threads", [1, 4, 40])
+def test_the_number_of_threads_does_not_matter(drawn, n_threads, monkeypatch):
+    monkeypatch.setattr(many_calls, "available_cores", lambda: n_threads)
+    idata = psf.filtered_states(posterior(a=MANY), pair_model(), random_seed=1)
+    assert idata["filtered_states"].to_dataset().identical(drawn)
+
+
+def test_draws_one_by_one_are_those_of_all_at_once(drawn):
+    """Whatever their neighbours are."""
+    some = psf.filtered_states(posterior(a=MANY[1:, :2]), pair_model(), random_seed=1)
+    for name in ("d_mean", "d_sd"):
+        expected = drawn[name].values[1:, :2]
+        np.testing.assert_array_equal(some["filtered_states"][name], expected)
+
+
+def test_results_of_several_shapes_and_types():
+    """Words of eight bytes, read as what they are."""
+    x, n, c = pt.dvector("x"), pt.lscalar("n"), pt.lvector("c")
+    function = pytensor.function([x, n, c], [x[::-1] * n, pt.outer(x, c), n], trust_input=True)
+    columns = np.array([[1.5, 2.5], [0.5, -1.0], [3.0, 4.0]]), np.array([2**60, -3, 5])
+    calls = ManyCalls(function, [column[0] for column in columns], [np.array([10, 20, 30])])
+    found = calls(*columns)
+    assert calls.shapes == [(2,), (2, 3), ()]
+    for row, (a, k) in zip(found, zip(*columns, strict=True), strict=True):
+        outer = np.outer(a, [10, 20, 30]).ravel()
+        np.testing.assert_array_equal(row, [*(a[::-1] * k), *outer, k])
+    counts = []
+    calls.watch = counts.append
+    calls(*columns)
+    assert sum(counts) == 3
+    # Strided columns, of another type.
+    again = calls(np.asfortranarray(columns[0])[::-1], columns[1].astype(object)[::-1])
+    np.testing.assert_array_equal(again, found[::-1])
+
+
+class Screen:
+    """What a progress bar is asked for."""
+
+    def __init__(self):
+        self.bars, self.closed = [], 0
+
+    def __call__(self):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.closed += 1
+
+    def add_task(self, task, completed, total):
+        self.bars.append([task, completed, total])
+        return len(self.bars) - 1
+
+    def advance(self, row, advance):
+        self.bars[row][1] += advance
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    screen = Screen()
+    monkeypatch.setattr(progress, "create_simple_progress", screen)
+    return screen
+
+
+@pytest.mark.parametrize(("patience", "progressbar"), [(0.0, True), (0.0, False), (60.0, True)])
+def test_a_bar_for_work_that_takes_long(screen, patience, progressbar, monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", patience)
+    psf.filtered_states(posterior(a=MANY), pair_model(), progressbar=progressbar)
+    shown = patience == 0.0 and progressbar
+    assert screen.bars == ([["states", 15, 15]] if shown else [])
+    assert screen.closed == len(screen.bars)
+
+
+def at_draws_of(function, n_draws):
+    """A variable with a parameter that a Python function makes, in PyTensor's mode for that."""
+    with pm.Model() as model:
+        a = wrap_py([pt.dscalar], [pt.dscalar])(function)(pm.Normal("a"))
+        psf.StateSpace("d", PAIR, EKF, params={"a": a}, steps=STEPS, observed=PAIR_DATA)
+    draws = draws_of(posterior(a=np.linspace(0.0, 1.0, n_draws)[None]), None)
+    return VariableAtDraws(model, observed_variables(model)[0], draws)
+
+
+def test_an_exception_arrives():
+    def picky(a):
+        if a > 0.5:
+            raise ArithmeticError("too large")
+        return np.asarray(a)
+
+    with (
+        pytensor.config.change_flags(mode="FAST_COMPILE"),
+        pytest.raises(ArithmeticError, match="too large"),
+    ):
+        at_draws_of(picky, 10).parameters()
+
+
+@pytest.fixture
+def _interrupts_arrive():
+    """A shell has them ignored in what it runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_interrupts_arrive")
+def test_an_interrupt_stops_the_work():
+    calls = []
+
+    def slow(a):
+        calls.append(a)
+        time.sleep(0.01)
+        return np.asarray(a)
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        at_draws = at_draws_of(slow, 10_000)
+        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            at_draws.parameters()
+    assert len(calls) < 2_000  # of 10 000, 100 s of them
+    done = len(calls)
+    time.sleep(0.05)
+    assert len(calls) == done
+
+
+def test_a_record_that_machine_code_refuses():
+    """Data exchanged for some that do not fit: the error is that of the machine code."""
+    observed = pytensor.shared(PAIR_DATA)
+    model = pair_model(observed=observed)
+    observed.set_value(PAIR_DATA[:2])
+    with pytest.raises(psf.ModelError, match="a row for each step"):
+        psf.filtered_states(posterior(a=MANY), model)
+
+
+def test_other_modes_of_pytensor_give_the_same():
+    numbers = psf.smoothed_states(posterior(a=MANY[:2]), pair_model(), random_seed=1)
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        other = psf.smoothed_states(posterior(a=MANY[:2]), pair_model(), random_seed=1)
+    assert other["smoothed_states"].identical(numbers["smoothed_states"])
