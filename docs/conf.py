@@ -11,9 +11,9 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import reference_pages  # noqa: E402
-
 from pymc_statespace_filters import DRAM  # noqa: E402
+
+import reference_pages  # noqa: E402
 
 project = "pymc-statespace-filters"
 author = "The pymc-statespace-filters developers"
@@ -39,7 +39,9 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_merge_streams = True
-nb_output_stderr = "warn"
+nb_output_stderr = (
+    "warn"  # a cell whose warning the text is about shows it: output_stderr
+)
 os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
 
 # The reference is the list of public names in __init__.py.

@@ -48,21 +48,40 @@ def _grouped() -> dict[str, list[str]]:
     rooms = {room: title for title, rooms in GROUPS.items() for room in rooms}
     groups: dict[str, list[str]] = {title: [] for title in GROUPS}
     for name in psf.__all__:
-        room = getattr(psf, name).__module__.removeprefix(f"{PACKAGE}.").split(".")[0]
+        room = (
+            getattr(psf, name)
+            .__module__.removeprefix(f"{PACKAGE}.")
+            .split(".")[0]
+        )
         groups[rooms[room]].append(name)
     return {title: names for title, names in groups.items() if names}
 
 
 def _section(title: str, names: list[str]) -> str:
-    table = [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in names)]
-    pages = [".. toctree::", "   :hidden:", "", *(f"   {name}" for name in names)]
+    table = [
+        ".. autosummary::",
+        "   :nosignatures:",
+        "",
+        *(f"   {name}" for name in names),
+    ]
+    pages = [
+        ".. toctree::",
+        "   :hidden:",
+        "",
+        *(f"   {name}" for name in names),
+    ]
     return "\n".join([_heading(title, "-"), *table, "", *pages, ""])
 
 
 def _page(name: str) -> str:
     value = getattr(psf, name)
     kind = "autoclass" if inspect.isclass(value) else "autofunction"
-    lines = [_heading(name, "="), f".. currentmodule:: {PACKAGE}", "", f".. {kind}:: {name}"]
+    lines = [
+        _heading(name, "="),
+        f".. currentmodule:: {PACKAGE}",
+        "",
+        f".. {kind}:: {name}",
+    ]
     if kind == "autoclass":
         lines += ["   :members:", f"   :exclude-members: {', '.join(INTERNAL)}"]
     if inspect.isclass(value) and issubclass(value, Exception):

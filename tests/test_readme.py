@@ -1,9 +1,9 @@
 """The code that the README and the guide show runs as it stands."""
 
+import json
 import re
 from pathlib import Path
 
-import arviz as az
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -12,14 +12,25 @@ import pytest
 import pymc_statespace_filters  # noqa: F401
 
 ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted(path for path in (ROOT / "docs").rglob("*.ipynb") if "_build" not in path.parts)
+
+
+def cells_of(notebook: Path) -> list[dict]:
+    return [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"]
+
+
+def code_of(page: str) -> str:
+    path = ROOT / page
+    if path.suffix == ".ipynb":
+        return "\n".join("".join(cell["source"]) for cell in cells_of(path))
+    return "\n".join(re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL))
 
 
 def run_code_of(*pages: str) -> dict:
     """Run the code of pages in their order, a later one with the names of those before."""
     names: dict = {}
     for page in pages:
-        blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
-        exec(compile("\n".join(blocks), page, "exec"), names)
+        exec(compile(code_of(page), page, "exec"), names)
     return names
 
 
@@ -31,28 +42,21 @@ def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
     assert last_line.split()[1] == "+-"
 
 
-def test_your_own_system() -> None:
-    names = run_code_of("docs/tutorials/your_system.md")
-    # The record was made by a hardening spring, and says so.
-    assert names["table"].loc["hardening", "prob_low"] > 0.99
-    assert np.isfinite(names["terms"]).all()
-
-
-def test_evidence() -> None:
-    with az.rc_context({"plot.backend": "matplotlib"}):
-        names = run_code_of("docs/explanation/evidence.md")
+# The notebooks end with a cell of their own that holds their text to the numbers. The build of the
+# guide runs all of them; these two run here too.
+@pytest.mark.parametrize("name", ["your_system", "model_comparison"])
+def test_tutorial(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT / "docs" / "tutorials")
+    with plt.rc_context():
+        run_code_of(f"docs/tutorials/{name}.ipynb")
     plt.close("all")
-    table, found = names["table"], names["found"]
-    assert found.agreement
-    assert max(one.se for one in found.values()) < 0.1  # an agreement that says something
-    # A cubic spring made the record, which shows that it is not linear, and no friction.
-    assert list(table.index) == ["cubic", "friction", "linear"]
-    assert table.loc["cubic", "prob_low"] > 0.6
-    assert table.loc["linear", "prob_high"] < 0.01
-    # At a width of one the prior is what it was, and so are the probabilities.
-    as_it_is = names["curves"]["width_prob"].sel(width=1.0, model=list(table.index))
-    np.testing.assert_allclose(as_it_is, table["prob"], rtol=1e-9)
-    assert (names["curves"]["width_prob"].sel(model="cubic") > 0.5).all()
-    assert names["curves"]["prob"].sel(exponent=4.0).idxmax("model") == "linear"  # as the page says
-    force = names["average"]["posterior"]["restoring_force"].sel(place=2.0)
-    assert abs(force.mean() - (2.0 + 0.2 * 2.0**3)) < 2 * force.std()
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_kept_without_outputs_and_check_their_text(notebook: Path) -> None:
+    kernel = json.loads(notebook.read_text())["metadata"]["kernelspec"]["name"]
+    assert kernel == "python3"  # that of any Jupyter
+    for cell in cells_of(notebook):
+        assert not cell["outputs"]
+        assert cell["execution_count"] is None
+    assert any("assert" in "".join(cell["source"]) for cell in cells_of(notebook))
