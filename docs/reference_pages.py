@@ -25,11 +25,13 @@ GROUPS = {
     "Errors and warnings": ("errors",),
 }
 
-# What rooms ask of each other, and PyMC of a step method, is no part of a user's reading.
-INTERNAL = """algorithm check compile compile_batch compile_gradient compile_reverse compile_states
-compile_taped equations fingerprint is_exact_for kernel n_normals n_theta noise_size noise_sizes
-resampling_normals rv_op rv_type settings setup_chain size smooth smoothing_method step stop_tuning
-stored_normals support_point""".split()
+# Members that a user calls. The others are what rooms ask of each other, or PyMC of a step method.
+MEMBERS = {
+    "DimensionCorrection": "log_prior",
+    "Evidence": "prior_note",
+    "PFEnKF": "density_method",
+    "StateSpace": "dist",
+}
 
 
 def write(folder: Path) -> None:
@@ -82,8 +84,8 @@ def _page(name: str) -> str:
         "",
         f".. {kind}:: {name}",
     ]
-    if kind == "autoclass":
-        lines += ["   :members:", f"   :exclude-members: {', '.join(INTERNAL)}"]
+    if name in MEMBERS:
+        lines += [f"   :members: {MEMBERS[name]}"]
     if inspect.isclass(value) and issubclass(value, Exception):
         lines += ["   :show-inheritance:"]
     return "\n".join(lines) + "\n"
