@@ -42,7 +42,7 @@ def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
     assert last_line.split()[1] == "+-"
 
 
-# Both end with a cell that holds their text to the numbers. The build of the guide runs all notebooks.
+# Both end with a cell that holds their text to the numbers. The build of the guide runs them all.
 @pytest.mark.parametrize("name", ["your_system", "model_comparison"])
 def test_tutorial(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT / "docs" / "tutorials")
