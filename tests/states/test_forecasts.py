@@ -6,6 +6,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.simulation import observer
 from tests.filters.test_ekf_states import assert_drawn_from
 from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
@@ -161,21 +162,36 @@ def test_counts_are_forecast_as_counts():
     with pm.Model() as model:
         pm.Normal("c")
         psf.StateSpace("d", system, psf.BootstrapPF(100), steps=[0, 1], observed=[1.0, 2.0])
-    idata = posterior(c=np.tile([0.3, 1.3], (2, 1500)))
-    group = predictions(idata, model, n_steps=30).to_dataset().isel(d_time=-1)
+    values = np.tile([0.3, 1.3], (2, 1500))
+    values[1, 0] = 1e300  # the filter fails, and no count is that of an unknown rate
+    with pytest.warns(psf.FilterWarning, match="in 1 of 6000 evaluations"):
+        group = predictions(posterior(c=values), model, n_steps=30).to_dataset().isel(d_time=-1)
+    assert group["d"].isnull().sum() == group["d"][1, 0].isnull().sum() == 1
     for i, c in enumerate((0.3, 1.3)):
         part = group.isel(draw=slice(i, None, 2))
-        counts = part["d"].values.ravel()
+        known = part["d"].notnull().values.ravel()
+        counts = part["d"].values.ravel()[known]
         assert (counts % 1 == 0).all()
         # 30 steps later the state is stationary, with variance 0.2 / (1 - 0.64).
         v = 0.2 / 0.36
         mean = np.exp(c + v / 2)
         variance = mean + mean**2 * np.expm1(v)
         assert abs(counts.mean() - mean) < 5 * np.sqrt(variance / counts.size)
-        rate = np.exp(c + part["d_states"].values.ravel())
+        rate = np.exp(c + part["d_states"].values.ravel()[known])
         z = (counts - rate) / np.sqrt(rate)
         assert abs(z.mean()) < 5 / np.sqrt(z.size)
         assert abs(np.mean(z**2) - 1) < 5 * np.sqrt((2 + np.mean(1 / rate)) / z.size)
+
+
+def test_observations_of_given_states():
+    """At their own steps: inputs and time enter there."""
+    steps = np.array([2, 3, 6])
+    states = np.random.default_rng(1).normal(size=(3, 1))
+    force = np.asarray(FORCE)[:, None]
+    look, rng = observer(PUSHED).function, np.random.default_rng(2)
+    seen = np.array([look(rng, np.array([0.7]), states, steps, force, T0) for _ in range(4000)])
+    mean = states[:, 0] + shown(steps, FORCE)
+    assert_drawn_from(seen[:, :, 0], mean, 0.5 * np.eye(3), RATE)
 
 
 def test_the_same_seed_gives_the_same_forecast():
