@@ -47,8 +47,8 @@ lint: $(VENV)/.installed  ## style, format, types, and who imports whom
 	$(IN)/mypy
 	$(IN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed  ## the guide, in docs/_build/html; every notebook in it is run
-	$(IN)/python -m sphinx -E -W --keep-going --quiet -b html docs docs/_build/html
+docs: $(VENV)/.installed  ## the guide, in docs/_build/html; every notebook in it is run, two at a time
+	$(IN)/python -m sphinx -E -j 2 -W --keep-going --quiet -b html docs docs/_build/html
 
 linkcheck: $(VENV)/.installed  ## the guide's links to other sites, on a machine that reaches them
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck

@@ -1,10 +1,9 @@
-"""The code that the README and the guide show runs as it stands."""
+"""The README's code runs as it stands; the guide's is run by the build of the guide."""
 
 import json
 import re
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -40,15 +39,6 @@ def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
     assert dict(names["idata"]["posterior"].sizes) == {"chain": 4, "draw": 2000}
     last_line = capsys.readouterr().out.splitlines()[-1]
     assert last_line.split()[1] == "+-"
-
-
-# Both end with a cell that holds their text to the numbers. The build of the guide runs them all.
-@pytest.mark.parametrize("name", ["your_system", "model_comparison"])
-def test_tutorial(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT / "docs" / "tutorials")
-    with plt.rc_context():
-        run_code_of(f"docs/tutorials/{name}.ipynb")
-    plt.close("all")
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
