@@ -113,6 +113,20 @@ def at_draws_of(function, n_draws):
     return VariableAtDraws(model, observed_variables(model)[0], draws)
 
 
+def test_a_bar_that_appears_on_the_way_counts_all(screen, monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    monkeypatch.setattr(many_calls, "_REFRESH_SECONDS", 0.01)
+
+    def slow(a):
+        time.sleep(0.004)
+        return np.asarray(a)
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        at_draws = at_draws_of(slow, 60)
+        at_draws.evaluate([at_draws.variable.theta], {}, task="parameters", progressbar=True)
+    assert screen.bars == [["parameters", 60, 60]]
+
+
 def test_an_exception_arrives():
     def picky(a):
         if a > 0.5:
