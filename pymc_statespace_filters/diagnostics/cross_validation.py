@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 from pymc_statespace_filters.diagnostics.pointwise_terms import SEQUENTIAL, terms_at
 from pymc_statespace_filters.diagnostics.shortened_record import record_of, shortened
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.records import is_whole
 from pymc_statespace_filters.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.posterior import draws_of
 from pymc_statespace_filters.states.variable import chosen_variables
@@ -150,8 +151,7 @@ def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
 
 
 def _check_number(given: int, least: int, n_observations: int, name: str) -> None:
-    whole = isinstance(given, int) and not isinstance(given, bool)
-    if not (whole and least <= given < n_observations):
+    if not (is_whole(given) and least <= given < n_observations):
         raise ModelError(
             f"min_observations must be an integer from {least} to {n_observations - 1}, as "
             f"{name!r} has {n_observations} observations, got {given!r}"

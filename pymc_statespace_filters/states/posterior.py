@@ -74,6 +74,7 @@ def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
     n_chains, length = posterior.sizes["chain"], posterior.sizes["draw"]
     if not n_chains * length:
         raise ModelError("the posterior of idata has no draws")
+    stats = _of_the_same_draws(stats, posterior)
     if n_draws is not None:
         if not is_whole(n_draws) or not 1 <= n_draws <= n_chains * length:
             raise ModelError(
@@ -84,3 +85,16 @@ def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
         kept = {"draw": np.linspace(0, length - 1, each).round().astype(int)}
         posterior, stats = posterior.isel(kept), stats.isel(kept, missing_dims="ignore")
     return PosteriorDraws(posterior, stats, noise_was_moved(idata))
+
+
+def _of_the_same_draws(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:
+    """The statistics of these draws, which may be some of those that there were."""
+    labels = {dim: posterior[dim].values for dim in SAMPLE_DIMS}
+    if not set(SAMPLE_DIMS) <= set(stats.dims):
+        return xr.Dataset()
+    if not all(np.isin(values, stats[dim]).all() for dim, values in labels.items()):
+        raise ModelError(
+            "the draws of the posterior are not among those of sample_stats: their noise seeds "
+            "cannot be told. Select from the whole of idata, or drop its group sample_stats"
+        )
+    return stats.sel(labels)

@@ -7,6 +7,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops import LogLikelihood, evaluator
@@ -260,3 +261,19 @@ def test_every_draw_is_drawn_apart(estimate):
     idata = estimate(posterior(a=np.full(SHAPE, 0.6)), pair_model(), random_seed=1)
     drawn = list(idata.children.values())[-1]["d_states"].values
     assert len(np.unique(drawn)) == drawn.size
+
+
+def test_seeds_belong_to_the_draws_of_their_labels():
+    """Draws thinned by the user, whose statistics were not."""
+    model, idata = pair_model(PF), posterior(a=A)
+    idata["sample_stats"] = posterior(d_seed=np.arange(6).reshape(SHAPE))["posterior"]
+    means = psf.filtered_states(idata, model, random_seed=1)["filtered_states"]["d_mean"]
+    kept = {"chain": [1], "draw": [0, 2]}
+    thinned = idata.copy()
+    thinned["posterior"] = idata["posterior"].isel(kept)
+    found = psf.filtered_states(thinned, model, random_seed=2)["filtered_states"]["d_mean"]
+    np.testing.assert_array_equal(found, means.isel(kept))
+    others = thinned["posterior"].to_dataset().assign_coords(draw=[7, 8])
+    thinned["posterior"] = xr.DataTree(others)
+    with pytest.raises(psf.ModelError, match="not among those of sample_stats"):
+        psf.filtered_states(thinned, model)
