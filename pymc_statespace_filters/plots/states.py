@@ -136,7 +136,7 @@ def plot_states(
         true = truth.reindex(state=shown).to_dataset(name="truth")
         collection.map(curve, "truth", data=true, **TRUTH)
         key["truth"] = TRUTH
-    if record is not None:
+    if record is not None and set(shown) & set(record["state"].values):
         seen = record.reindex(state=shown).to_dataset(name="data")
         collection.map(points, "data", data=seen, diameter=4, **DATA)
         key["data"] = in_key(DATA)

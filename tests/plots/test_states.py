@@ -124,8 +124,9 @@ def test_panels_and_their_names(states):
     assert [axes.get_xlabel() for axes in figure.axes] == ["", "time (s)"]
     key = [text.get_text() for text in figure.legends[0].get_texts()]
     assert key == ["median", "50 %", "90 %", "data"]
-    (axes,) = plot_states(states, states="speed").viz["figure"].item().axes
-    assert axes.get_ylabel() == "speed"
+    unseen = plot_states(states, states="speed").viz["figure"].item()
+    assert [axes.get_ylabel() for axes in unseen.axes] == ["speed"]
+    assert [text.get_text() for text in unseen.legends[0].get_texts()] == key[:-1]
 
 
 def test_many_states():
