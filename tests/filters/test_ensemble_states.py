@@ -8,9 +8,12 @@ any finite number has. A right filter fails that once in a million times the num
 from typing import NamedTuple
 
 import numpy as np
+import pytensor.tensor as pt
 import pytest
+from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.filters._backward import _choose_particles, _share_out
 from pymc_statespace_filters.filters._past import LAG, _settlement
 from pymc_statespace_filters.ops import LogLikelihood, evaluator
 from pymc_statespace_filters.ops import States as StatesOp
@@ -271,3 +274,59 @@ def test_errors_of_particles_fall_with_the_root_of_their_number(moment):
     ]
     slope, _ = np.polyfit(np.log(sizes), np.log(rms), 1)
     assert -0.6 < slope < -0.4
+
+
+def test_particles_are_chosen_by_weight_and_density():
+    """Proposals that are accepted, and full sweeps where none is, give one law.
+
+    A chi-square test that a right choice fails once in ten thousand.
+    """
+    rng = np.random.default_rng(1)
+    N, n, n_paths = 12, 2, 20_000
+    means, roots = 3.0 * rng.normal(size=(n, N)), np.zeros((N, n, n))
+    roots[:, 0, 0], roots[:, 1, 1] = rng.uniform(0.1, 1.0, (2, N))
+    roots[:, 1, 0] = rng.normal(size=N)
+    log_constants = -np.log(roots[:, 0, 0] * roots[:, 1, 1])
+    w = rng.dirichlet(np.ones(N))
+    w[3] = 0.0
+    log_constants[3] = -np.inf
+    x = means[:, 5] + roots[5] @ [0.3, -0.2]  # far off for most: often all proposals are refused
+    covs = roots @ roots.transpose(0, 2, 1)
+    densities = [multivariate_normal.pdf(x, m, c) for m, c in zip(means.T, covs, strict=True)]
+    shares = w * densities / (w @ densities)
+    refused = 1.0 - 2.0 * np.pi * (w @ densities) / np.exp(log_constants.max())
+    assert 0.1 < refused**16 < 0.9
+
+    cumulative, begins = np.empty(N), np.empty(N, np.int64)
+    _share_out(w, (cumulative, begins))
+    chosen = np.empty(n_paths, np.int64)
+    kernel = (means, roots, log_constants)
+    _choose_particles(7, 0, w, (cumulative, begins), kernel, np.tile(x, (n_paths, 1)), chosen)
+    counts = np.bincount(chosen, minlength=N)
+    likely = shares * n_paths > 5
+    expected = np.append(shares[likely], shares[~likely].sum()) * n_paths
+    found = np.append(counts[likely], counts[~likely].sum())
+    assert counts[3] == 0
+    keep = expected > 0
+    statistic = ((found - expected)[keep] ** 2 / expected[keep]).sum()
+    assert chi2.sf(statistic, keep.sum() - 1) > 1e-4
+
+
+def test_noise_that_depends_on_the_state():
+    """Each particle has a covariance of its own; the point-mass filter knows the answer."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + (0.2 + 0.6 * pt.sigmoid(2.0 * x[0])) * q[0]],
+        process_noise=[[1.0]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.3]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    steps, rows = np.array([2, 5, 8]), np.arange(9)
+    arguments = (system, [], steps, np.array([[1.5], [-0.8], [0.9]]), rows)
+    truth = states("smoothed", psf.GridFilter(), *arguments)
+    several = [
+        states("smoothed", psf.BootstrapPF(500), *arguments, seed=i, draw_seed=i)
+        for i in range(N_SEEDS)
+    ]
+    assert_right(several, truth, 0.03)
