@@ -261,8 +261,9 @@ def _settlement(rows, steps, observed, lag):
     for row in range(rows.size):
         while first < seen.size and steps[seen[first]] < rows[row]:
             first += 1
-        within = first + lag < seen.size
-        settled_at[row] = seen[first + lag] if within else steps.size
+        # At the last one at the latest, before resampling adds noise.
+        within = first < seen.size
+        settled_at[row] = seen[min(first + lag, seen.size - 1)] if within else steps.size
         last = steps[settled_at[row]] if within else rows[-1]
         while until < rows.size and rows[until] <= last:
             until += 1

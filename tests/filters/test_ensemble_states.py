@@ -58,11 +58,11 @@ class States(NamedTuple):
 
 def states(
     moment, filter, system=PAIR, theta=(0.7, 0.2), steps=STEPS, observed=PAIR_DATA, rows=ROWS,
-    seed=0, draw_seed=0,
+    seed=0, draw_seed=0, inputs=NO_INPUTS,
 ):  # fmt: skip
     evaluate = evaluator(StatesOp(system, filter, moment))
     theta = np.array(theta)
-    return States(*evaluate(theta, steps, observed, NO_INPUTS, 0.0, seed, rows, draw_seed))
+    return States(*evaluate(theta, steps, observed, inputs, 0.0, seed, rows, draw_seed))
 
 
 def exact(moment, rows=ROWS, **changes):
@@ -207,10 +207,10 @@ def test_when_rows_are_settled():
     observed = np.array([[0.1], [np.nan], [0.3], [0.4], [0.5], [0.6]])
     settled, slots = _settlement(np.arange(11), steps, observed, 2)
     # Rows 1 to 4 wait for the datum at step 4, and two more.
-    np.testing.assert_array_equal(settled, [3, 4, 4, 4, 4, 5, 5, 6, 6, 6, 6])
+    np.testing.assert_array_equal(settled, [3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 5])
     assert slots == 8  # rows 1 to 8 are there at step 8, when row 1 is settled
     settled, slots = _settlement(np.array([3, 9]), steps, observed, 10**9)
-    np.testing.assert_array_equal(settled, [6, 6])
+    np.testing.assert_array_equal(settled, [5, 5])
     assert slots == 2
 
 
@@ -314,8 +314,14 @@ def test_particles_are_chosen_by_weight_and_density():
 
 def test_noise_that_depends_on_the_state():
     """Each particle has a covariance of its own; the point-mass filter knows the answer."""
+
+    def transition(x, q, u, t):
+        noise = 0.2 + 0.6 * pt.sigmoid(2.0 * x[0])
+        return [0.9 * x[0] + u[0] + 0.5 * pt.cos(2.0 * t) + noise * q[0]]
+
     system = psf.StateSpaceModel(
-        transition=lambda x, q: [0.9 * x[0] + (0.2 + 0.6 * pt.sigmoid(2.0 * x[0])) * q[0]],
+        transition=transition,
+        inputs=["push"],
         process_noise=[[1.0]],
         observation=lambda x: [x[0]],
         observation_noise=[[0.3]],
@@ -324,9 +330,23 @@ def test_noise_that_depends_on_the_state():
     )
     steps, rows = np.array([2, 5, 8]), np.arange(9)
     arguments = (system, [], steps, np.array([[1.5], [-0.8], [0.9]]), rows)
-    truth = states("smoothed", psf.GridFilter(), *arguments)
+    push = np.array([[0.5], [-1.0], [2.0], [0.0], [-2.0], [1.0], [0.3], [-0.7]])
+    truth = states("smoothed", psf.GridFilter(), *arguments, inputs=push)
     several = [
-        states("smoothed", psf.BootstrapPF(500), *arguments, seed=i, draw_seed=i)
+        states("smoothed", psf.BootstrapPF(500), *arguments, inputs=push, seed=i, draw_seed=i)
         for i in range(N_SEEDS)
     ]
     assert_right(several, truth, 0.03)
+
+
+@pytest.mark.parametrize("below", [0.0, 1.0], ids=["weighted", "resampled"])
+@pytest.mark.parametrize("kind", [psf.EnKF, psf.BootstrapPF, psf.PFEnKF])
+def test_at_its_end_a_record_is_filtered(kind, below):
+    """The past is nudged and weighted as the present is, to rounding."""
+    settings = {} if kind is psf.EnKF else {"resample_below": below}
+    arguments = (kind(60, **settings), SWING, [1.2], LONG_STEPS[:9], LONG_DATA[:9])
+    rows = np.array([4, 9])
+    smoothed, filtered = (states(m, *arguments, rows=rows) for m in ("smoothed", "filtered"))
+    np.testing.assert_allclose(smoothed.mean[1], filtered.mean[1], rtol=1e-9)
+    np.testing.assert_allclose(smoothed.sd[1], filtered.sd[1], rtol=1e-9)
+    assert (smoothed.mean[0] != filtered.mean[0]).all()
