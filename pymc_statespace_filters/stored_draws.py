@@ -4,8 +4,6 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 
-STATS = "sample_stats"
-
 
 def posterior_group(idata: xr.DataTree) -> xr.Dataset:
     """The draws, every variable with the dimensions chain and draw.
@@ -33,4 +31,4 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
 
 def noise_was_moved(idata: xr.DataTree) -> bool:
     """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
-    return STATS in idata.children and "correlation" in idata[STATS]
+    return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]

@@ -19,10 +19,7 @@ def cells_of(notebook: Path) -> list[dict]:
 
 
 def code_of(page: str) -> str:
-    path = ROOT / page
-    if path.suffix == ".ipynb":
-        return "\n".join("".join(cell["source"]) for cell in cells_of(path))
-    return "\n".join(re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL))
+    return "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL))
 
 
 def run_code_of(*pages: str) -> dict:

@@ -18,7 +18,7 @@ from pymc_statespace_filters.diagnostics.shortened_record import record_of
 from pymc_statespace_filters.inspection import COLLAPSED
 from pymc_statespace_filters.records import check_random_seed
 from pymc_statespace_filters.simulation import observer
-from pymc_statespace_filters.state_graphs import StateSpaceVariable, with_other_filter
+from pymc_statespace_filters.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.posterior import PosteriorDraws, draws_of
 from pymc_statespace_filters.states.result import with_group
 from pymc_statespace_filters.states.variable import States, VariableAtDraws, chosen_variables
@@ -136,9 +136,7 @@ def filter_diagnostics(
     rng = check_random_seed(random_seed)
     draws = draws_of(idata, n_draws)
     parts = []
-    for variable in chosen_variables(model, var_name):
-        if filter is not None:
-            variable = with_other_filter(variable, filter)
+    for variable in chosen_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
         after = before

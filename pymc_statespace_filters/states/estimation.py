@@ -9,7 +9,7 @@ import xarray as xr
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.likelihood import warn_of
 from pymc_statespace_filters.records import check_random_seed
-from pymc_statespace_filters.state_graphs import observed_variables, with_other_filter
+from pymc_statespace_filters.state_graphs import observed_variables
 from pymc_statespace_filters.states.posterior import draws_of
 from pymc_statespace_filters.states.result import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
@@ -124,8 +124,9 @@ def smoothed_states(
     -------
     xarray.DataTree
         With the group ``smoothed_states``, of the form that `filtered_states` describes. A row of
-        ``d_states`` is a path: the states of one draw belong together. How the filter smooths is
-        in the attribute ``smoothing`` of ``d_states``.
+        ``d_states`` is a path: the states of one draw belong together (along ancestries, as far
+        as their lag reaches). How the filter smooths is in the attribute ``smoothing`` of
+        ``d_states``.
 
     See Also
     --------
@@ -176,9 +177,7 @@ def _add_states(
     draws = draws_of(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name):
-        if filter is not None:
-            variable = with_other_filter(variable, filter)
+    for variable in chosen_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         rows = ROWS_AT[at](at_draws.steps)
         states = at_draws.states(moment, rows, rng, progressbar=progressbar)

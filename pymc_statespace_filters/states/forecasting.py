@@ -18,7 +18,7 @@ from pymc_statespace_filters.records import (
     steps_of,
 )
 from pymc_statespace_filters.simulation import continuation
-from pymc_statespace_filters.state_graphs import observed_variables, with_other_filter
+from pymc_statespace_filters.state_graphs import observed_variables
 from pymc_statespace_filters.states.posterior import draws_of
 from pymc_statespace_filters.states.result import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
@@ -106,9 +106,7 @@ def forecast(
     draws = draws_of(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name):
-        if filter is not None:
-            variable = with_other_filter(variable, filter)
+    for variable in chosen_variables(model, var_name, filter):
         name, system, (time, observable) = variable.name, variable.system, variable.dims
         at_draws = VariableAtDraws(model, variable, draws)
         last = at_draws.steps[-1:]

@@ -1,7 +1,7 @@
 """A state-space variable at draws of the posterior: parameters, inputs, and states by a filter."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
@@ -15,7 +15,12 @@ from pytensor.graph.traversal import ancestors
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.machine_code import ManyCalls
 from pymc_statespace_filters.progress import watched
-from pymc_statespace_filters.state_graphs import StateSpaceVariable, observed_variables, states_of
+from pymc_statespace_filters.state_graphs import (
+    StateSpaceVariable,
+    observed_variables,
+    states_of,
+    with_other_filter,
+)
 from pymc_statespace_filters.states.posterior import PosteriorDraws
 
 Array = NDArray[np.float64]
@@ -125,13 +130,14 @@ class VariableAtDraws:
         return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
 
 
-def chosen_variables(model: pm.Model, name: str | None) -> list[StateSpaceVariable]:
-    """The observed variable of a name, or all of them."""
+def chosen_variables(
+    model: pm.Model, name: str | None, filter: Any = None
+) -> list[StateSpaceVariable]:
+    """The observed variable of a name, or all of them; read by another filter if one is given."""
     found = {variable.name: variable for variable in observed_variables(model)}
     if not found:
         raise ModelError("the model has no observed StateSpace variable")
-    if name is None:
-        return list(found.values())
-    if name not in list(found):  # a list cannot be looked up
+    if name is not None and name not in list(found):  # a list cannot be looked up
         raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
-    return [found[name]]
+    chosen = list(found.values()) if name is None else [found[name]]
+    return chosen if filter is None else [with_other_filter(v, filter) for v in chosen]
