@@ -19,8 +19,10 @@ endef
 IN = $(VENV)/bin
 PYTEST = -m pytest -n 2 --dist loadfile
 
+STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
+
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-quick test test-slow test-latest lint docs linkcheck bench bench-quick lock clean
+.PHONY: help demo demo-quick thesis thesis-quick test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -31,8 +33,17 @@ demo: $(VENV)/.installed  ## three rival models of a double well, in out/; CSV=y
 demo-quick: $(VENV)/.installed  ## the same with short chains, to see that it runs
 	$(IN)/python examples/double_well.py --quick --out out/quick $(if $(CSV),--csv "$(CSV)")
 
+thesis: $(VENV)/.installed  ## every study of the thesis at its own settings, in out/thesis; hours, resumes; STUDIES=double_well
+	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py $(ARGS) || exit 1; done
+
+thesis-quick: $(VENV)/.installed  ## the same in a short form, minutes; fails where a verdict does not hold
+	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py --quick $(ARGS) || exit 1; done
+
 test: $(VENV)/.installed  ## the tests, in two processes
 	$(IN)/python $(PYTEST)
+
+test-mpi: $(VENV)/.installed  ## the tests by real MPI, on one, two and four ranks
+	$(IN)/python -m pytest -m "mpi and not slow" tests/mpi
 
 test-slow: $(VENV)/.installed  ## the statistical calibrations that `make test` leaves out
 	$(IN)/python $(PYTEST) -m slow
@@ -58,6 +69,9 @@ bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  #
 
 bench-quick: $(VENV)/.installed  ## our filters beside loops by hand, a minute
 	$(IN)/python -m benchmarks.quick
+
+bench-mpi: $(VENV)/.installed  ## seconds against ranks, into docs/; two cores, half an hour
+	$(IN)/python -m benchmarks.mpi $(ARGS)
 
 lock: $(LATEST)/.exists  ## resolve anew; PYTHON=python3.12, so that the versions suit every Python
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]' hatchling editables

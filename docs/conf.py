@@ -28,7 +28,8 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["_build"]
+# The notes of a study are sections of the page on the thesis.
+exclude_patterns = ["_build", "thesis/*/*.md"]
 nitpicky = True  # every reference within the guide must be found
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -58,7 +59,7 @@ html_theme = "pydata_sphinx_theme"  # that of PyMC's own pages is made from it
 html_title = "pymc-statespace-filters"
 html_static_path = ["_static"]
 html_css_files = ["guide.css"]
-html_sidebars = {"index": [], "start": []}
+html_sidebars = {"index": [], "start": [], "thesis": []}
 html_show_sourcelink = False
 html_theme_options = {
     "footer_end": [],

@@ -17,7 +17,7 @@ GROUPS = {
         "records",
         "simulation",
     ),
-    "Filters": ("filters", "likelihood"),
+    "Filters": ("filters", "likelihood", "filter_run"),
     "In a PyMC model": ("distribution", "sampling"),
     "States, forecasts, diagnostics": ("states", "diagnostics"),
     "Evidence and model choice": ("evidence",),

@@ -14,6 +14,8 @@ from pymc_statespace_filters.errors import (
     GradientUnavailableError,
     LoweringError,
     ModelError,
+    ParallelError,
+    ParallelWarning,
     StateSpaceFiltersError,
 )
 from pymc_statespace_filters.evidence import (
@@ -26,11 +28,17 @@ from pymc_statespace_filters.evidence import (
     marginal_modes,
     prior_sensitivity,
 )
+from pymc_statespace_filters.filter_run import run_filter
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
 from pymc_statespace_filters.integrators import EulerMaruyama
 from pymc_statespace_filters.likelihood import log_likelihood
 from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
+from pymc_statespace_filters.nonlinearities import (
+    cubic,
+    freeplay,
+    hysteresis,
+    hysteresis_branch,
+)
 from pymc_statespace_filters.plots import (
     plot_average,
     plot_evidence,
@@ -42,7 +50,7 @@ from pymc_statespace_filters.plots import (
     plot_states,
 )
 from pymc_statespace_filters.records import nearest_steps
-from pymc_statespace_filters.sampling import DRAM, sample_dram, suggest_particles
+from pymc_statespace_filters.sampling import DRAM, run_models, sample_dram, suggest_particles
 from pymc_statespace_filters.simulation import simulate
 from pymc_statespace_filters.states import filtered_states, forecast, smoothed_states
 
@@ -63,6 +71,8 @@ __all__ = [
     "LoweringError",
     "ModelError",
     "PFEnKF",
+    "ParallelError",
+    "ParallelWarning",
     "StateSpace",
     "StateSpaceFiltersError",
     "StateSpaceModel",
@@ -77,6 +87,7 @@ __all__ = [
     "forecast",
     "freeplay",
     "hysteresis",
+    "hysteresis_branch",
     "leave_future_out",
     "log_likelihood",
     "marginal_modes",
@@ -90,6 +101,8 @@ __all__ = [
     "plot_prior_sensitivity",
     "plot_states",
     "prior_sensitivity",
+    "run_filter",
+    "run_models",
     "sample_dram",
     "simulate",
     "smoothed_states",

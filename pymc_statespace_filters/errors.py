@@ -103,6 +103,31 @@ class GradientUnavailableError(StateSpaceFiltersError):
     """
 
 
+class ParallelError(StateSpaceFiltersError, RuntimeError):
+    """MPI cannot be used as it was asked for, or another rank has stopped the run.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> issubclass(psf.ParallelError, RuntimeError)
+    True
+    """
+
+
+class ParallelWarning(UserWarning):
+    """The ranks of a run are not what a reproducible run needs.
+
+    Examples
+    --------
+    To stop instead:
+
+    >>> import warnings
+    >>> import pymc_statespace_filters as psf
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", psf.ParallelWarning)
+    """
+
+
 class FilterWarning(UserWarning):
     """A filter's numbers should not be trusted as they stand.
 

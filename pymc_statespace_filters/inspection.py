@@ -15,16 +15,26 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.likelihood import check_kinds
-from pymc_statespace_filters.ops import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.ops import (
+    DelegableLogLikelihood,
+    DelegableLogLikelihoodOfNoise,
+    Delegate,
+    LogLikelihood,
+    LogLikelihoodOfNoise,
+    StoredNoise,
+)
 from pymc_statespace_filters.random_variable import StateSpaceRV
 
 __all__ = [
     "COLLAPSED",
     "FAILURES",
+    "Delegable",
+    "Delegate",
     "MovedNoise",
+    "delegable_likelihoods",
     "exactness",
     "health_outputs",
-    "hold_noise",
     "is_filter",
     "likelihood_nodes",
     "log_density_terms",
@@ -103,26 +113,50 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     return [node.outputs[1] for node in likelihood_nodes(graphs)]
 
 
-def hold_noise(
-    graphs: Sequence[Variable], seeds: Mapping[str, SharedVariable]
-) -> tuple[list[Variable], dict[TensorVariable, TensorVariable]]:
-    """Graphs that read stored normals where they made them from a seed, with the same values.
+class Delegable(NamedTuple):
+    """The symbols of `delegable_likelihoods`.
 
-    The mapping gives for each new input the expression of its value, which depends on the seed and
-    on the steps of the record alone.
+    Attributes
+    ----------
+    kinds : tuple of (StateSpaceModel, filter)
+        The likelihoods that a delegate is to evaluate, by the number that it is called with.
+    address : TensorVariable
+        Input: of the delegate; with 0 the filters evaluate.
+    normals : dict of TensorVariable to TensorVariable
+        Inputs, and the expressions of their values, which depend on the seed and on the steps of
+        the record alone. An empty vector makes the filter read its seed after all.
     """
+
+    kinds: tuple[tuple[StateSpaceModel, Filter], ...]
+    address: TensorVariable
+    normals: dict[TensorVariable, TensorVariable]
+
+
+def delegable_likelihoods(
+    graphs: Sequence[Variable], held: Mapping[str, SharedVariable]
+) -> tuple[list[Variable], Delegable]:
+    """Graphs whose noisy likelihoods a `Delegate` can evaluate, with the same values.
+
+    With seeds that are held, stored normals are read where they were made from one of these.
+    """
+    address = pt.lscalar("delegate")
     replaced: dict[Variable, Variable] = {}
     normals: dict[TensorVariable, TensorVariable] = {}
-    names = {seed: name for name, seed in seeds.items()}
-    for node in likelihood_nodes(graphs):
-        if node.inputs[-1] in names:
-            *arguments, seed = node.inputs
-            system, filter = node.op.system, node.op.filter
+    names = {seed: name for name, seed in held.items()}
+    delegable = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
+    for number, node in enumerate(delegable):
+        system, filter = node.op.system, node.op.filter
+        steps, seed = node.inputs[1], node.inputs[-1]
+        if seed in names:
             stored = pt.dvector(f"{names[seed]}_normals")
-            normals[stored] = StoredNoise(system, filter)(arguments[1], seed)
-            outputs = LogLikelihoodOfNoise(system, filter)(*arguments, stored)
-            replaced |= dict(zip(node.outputs, outputs, strict=True))
-    return clone_replace(list(graphs), replaced), normals
+            normals[stored] = StoredNoise(system, filter)(steps, seed)
+            op: LogLikelihood = DelegableLogLikelihoodOfNoise(system, filter)
+            outputs = op(*node.inputs, stored, number, address)
+        else:
+            outputs = DelegableLogLikelihood(system, filter)(*node.inputs, number, address)
+        replaced |= dict(zip(node.outputs, outputs, strict=True))
+    kinds = tuple((node.op.system, node.op.filter) for node in delegable)
+    return clone_replace(list(graphs), replaced), Delegable(kinds, address, normals)
 
 
 class MovedNoise(NamedTuple):

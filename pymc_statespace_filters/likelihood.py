@@ -1,21 +1,25 @@
 """Log-likelihoods without PyMC: numbers in, numbers out."""
 
+import hashlib
 import warnings
 from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.errors import DataMismatchError, FilterWarning, ModelError
 from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.model import StateSpaceModel
 from pymc_statespace_filters.ops import (
     HEALTH_SIZE,
     BatchLogLikelihood,
     LogLikelihood,
+    SharedLogLikelihood,
     evaluator,
     has_batch,
 )
+from pymc_statespace_filters.parallel import Ranks, ranks_of
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import (
     check_inputs,
@@ -38,6 +42,7 @@ def log_likelihood(
     inputs: Any = None,
     t0: float = 0.0,
     seed: Any = 0,
+    comm: Any = None,
 ) -> np.ndarray:
     """Evaluate the log-likelihood of a record, term by term.
 
@@ -60,6 +65,9 @@ def log_likelihood(
         Time of step 0.
     seed : int or array_like of int
         The noise inside the filter, if it has any; broadcasts with the parameters.
+    comm : mpi4py.MPI.Intracomm or "world", optional
+        Ranks among which the filter's members are divided, in blocks of 64. All of them call this
+        with the same arguments and get the same result, to the bit that of one rank.
 
     Returns
     -------
@@ -67,10 +75,17 @@ def log_likelihood(
         log p(d_j | d_1 .. d_{j-1}); their sum over j is the log-likelihood. A wholly missing row
         has the term 0; from an observation at which the filter fails on, terms are -inf.
 
+    Raises
+    ------
+    ModelError
+        If an argument does not fit the system, or the filter has not enough members for the ranks.
+    ParallelError
+        If MPI cannot be had as it was asked for, or the ranks are not alike.
+
     Warns
     -----
     FilterWarning
-        Once, if a filter failed or its particles collapsed.
+        Once, on the first rank, if a filter failed or its particles collapsed.
 
     Examples
     --------
@@ -105,24 +120,89 @@ def log_likelihood(
     seeds = np.broadcast_to(seeds, shape)
     points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
     record = (at, data, forces, np.asarray(t0))
-    terms, health = _evaluate(LogLikelihood(system, filter), points, record, seeds.ravel())
-    warn_of(filter, health)
+    with ranks_of(comm) as ranks:
+        if ranks.size > 1:
+            _check_agreement(ranks, filter, (points, *record, seeds))
+        terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
+        if ranks.rank == 0:
+            warn_of(filter, health)
     return terms.reshape(*shape, at.size)
 
 
+def _check_agreement(ranks: Ranks, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
+    """Raise, on all ranks, unless all make the same call."""
+    mine = hashlib.sha256(repr((filter, [array.shape for array in arrays])).encode())
+    for array in arrays:
+        mine.update(np.ascontiguousarray(array).tobytes())
+    digests = ranks.gather(mine.digest())
+    for rank, theirs in enumerate(digests):
+        if theirs != digests[0]:
+            raise DataMismatchError(
+                f"rank {rank} of {ranks.size} was asked for the likelihood of other parameters, "
+                f"seeds or data than rank 0, or by another filter: all must make the same call"
+            )
+
+
 def _evaluate(
-    op: LogLikelihood, points: np.ndarray, record: tuple, seeds: np.ndarray
+    system: StateSpaceModel,
+    filter: Filter,
+    points: np.ndarray,
+    record: tuple,
+    seeds: np.ndarray,
+    ranks: Ranks,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Terms and health of every point: side by side where the filter can, else in turn."""
-    if len(points) > 1 and has_batch(op):
+    check_ranks(filter, ranks.size)
+    if len(points) > 1 and has_batch(LogLikelihood(system, filter)):
         # Such a filter draws nothing: any seed will do.
-        return evaluator(BatchLogLikelihood(op.system, op.filter))(points, *record, seeds[0])
-    evaluate = evaluator(op)
+        return evaluator(BatchLogLikelihood(system, filter))(points, *record, seeds[0])
+    evaluate = shared_evaluator(system, filter, ranks)
     terms = np.empty((len(points), record[0].size))
     health = np.empty((len(points), HEALTH_SIZE))
     for i, point in enumerate(points):
         terms[i], health[i] = evaluate(point, *record, np.asarray(seeds[i]))
     return terms, health
+
+
+def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Ranks) -> Callable:
+    """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
+
+    All call it with the same arguments, each moves its own members, and all get the same result, to
+    the bit that of one rank.
+
+    Raises
+    ------
+    ModelError
+        If the filter has no members for so many ranks.
+    """
+    check_ranks(filter, ranks.size)
+    if ranks.size == 1:
+        return evaluator(LogLikelihood(system, filter))
+    evaluate = evaluator(SharedLogLikelihood(system, filter))
+
+    def evaluate_together(*record: Any) -> tuple[np.ndarray, np.ndarray]:
+        results = evaluate(*record, ranks.rank, ranks.size, ranks.exchange)
+        ranks.check_exchange()
+        return results
+
+    return evaluate_together
+
+
+def check_ranks(filter: Filter, n_ranks: int) -> None:
+    """Raise unless a filter has members for so many ranks."""
+    if n_ranks == 1:
+        return
+    if not filter.noisy:
+        raise ModelError(
+            f"{filter} has no members to spread over {n_ranks} ranks; take one rank for each "
+            f"evaluation, or a filter with members: EnKF, BootstrapPF or PFEnKF"
+        )
+    most = filter.most_ranks()  # type: ignore[union-attr]
+    if n_ranks > most:
+        raise ModelError(
+            f"{filter} has members for {most} of {n_ranks} ranks alone: a rank takes whole blocks "
+            f"of 64 members"
+        )
 
 
 def warn_of(filter: Filter, health: np.ndarray, *, stacklevel: int = 3) -> None:

@@ -14,7 +14,7 @@ from pytensor.tensor import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 
-__all__ = ["cubic", "freeplay", "hysteresis"]
+__all__ = ["cubic", "freeplay", "hysteresis", "hysteresis_branch"]
 
 type Tensorlike = TensorVariable | ArrayLike
 type Coefficient = TensorVariable | np.ndarray | float
@@ -154,7 +154,9 @@ def hysteresis(
     -----
     The rule has no memory: the branch follows from the sign of the velocity alone. Between the
     plateaus, ``abs(z) < a_h``, it is a spring with dry friction of strength ``k_h * delta_h / 2``,
-    which holds the mass in place if the other forces are weaker than that.
+    which holds the mass in place if the other forces are weaker than that. For a force that keeps
+    its branch when the motion turns inside the loop, give as `v` what :func:`hysteresis_branch`
+    returns: only the sign counts.
 
     *Differences from the source.* "Positive deflection" is read as positive velocity: with the sign
     of the displacement there would be no loop. A velocity of exactly zero is on the rising branch.
@@ -176,6 +178,51 @@ def hysteresis(
         return f_0 + k_h * (_ramp(z - a_h - delta_h, width) - _ramp(a_h - z, width))
 
     return pt.switch(v >= 0, rising(z), -rising(-z))
+
+
+def hysteresis_branch(
+    z: Tensorlike, branch: Tensorlike, a_h: Coefficient, delta_h: Coefficient
+) -> TensorVariable:
+    r"""Branch of a hysteresis that remembers: it is left at the ends of the loop alone.
+
+    .. math::
+
+        b' = \begin{cases} -1 & z \ge a_h + \delta_h \\
+                            +1 & z \le -(a_h + \delta_h) \\
+                            b & \text{between} \end{cases}
+
+    Beyond the ends both branches are one line, so the force, ``hysteresis(z, b, ...)``, is
+    continuous: a motion that turns inside the loop goes back the way it came, and has no friction.
+
+    Parameters
+    ----------
+    z : tensor_like
+        Displacement.
+    branch : tensor_like
+        The branch until now: 1 is the one of the way up, -1 that of the way down.
+    a_h, delta_h : tensor_like
+        Where a plateau begins and how long it is, as in :func:`hysteresis`.
+
+    Returns
+    -------
+    TensorVariable
+        The branch from here on, of the broadcast shape of the arguments.
+
+    Notes
+    -----
+    In a `StateSpaceModel` the branch is a state of its own, named in ``carried``: no Kalman update
+    may move it. `EKF` and `GridFilter` refuse such a system.
+
+    *Difference from the source.* Thesis, Eqs. 5.22 and 5.23 do not say when a branch is left.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.hysteresis_branch([-2.5, 0.0, 2.5], 1.0, a_h=0.5, delta_h=1.5).eval()
+    array([ 1.,  1., -1.])
+    """
+    z, end = _real(z), a_h + delta_h
+    return pt.switch(z >= end, -1.0, pt.switch(z <= -end, 1.0, _real(branch)))
 
 
 def _ramp(z: TensorVariable, width: float | None) -> TensorVariable:

@@ -12,6 +12,8 @@ from pymc_statespace_filters.model import StateSpaceModel
 # Times must lie on the grid of steps to this fraction of a step.
 GRID_TOLERANCE = 1e-6
 
+ROWS_AT = ("observations", "steps")
+
 
 def check_system(system: Any) -> None:
     """Raise unless this is a system."""
@@ -100,6 +102,17 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
             "or one value for both"
         )
     return check_steps(steps.astype("int64"))
+
+
+def check_at(at: Any) -> None:
+    """Raise unless this names the steps at which states are wanted."""
+    if at not in list(ROWS_AT):
+        raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
+
+
+def rows_at(at: str, steps: np.ndarray) -> np.ndarray:
+    """The steps at which states are wanted: those observed, or all from 0 to the last of them."""
+    return steps if at == "observations" else np.arange(steps[-1] + 1)
 
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:

@@ -1,8 +1,18 @@
-"""What a DataTree of posterior draws must hold, whoever made it."""
+"""What a DataTree of posterior draws must hold, whoever made it, and its draws unconstrained.
 
+The unconstrained space is that of the model's value variables: every free variable goes through its
+transform, vectors and matrices are flattened.
+"""
+
+import numpy as np
+import pymc as pm
 import xarray as xr
+from numpy.typing import NDArray
+from pymc.model.transform_values import unconstrain_values
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+
+MIN_DRAWS = 20
 
 
 def posterior_group(idata: xr.DataTree) -> xr.Dataset:
@@ -32,3 +42,51 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
 def noise_was_moved(idata: xr.DataTree) -> bool:
     """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
     return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
+
+
+def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float64]:
+    """Map the posterior group to the unconstrained space, shape (chain, draw, k).
+
+    Raises
+    ------
+    ModelError
+        If there is no posterior group, or too few draws in it.
+    DataMismatchError
+        If free variables are missing from it or have other shapes, or if a draw lies outside the
+        support.
+    """
+    posterior = posterior_group(idata)
+    missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
+    if missing:
+        raise DataMismatchError(
+            f"idata has no draws of {missing}, free variables of the model; "
+            f"its posterior holds {sorted(map(str, posterior.data_vars))}"
+        )
+    n_chains, n_draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    if n_draws < MIN_DRAWS:
+        raise ModelError(f"idata must have at least {MIN_DRAWS} draws per chain, got {n_draws}")
+
+    shapes = model.eval_rv_shapes()
+    for rv in model.free_RVs:
+        drawn = posterior[rv.name].transpose("chain", "draw", ...).shape[2:]
+        expected = tuple(int(length) for length in shapes[rv.name])
+        if drawn != expected:
+            raise DataMismatchError(
+                f"{rv.name!r} has shape {expected} in the model and {drawn} in idata"
+            )
+    # One call for all draws: not worth machine code.
+    unconstrained = unconstrain_values(
+        posterior, model=model, compile_kwargs={"mode": "FAST_COMPILE"}
+    )
+    columns = [
+        unconstrained[model.rvs_to_values[rv].name].values.reshape(n_chains, n_draws, -1)
+        for rv in model.free_RVs
+    ]
+    draws = np.concatenate(columns, axis=-1).astype(np.float64)
+    outside = int((~np.isfinite(draws).all(axis=-1)).sum())
+    if outside:
+        raise DataMismatchError(
+            f"{outside} of {n_chains * n_draws} draws lie on or outside the support of the model's "
+            "free variables: idata belongs to another model"
+        )
+    return draws

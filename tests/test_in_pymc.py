@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytest
+from numba.core.event import install_recorder
 from pymc.model.transform.optimization import freeze_dims_and_data
 
 import pymc_statespace_filters as psf
@@ -122,6 +123,15 @@ def test_draws_are_seeded_batched_and_the_same_in_every_mode():
     )
     first, second = pm.draw(several, random_seed=1, mode="FAST_COMPILE")
     assert np.abs(first - second).min() > 0
+
+
+def test_draws_in_python_compile_once():
+    variable = pair_model(observed=None)["d"]
+    draw = pytensor.function([], variable, mode="FAST_COMPILE")
+    draw()
+    with install_recorder("numba:compile") as compiled:
+        draw()
+    assert not compiled.buffer
 
 
 def test_draws_have_the_law_of_the_system():

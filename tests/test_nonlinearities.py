@@ -1,12 +1,19 @@
 """Forces against a transcription of thesis, Eqs. 5.20-5.23, and against what follows from it."""
 
+import itertools
+
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.nonlinearities import cubic, freeplay, hysteresis
+from pymc_statespace_filters.nonlinearities import (
+    cubic,
+    freeplay,
+    hysteresis,
+    hysteresis_branch,
+)
 
 STIFFNESS, START, LENGTH, GAP = 1.3, 0.4, 0.7, 0.25
 GRID = np.linspace(-3.0, 3.0, 1201)  # holds the kinks, and points between them
@@ -90,6 +97,39 @@ def test_branches_of_hysteresis_meet_outside_the_loop():
     rising = hysteresis(outside, 1.0, STIFFNESS, START, LENGTH).eval()
     falling = hysteresis(outside, -1.0, STIFFNESS, START, LENGTH).eval()
     np.testing.assert_allclose(rising, falling, atol=1e-14)
+
+
+@pytest.mark.parametrize("branch", [1.0, -1.0])
+def test_a_branch_is_left_at_the_ends_of_the_loop_alone(branch):
+    end = START + LENGTH
+    displacements = [-9.0, -end, -end + 1e-9, 0.0, end - 1e-9, end, 9.0]
+    kept = hysteresis_branch(displacements, branch, START, LENGTH).eval()
+    np.testing.assert_array_equal(kept, [1.0, 1.0, branch, branch, branch, -1.0, -1.0])
+
+
+def test_remembered_force_is_continuous_and_takes_out_full_loops_only():
+    """Along small swings, then once around: the work of the force is the area of one loop."""
+    z, b = pt.dscalar("z"), pt.dscalar("b")
+    force = hysteresis(z, b, STIFFNESS, START, LENGTH)
+    kept = hysteresis_branch(z, b, START, LENGTH)
+    step = pytensor.function([z, b], [force, kept], mode="FAST_COMPILE")
+    end, density = START + LENGTH, 200
+    turns = np.array([0.0, 0.8, -0.7, 0.9, -end - 0.5, end + 0.5, 0.0]) * density
+    path = np.concatenate([np.arange(a, o, np.sign(o - a)) for a, o in itertools.pairwise(turns)])
+    path, branch, forces = path / density, 1.0, []
+    for place in path:
+        value, branch = step(place, branch)
+        forces.append(float(value))
+    assert np.abs(np.diff(forces)).max() <= STIFFNESS / density * (1 + 1e-9)
+    assert branch == -1.0
+    # The way back from 0 on the falling branch to 0 on the rising one closes the loop.
+    f_0 = STIFFNESS * (2 * START + LENGTH) / 2
+    down = np.linspace(0, -end, 2001)
+    back = np.concatenate([down, down[::-1]])
+    branches = np.repeat([-1.0, 1.0], 2001)
+    closing = hysteresis(back, branches, STIFFNESS, START, LENGTH).eval()
+    work = np.trapezoid(forces, path) + np.trapezoid(closing, back)
+    assert work == pytest.approx(2 * f_0 * LENGTH, rel=1e-2)
 
 
 @pytest.mark.parametrize("width", [None, *WIDTHS])

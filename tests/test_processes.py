@@ -27,20 +27,24 @@ def evaluate(pickled, point):
     return pickle.loads(pickled)(point)
 
 
-@pytest.mark.filterwarnings("ignore:.*use of fork\\(\\) may lead to deadlocks:DeprecationWarning")
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.EnKF(20)], ids=["EKF", "EnKF"])
-@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
-def test_a_compiled_model_gives_the_same_bits_in_a_child(method, filter):
-    if method not in multiprocessing.get_all_start_methods():
-        pytest.skip(f"no {method} on this platform")
+def compiled(filter):
     with pm.Model() as model:
         pm.Normal("a", 0.5, 0.2)
         psf.StateSpace("d", PAIR, filter, steps=STEPS, observed=PAIR_DATA)
-    logp = model.compile_logp()
+    return model.compile_logp()
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork\\(\\) may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+def test_a_compiled_model_gives_the_same_bits_in_a_child(method):
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {method} on this platform")
+    models = [compiled(filter) for filter in (psf.EKF(), psf.EnKF(20))]
     context = multiprocessing.get_context(method)
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        there = pool.submit(evaluate, cloudpickle.dumps(logp), POINT).result(timeout=120)
-    assert there == logp(POINT)
+        calls = [pool.submit(evaluate, cloudpickle.dumps(logp), POINT) for logp in models]
+        there = [call.result(timeout=120) for call in calls]
+    assert there == [logp(POINT) for logp in models]
 
 
 # What a script of the user's does, in a process of its own: settings on the command line.
@@ -48,6 +52,7 @@ SCRIPT = """
 import json, sys
 import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.machine_code import entries
 from pymc_statespace_filters.ops import cache_key
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
@@ -59,8 +64,11 @@ for system, observed in json.loads(sys.argv[1]):
             "d", forced(**system), psf.EKF(), steps=STEPS, observed=observed, inputs=FORCE
         )
     results.append(model.compile_logp([model["d"]], sum=False)({"a": np.array(0.6)})[0].tolist())
+record = dict(observed=FORCED_DATA, steps=STEPS, inputs=FORCE)
+value = psf.log_likelihood(forced(), psf.EnKF(20), {"a": 0.6}, **record).tolist()
 key = cache_key(forced(), psf.EnKF(20).compile(forced()))
-print(json.dumps([results, key]))
+found = [entry.cache_hits for entry in entries._compiled.values()]
+print(json.dumps([results, value, key, found]))
 """
 
 
@@ -80,33 +88,28 @@ def run(tmp_path):
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        results, key = json.loads(done.stdout)
         machine_code = {p for p in cache.rglob("*") if p.suffix in {".nbc", ".nbi"}}
-        return results, key, machine_code
+        return *json.loads(done.stdout), machine_code
 
     return run
 
 
 def test_machine_code_is_found_again_and_never_mixed_up(run):
-    """Other data and other constants meet the cache that the first ones filled."""
+    """A second process compiles nothing; other data and constants meet what the first one kept."""
     data, other_data = FORCED_DATA.tolist(), (2 * FORCED_DATA).tolist()
-    cold, key, machine_code = run([{}, data])
+    *cold, found, machine_code = run([{}, data])
+    terms, _, key = cold
     assert machine_code
-    np.testing.assert_allclose(cold, [forced_terms(0.6)], rtol=1e-12)
+    assert len(found) > 5
+    assert not any(found)
+    np.testing.assert_allclose(terms, [forced_terms(0.6)], rtol=1e-12)
 
-    warm, same_key, same_machine_code = run([{}, data])
+    *warm, found_again, same_machine_code = run([{}, data])
     assert same_machine_code == machine_code
-    assert same_key == key == cache_key(FORCED, psf.EnKF(20).compile(FORCED))
+    assert found_again == [1] * len(found)
+    assert key == cache_key(FORCED, psf.EnKF(20).compile(FORCED))
     assert warm == cold
 
-    others, _, _ = run(
-        [{}, other_data],
-        [{"observation_noise": [[0.6]]}, data],
-        [{"initial_cov": [[3.0]]}, data],
-    )
-    exact = [
-        forced_terms(0.6, other_data),
-        forced_terms(0.6, observation_noise=0.6),
-        forced_terms(0.6, initial_cov=3.0),
-    ]
+    others, *_ = run([{}, other_data], [{"observation_noise": [[0.6]]}, data])
+    exact = [forced_terms(0.6, other_data), forced_terms(0.6, observation_noise=0.6)]
     np.testing.assert_allclose(others, exact, rtol=1e-12)

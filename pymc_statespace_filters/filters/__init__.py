@@ -9,9 +9,13 @@ do not read. ``compile_states(system, moment)`` gives the machine code of the st
 steps, observed, inputs, t0, seed, rows, draw_seed) -> (mean, sd, drawn, n_effective, health)``: at
 the steps ``rows``, (R, n) each and (R,), given the observations before them ("predicted"), up to
 them ("filtered") or all ("smoothed", in the way that ``smoothing_method(system)`` names). From a
-failing observation on they are NaN. What only some filters have is a method of theirs:
-``stored_noise`` of the noisy ones, ``compile_batch``, and with a gradient ``compile_gradient``,
-``compile_taped``, ``compile_reverse``.
+failing observation on they are NaN. ``compile_run(system)`` gives the machine code of one run with
+all that it knew, ``(theta, steps, observed, inputs, t0, seed, rows) -> (terms, health, mean, cov,
+members, weights)``: terms and health are those of ``compile``, the others, (R, n), (R, n, n),
+(R, N, n) and (R, N), hold at the steps ``rows``, given the observations up to them; N is 0 for a
+filter without members. What only some filters have is a method of theirs: ``stored_noise`` of the
+noisy ones, ``compile_batch``, and with a gradient ``compile_gradient``, ``compile_taped``,
+``compile_reverse``.
 """
 
 from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES

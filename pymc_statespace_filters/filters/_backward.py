@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import compiled, keep, pasted
 from pymc_statespace_filters.filters._elementary import exp
 from pymc_statespace_filters.filters._ensemble_states import (
     choose,
     finite_weights,
     forget_row,
-    keep,
     results,
 )
 from pymc_statespace_filters.filters._failures import COVARIANCE_NOT_POSITIVE, NONE

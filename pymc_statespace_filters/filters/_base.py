@@ -5,12 +5,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._compile import compiled, keep
+from pymc_statespace_filters.filters._ensemble_run import members_kernel
 from pymc_statespace_filters.filters._ensemble_states import summary_kernel
 from pymc_statespace_filters.filters._failures import OUT_OF_MEMORY
 from pymc_statespace_filters.filters._noise import STORE_NORMALS, NoiseSizes, n_stored
-from pymc_statespace_filters.filters._random import padded
+from pymc_statespace_filters.filters._random import BLOCK, padded
+from pymc_statespace_filters.filters._share import ALONE
 from pymc_statespace_filters.filters._system import N_TABLE
+from pymc_statespace_filters.filters._witness import NOBODY
 from pymc_statespace_filters.lowering import Compiled, Machine, ensemble_machine, machine_entries
 from pymc_statespace_filters.machine_code import Entry, address_of, key_of
 from pymc_statespace_filters.model import StateSpaceModel
@@ -36,6 +39,14 @@ class EnsembleFilter:
     def settings(self) -> tuple[float, ...]:
         """Return the settings that the entry reads besides the size, choices by their number."""
         raise NotImplementedError
+
+    def most_ranks(self) -> int:
+        """Return how many ranks can have a whole block of 64 members each.
+
+        One that had but a part of a block might compute it by other instructions, as there are too
+        few for the vector code of the others, and differ in the last bit.
+        """
+        return max(1, self.size() // BLOCK)
 
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""
@@ -86,23 +97,52 @@ class EnsembleFilter:
 
     def kernel(self, machine: Machine) -> Any:
         """Bind the filter's entry to the functions of one system."""
-        evaluate = self.algorithm(machine).watched(machine)
+        evaluate = self.algorithm(machine)._bound(machine)
 
         @compiled
         def run(theta, steps, observed, inputs, t0, noise):
-            return evaluate(theta, steps, observed, inputs, t0, noise, (0, 0, 0))
+            return evaluate(theta, steps, observed, inputs, t0, noise, NOBODY, ALONE)
+
+        return run
+
+    def compile_shared(self, system: StateSpaceModel) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange).
+
+        It moves one rank's share of the members (see `_share`) and gives the same terms and health
+        on all ranks, to the bit those of `compile` on one.
+        """
+        machine = ensemble_machine(system)
+        return Compiled(self.shared_kernel(machine), key_of(f"shared {self!r}", machine.key))
+
+    def shared_kernel(self, machine: Machine) -> Any:
+        """Bind the filter's entry to one system, for several ranks."""
+        evaluate = self.algorithm(machine)._bound(machine)
+
+        @compiled
+        def run(theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange):
+            noise, share = (seed, np.empty(0)), (rank, n_ranks, exchange)
+            return evaluate(theta, steps, observed, inputs, t0, noise, NOBODY, share)
 
         return run
 
     def watched(self, machine: Machine) -> Any:
-        """The same function with the addresses of a witness and its two vectors: `_witness`."""
+        """The kernel with the addresses of a witness and its two vectors: `_witness`."""
+        evaluate = self._bound(machine)
+
+        @compiled
+        def run(theta, steps, observed, inputs, t0, noise, watch):
+            return evaluate(theta, steps, observed, inputs, t0, noise, watch, ALONE)
+
+        return run
+
+    def _bound(self, machine: Machine) -> Any:
         self.entry.compile()
         evaluate, make_table, dt = self.entry.external, system_table(machine), machine.dt
         sizes = self.noise_sizes(machine)
         settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
 
         @compiled
-        def run(theta, steps, observed, inputs, t0, noise, watch):
+        def run(theta, steps, observed, inputs, t0, noise, watch, share):
             seed, normals = noise
             n_steps = steps[-1] if steps.size else np.int64(0)
             if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
@@ -114,10 +154,11 @@ class EnsembleFilter:
                 table.ctypes.data, dt, settings.ctypes.data, theta.ctypes.data, theta.size,
                 steps.ctypes.data, steps.size, observed.ctypes.data,
                 inputs.ctypes.data, inputs.shape[0], t0,
-                seed, normals.ctypes.data, normals.size, *watch,
+                seed, normals.ctypes.data, normals.size, *watch, *share,
                 terms.ctypes.data, health.ctypes.data,
             )  # fmt: skip
-            _keep(table, normals)
+            keep(table)
+            keep(normals)
             return terms, health
 
         return run
@@ -134,6 +175,16 @@ class EnsembleFilter:
         else:
             kernel = summary_kernel(filter.watched(machine), system.n, self.size(), moment)
         return Compiled(kernel, key_of(f"{moment} states {self!r}", machine.key))
+
+    def compile_run(self, system: StateSpaceModel) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
+
+        See `filters`, the room, for what it returns.
+        """
+        machine = ensemble_machine(system)
+        watched = self.algorithm(machine).watched(machine)
+        kernel = members_kernel(watched, system.n, self.size())
+        return Compiled(kernel, key_of(f"run {self!r}", machine.key))
 
     def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
         """Bind the smoother of this filter to one system."""
@@ -188,8 +239,3 @@ def system_table(machine: Machine) -> Any:
         return table
 
     return make_table
-
-
-@compiled
-def _keep(table, normals):
-    """Be the last reader of arrays whose addresses were handed on; else they were freed before."""

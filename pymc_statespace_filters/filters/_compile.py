@@ -27,3 +27,11 @@ every level that it is called from, so this also halves the time a new model wai
 
 reducing = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
 """For sums over members, which may be added up in another order and so become vector code."""
+
+strict = njit(error_model="numpy", nogil=True, inline="always")
+"""Pasted too, and computed to the letter: for sums that must not depend on what is around them."""
+
+
+@compiled
+def keep(array):
+    """Be the last reader of an array whose address was handed on; else it was freed before."""

@@ -12,18 +12,18 @@ from pymc_statespace_filters.filters._gaussian import (
     solve_lower,
     solve_lower_transposed,
 )
+from pymc_statespace_filters.filters._sums import exchange, sum_products, total
 
 
 @compiled
 def mark_finite(X, D, alive):
-    """Set ``alive`` where states and simulated observations are all finite; return how many."""
+    """Set ``alive`` where states and simulated observations are all finite."""
     for i in range(alive.size):
         alive[i] = True
     for A in (X, D):
         for a in range(A.shape[0]):
             for i in range(alive.size):
                 alive[i] &= np.isfinite(A[a, i])
-    return count_true(alive)
 
 
 @compiled
@@ -51,15 +51,6 @@ def equal_weights(alive, count, w):
 
 
 @reducing
-def spread_factor(w):
-    """1 - sum w^2, as a sum of positive terms: zero if one member has all the weight."""
-    total = 0.0
-    for i in range(w.size):
-        total += w[i] * (1.0 - w[i])
-    return total
-
-
-@reducing
 def mean(w, X, out):
     """Weighted mean of each row; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
@@ -70,38 +61,30 @@ def mean(w, X, out):
         out[a] = total
 
 
-@reducing
-def covariance(w, X, x_mean, Y, y_mean, out):
-    """Weighted covariance of the rows of X with those of Y, over 1 - sum w^2."""
-    scale = 1.0 / spread_factor(w)
-    for a in range(X.shape[0]):
-        for b in range(Y.shape[0]):
-            total = 0.0
-            for i in range(w.size):
-                term = w[i] * (X[a, i] - x_mean[a]) * (Y[b, i] - y_mean[b])
-                total += term if w[i] > 0.0 else 0.0
-            out[a, b] = scale * total
-
-
 @compiled
-def forecast_moments(w, X, D, d, moments):
-    """Moments of states and simulated observations (Eqs. 4.16-4.19, 4.30-4.33).
+def forecast_moments(w, X, D, d, divisor, own, moments):
+    """Covariances of states and simulated observations, whose means are given (Eqs. 4.16-4.19).
 
-    P_dd is left as its Cholesky factor.
+    They are sums with weights w over ``divisor``. P_dd is left as its Cholesky factor.
 
     A missing component of d gets a row and column of the identity in P_dd and of zero in P_xd, so
     that it moves nothing. Returns False if P_dd is not positive definite.
     """
     x_mean, d_mean, P_xd, P_dd = moments
-    mean(w, X, x_mean)
-    mean(w, D, d_mean)
-    covariance(w, X, x_mean, D, d_mean, P_xd)
-    covariance(w, D, d_mean, D, d_mean, P_dd)
-    for b in range(d.size):
+    n, p = P_xd.shape
+    sum_products(w, X, x_mean, D, d_mean, own, 0)
+    sum_products(w, D, d_mean, D, d_mean, own, n * p)
+    exchange(own, (n + p) * p)
+    for b in range(p):
+        for a in range(n):
+            P_xd[a, b] = total(own, a * p + b) / divisor
+        for a in range(p):
+            P_dd[a, b] = total(own, (n + a) * p + b) / divisor
+    for b in range(p):
         if np.isnan(d[b]):
-            for a in range(P_xd.shape[0]):
+            for a in range(n):
                 P_xd[a, b] = 0.0
-            for a in range(d.size):
+            for a in range(p):
                 P_dd[a, b] = P_dd[b, a] = 0.0
             P_dd[b, b] = 1.0
     return cholesky(P_dd)

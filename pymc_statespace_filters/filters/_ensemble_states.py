@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._compile import compiled, keep
 from pymc_statespace_filters.filters._failures import NONE
 from pymc_statespace_filters.filters._random import STATES, uniform_at
 from pymc_statespace_filters.filters._weights import effective_number, normalise
@@ -19,13 +19,13 @@ _LAST_EVENT = {"predicted": int(FORECAST), "filtered": int(UPDATED)}
 # The witness's whole numbers: states, members, rows, last event, seed of the draws, next row; then
 # the steps of the rows. Its real ones: mean, sd, draw, each (rows, n), and effective number (rows).
 _N_COUNTS = 6
-_NEXT = 5
+_N, _MEMBERS, _ROWS, _LAST, _SEED, _NEXT = range(_N_COUNTS)
 
 
 def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated, ancestors):
     of = carray(counts, (_N_COUNTS,))
-    n, N, n_rows = of[0], of[1], of[2]
-    if event > of[3]:  # members before resampling say the same, more exactly
+    n, N, n_rows = of[_N], of[_MEMBERS], of[_ROWS]
+    if event > of[_LAST]:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + n_rows,))[_N_COUNTS:]
     while of[_NEXT] < n_rows and rows[of[_NEXT]] < k:
@@ -35,7 +35,7 @@ def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated,
         return
     X = carray(members, (n, N))
     w = finite_weights(X, carray(log_weights, (N,)))
-    summarise_row(carray(numbers, ((3 * n + 1) * n_rows,)), n_rows, row, X, w, of[4], k)
+    summarise_row(carray(numbers, ((3 * n + 1) * n_rows,)), n_rows, row, X, w, of[_SEED], k)
 
 
 @compiled
@@ -117,8 +117,8 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R = rows.size
         counts, numbers = np.empty(_N_COUNTS + R, np.int64), np.full((3 * n + 1) * R, np.nan)
-        counts[0], counts[1], counts[2] = n, n_members, R
-        counts[3], counts[4], counts[_NEXT] = last_event, draw_seed, 0
+        counts[_N], counts[_MEMBERS], counts[_ROWS] = n, n_members, R
+        counts[_LAST], counts[_SEED], counts[_NEXT] = last_event, draw_seed, 0
         counts[_N_COUNTS:] = rows
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
         _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
@@ -147,8 +147,3 @@ def results(numbers, n, n_rows, health):
     moments = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)
     n_effective = numbers[3 * n * n_rows : (3 * n + 1) * n_rows].copy()
     return moments[0].copy(), moments[1].copy(), moments[2].copy(), n_effective, health
-
-
-@compiled
-def keep(counts):
-    """Be the last reader of an array whose address was handed on; else it was freed before."""

@@ -54,7 +54,8 @@ _ARGUMENTS = (
     NUMBERS, types.intp,  # rows of inputs
     types.float64,  # t0
     COUNTS, types.intp, types.int64,  # rows wanted, seed of the draws
-    NUMBERS, NUMBERS, NUMBERS, NUMBERS,  # mean, deviation, draw, health
+    NUMBERS, NUMBERS, NUMBERS,  # mean, deviation, draw
+    NUMBERS, NUMBERS,  # terms, health
 )  # fmt: skip
 
 
@@ -71,7 +72,7 @@ class _Rows(NamedTuple):
 def _grid_states(
     start, move, log_density, p, n_inputs, same_every_step, dt, tolerance, moment, theta, n_theta,
     steps, n_observations, observed, inputs, n_rows, t0, wanted, n_wanted, draw_seed,
-    mean, sd, drawn, health,
+    mean, sd, drawn, terms, health,
 ):  # fmt: skip
     """The states as one function for all systems; see `_evaluate` for what it writes."""
     system = read_one_state(
@@ -83,7 +84,10 @@ def _grid_states(
         carray(wanted, (n_wanted,)), draw_seed,
         carray(mean, (n_wanted,)), carray(sd, (n_wanted,)), carray(drawn, (n_wanted,)),
     )  # fmt: skip
-    code, j = _evaluate(system, at, record, t0, tolerance, moment, rows)
+    out = carray(terms, (n_observations,))
+    code, j = _evaluate(system, at, record, t0, tolerance, moment, rows, out)
+    for failed in range(j, n_observations):
+        out[failed] = -np.inf
     for i in range(n_wanted):
         if code != NONE and (moment == SMOOTHED or j == 0 or rows.at[i] >= at[j]):
             rows.mean[i], rows.sd[i], rows.drawn[i] = np.nan, np.nan, np.nan
@@ -93,11 +97,11 @@ def _grid_states(
 
 
 @pasted
-def _evaluate(system, steps, observed, t0, tolerance, moment, rows):
-    """Write the rows: (NONE, J), or (a reason, the observation that failed)."""
+def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
+    """Write rows and terms: (NONE, J), or (a reason, the observation that failed)."""
     if not system.is_valid:
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    terms, kept = np.empty(steps.size), rows.at
+    kept = rows.at
     if moment == SMOOTHED and rows.at.size:
         kept = np.arange(rows.at[0], steps[-1] + 1)
     spacing, reach = first_lattice(system, steps, t0, tolerance)

@@ -12,18 +12,24 @@ n its dimension.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pymc_statespace_filters.filters._compile import compiled, pasted
-from pymc_statespace_filters.filters._ensemble import count_true, covariance, mean
+from pymc_statespace_filters.filters._ensemble import count_true
 from pymc_statespace_filters.filters._gaussian import LOG_TWO_PI, semidefinite_cholesky
 from pymc_statespace_filters.filters._kernel_sum import (
     compact,
     kernel_sum_workspace,
     log_kernel_sum,
 )
-from pymc_statespace_filters.filters._lattice_sum import lattice_workspace
+from pymc_statespace_filters.filters._lattice_sum import (
+    lattice_workspace,
+)
+from pymc_statespace_filters.filters._points import Points, complete_points
+from pymc_statespace_filters.filters._random import BLOCK
+from pymc_statespace_filters.filters._sums import total
 from pymc_statespace_filters.filters._tilted_sum import log_lattice_sums, tilted_workspace
 
 _SQRT_HALF = math.sqrt(0.5)
@@ -42,29 +48,50 @@ def density_method(n_active, n_members):
     return "lattice" if _by_lattice.py_func(n_active, n_members) else "exact"
 
 
-@compiled
-def density_workspace(n, width):
-    """Scratch of ``log_kernel_density`` for n directions and a padded number of members."""
-    whitened = np.empty((n, width)), np.empty((n, width))
-    missed = np.empty(width, np.int64)
-    exact, lattice = kernel_sum_workspace(width), lattice_workspace(width)
-    return whitened, missed, exact, lattice, tilted_workspace(n, width)
+class Kernel(NamedTuple):
+    """Where the members of a density are and how far they spread: their mean and their bandwidth.
 
-
-@compiled
-def scott_bandwidth(w, n_effective, X, free, x_mean, P, H, active):
-    """Lower Cholesky factor H of the bandwidth of the free states (Eqs. 4.38 and 4.39).
-
-    H is (n_free, n_free); x_mean (n,) and P (n, n) are scratch. ``active`` (n_free,) is False for
-    directions without spread. Returns False if the moments are not finite.
+    ``H`` (n_free, n_free) is the lower Cholesky factor of Eqs. 4.38 and 4.39, of the directions in
+    which they spread at all, which ``active`` tells. ``mean`` (n,) is that of all states.
     """
-    mean(w, X, x_mean)
-    covariance(w, X, x_mean, X, x_mean, P)
+
+    mean: np.ndarray
+    H: np.ndarray
+    active: np.ndarray
+
+
+@pasted
+def kernel_workspace(n, n_free):
+    """A kernel to be filled by ``scott_bandwidth``."""
+    return Kernel(np.empty(n), np.empty((n_free, n_free)), np.empty(n_free, np.bool_))
+
+
+@compiled
+def density_workspace(own, n):
+    """Scratch of ``log_kernel_density`` for n directions.
+
+    The members and their weights, the targets and the logs of the sums at them, of all ranks.
+    """
+    n_ranks, width = own.share.n_ranks, BLOCK * own.sums.shape[1]
+    sources = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
+    targets = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
+    exact, lattice = kernel_sum_workspace(width), lattice_workspace(n_ranks, width)
+    return sources, targets, (exact, lattice, tilted_workspace(n_ranks, n, width))
+
+
+@compiled
+def scott_bandwidth(own, row, spread, n_effective, free, kernel):
+    """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39); the mean is given.
+
+    From completed rows of ``sum_products`` of all states, to be divided by ``spread``. Returns
+    False if the moments are not finite.
+    """
+    x_mean, H, active = kernel
     floor = np.empty(free.size)
     for a in range(free.size):
         floor[a] = (_KNOWN * x_mean[free[a]]) ** 2
         for b in range(free.size):
-            H[a, b] = P[free[a], free[b]]
+            H[a, b] = total(own, row + free[a] * x_mean.size + free[b]) / spread
     if not semidefinite_cholesky(H, floor, active):
         return False
     scott = n_effective ** (-1.0 / (count_true(active) + 4))
@@ -75,61 +102,64 @@ def scott_bandwidth(w, n_effective, X, free, x_mean, P, H, active):
 
 
 @compiled
-def _whiten(H, active, free, X, origin, out):
-    """Leave H^-1 (X - origin) / sqrt(2) of the active directions in the first rows of ``out``.
+def _whiten(kernel, free, X, first, out):
+    """Leave H^-1 (X - mean) / sqrt(2) of the active directions in rows of ``out``, from 1 on.
 
-    Returns how many rows. The origin is a particle: far from zero x / h would be rounded to more
-    than the distances between particles bear.
+    X becomes the columns from ``first`` on. Returns how many rows. Why the mean: far from zero
+    x / h would be rounded to more than the distances between particles bear.
     """
-    row = 0
+    x_mean, H, active = kernel
+    n_rows, last = 0, first + X.shape[1]
     for a in range(active.size):
         if not active[a]:
             continue
-        x, y, x_0 = X[free[a]], out[row], origin[a]
-        scale, before = 1.0 / H[a, a], 0
+        x, x_0 = X[free[a]], x_mean[free[a]]
+        y = out[n_rows + 1, first:last]
+        scale, before = 1.0 / H[a, a], 1
         for i in range(x.size):
             y[i] = (_SQRT_HALF * scale) * (x[i] - x_0)
         for b in range(a):
             if active[b]:
-                share, z = scale * H[a, b], out[before]
+                share, z = scale * H[a, b], out[before, first:last]
                 for i in range(x.size):
                     y[i] -= share * z[i]
                 before += 1
-        row += 1
-    return row
+        n_rows += 1
+    return n_rows
+
+
+@pasted
+def _sum_exactly(share, sources, targets, n_dims, first, logs, work):
+    """Logs of the sums at a rank's own targets, which begin at the column ``first``."""
+    complete_points(share, sources, n_dims)
+    y, v = sources.rows[1:], targets.rows[1:]
+    _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
+    for i in range(logs.size):
+        logs[i] = log_kernel_sum(y, n_dims, n_blocks, v, first + i, work)
 
 
 @compiled
-def log_kernel_density(w, X, V, free, H, active, work, out):
+def log_kernel_density(own, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 
-    Members of zero weight are left out, and may be NaN. A target that is not finite gets -inf.
+    All are a rank's own; the density is that of the particles of all ranks. Members of zero weight
+    are left out, and may be NaN. A target that is not finite gets -inf.
     """
-    (sources, targets), missed, sum_work, lattice_work, tilted_work = work
-    first = 0
-    while first < w.size - 1 and not w[first] > 0.0:
-        first += 1
-    origin = np.empty(free.size)
-    for a in range(free.size):
-        origin[a] = X[free[a], first]
-    n_active = _whiten(H, active, free, X, origin, sources)
-    _whiten(H, active, free, V, origin, targets)
-    if _by_lattice(n_active, out.size):
-        works = sum_work, lattice_work, tilted_work
-        n_missed, members = log_lattice_sums(w, sources, targets, n_active, works, missed, out)
-    else:
-        n_missed, members = out.size, (np.int64(0), np.int64(0))
-        for i in range(n_missed):
-            missed[i] = i
-    if n_missed > 0:
-        if members[0] == 0:
-            members = compact(w, sources, n_active, sum_work)
-        for k in range(n_missed):
-            i = missed[k]
-            out[i] = log_kernel_sum(sources, n_active, members[1], targets, i, sum_work)
+    sources, targets, sums = work
+    first, last = own.first, own.first + own.size
+    own_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
+    for i in range(w.size):
+        own_w[i] = w[i]
+    n_dims = _whiten(kernel, free, X, first, sources.rows)
+    _whiten(kernel, free, V, first, targets.rows)
+    if not (
+        _by_lattice(n_dims, own.n_members)
+        and log_lattice_sums(own.share, sources, targets, n_dims, sums)
+    ):
+        _sum_exactly(own.share, sources, targets, n_dims, first, logs, sums[0])
     log_kernel = 0.0
-    for a in range(active.size):
-        if active[a]:
-            log_kernel -= math.log(H[a, a]) + 0.5 * LOG_TWO_PI
+    for a in range(free.size):
+        if kernel.active[a]:
+            log_kernel -= math.log(kernel.H[a, a]) + 0.5 * LOG_TWO_PI
     for i in range(out.size):
-        out[i] += log_kernel
+        out[i] = logs[i] + log_kernel

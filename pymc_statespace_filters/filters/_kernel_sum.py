@@ -12,8 +12,7 @@ import numpy as np
 from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._elementary import exp
 from pymc_statespace_filters.filters._random import BLOCK
-
-_HALVES = (32, 16, 8, 4, 2, 1)  # the halves of a block, then of its first half, and so on
+from pymc_statespace_filters.filters._sums import HALVES
 
 
 @compiled
@@ -64,7 +63,7 @@ def log_kernel_sum(sources, n_dims, n_blocks, targets, target, work):
         _exponents(sources, log_w, n_dims, first, targets, target, e)
         for i in range(BLOCK):
             lane[i] = e[i] if e[i] > lane[i] else lane[i]
-    for half in _HALVES:
+    for half in HALVES:
         for i in range(half):
             lane[i] = lane[half + i] if lane[half + i] > lane[i] else lane[i]
     largest = lane[0]
@@ -76,7 +75,7 @@ def log_kernel_sum(sources, n_dims, n_blocks, targets, target, work):
         e = exponents[block * BLOCK : (block + 1) * BLOCK]
         for i in range(BLOCK):
             lane[i] += exp(e[i] - largest)
-    for half in _HALVES:
+    for half in HALVES:
         for i in range(half):
             lane[i] += lane[half + i]
     return largest + math.log(lane[0])

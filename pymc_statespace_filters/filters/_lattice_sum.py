@@ -15,6 +15,9 @@ h have variance s (1 - s). By Poisson's formula the relative error of the sums i
 apart, and twice that in two directions: all terms are positive, nothing cancels. What is beyond the
 windows and the blur is below 2e-15 of the total weight, so 2e-9 of a sum at the `FLOOR`. Smaller
 sums, in the far tails, are the caller's.
+
+A large ensemble adds its members to a few lattices, each its own stretch of them, and these are
+added up in their order: however many ranks share that work, the sums are the same.
 """
 
 import math
@@ -23,7 +26,9 @@ import numpy as np
 
 from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._elementary import exp
+from pymc_statespace_filters.filters._points import complete_points
 from pymc_statespace_filters.filters._random import BLOCK
+from pymc_statespace_filters.filters._share import BLOCKS, MEMBERS, Share, complete, part
 from pymc_statespace_filters.filters._windows import (
     LANES,
     POINTS,
@@ -44,6 +49,11 @@ FLOOR = 1e-6
 _NEGLIGIBLE = 1e-25  # smaller weights add nothing to sums above the floor, but denormal numbers
 _FAR = 8.6  # nor do members that are farther than this from all targets: exp(-FAR^2 / 2) < 1e-16
 _BLUR = 16  # lattice points on either side; an even number
+_ONE_LATTICE = 8192  # members; more of them are divided among several
+_MOST_LATTICES = 8
+_POINTS_A_MEMBER = (
+    4  # of all lattices: to clear them and add them up is then a fiftieth of the work
+)
 _BLUR_VARIANCE = 1.0 - 2.0 * VARIANCE
 _blur_lanes = taps_sum(
     (SPACING**2 / (2.0 * math.pi * VARIANCE * math.sqrt(_BLUR_VARIANCE)))
@@ -54,17 +64,18 @@ _WITHIN = _FAR * math.sqrt(0.5)
 
 
 @compiled
-def lattice_workspace(width):
+def lattice_workspace(n_ranks, width):
     """Scratch of ``lattice_sums`` for a padded number of members.
 
-    The windows of all members or targets (the first cell, the lead and the ratio of a bell), lanes
-    of a minimum and a maximum, where the lattice begins and how far it goes, and two lattices, with
-    room for several times the points that an ensemble of two states covers.
+    The windows of members or targets (the first cell, the lead and the ratio of a bell), lanes of a
+    minimum and a maximum, the ranges that each rank has found, where the lattice begins and how far
+    it goes, and two arrays for lattices, with room for several times the points that an ensemble of
+    two states covers.
     """
     bells = np.empty((2, width)), np.empty((2, width)), np.empty((2, width))
-    lanes, place = (np.empty(BLOCK), np.empty(BLOCK)), (np.empty(2), np.empty(2))
+    lanes, ranges = (np.empty(BLOCK), np.empty(BLOCK)), np.empty((8, n_ranks))
     room = 32768 + 8 * width
-    return bells, lanes, place, (np.empty(room), np.empty(room))
+    return bells, lanes, ranges, (np.empty(2), np.empty(2)), (np.empty((1, room)), np.empty(room))
 
 
 @compiled
@@ -87,14 +98,33 @@ def _range(y, w, least, lanes):
 
 
 @pasted
-def _extent(y, v, w, every, lanes):
+def _find_ranges(share, sources, targets, n_dims, lanes, ranges):
+    """Lowest and highest of members and of targets in each direction, as each rank finds them.
+
+    The sums of the targets are zeros.
+    """
+    y_first, y_last = part(share, sources.size, MEMBERS)
+    v_first, v_last = part(share, targets.size, MEMBERS)
+    w, zeros = sources.rows[0, y_first:y_last], targets.rows[0, v_first:v_last]
+    for a in range(n_dims):
+        y, v = sources.rows[1 + a, y_first:y_last], targets.rows[1 + a, v_first:v_last]
+        found = ranges[4 * a : 4 * a + 4, share.rank]
+        found[0], found[1] = _range(y, w, _NEGLIGIBLE, lanes)
+        found[2], found[3] = _range(v, zeros, -1.0, lanes)
+    complete(share, ranges[: 4 * n_dims], BLOCKS)
+
+
+@pasted
+def _extent(ranges):
     """Where the lattice must be: its first coordinate, and a number of points.
 
     Members farther than ``_WITHIN`` from all targets stay outside, and targets so far from all
-    members; there are no points if that leaves nothing. ``every`` is an array of zeros.
+    members; there are no points if that leaves nothing.
     """
-    y_low, y_high = _range(y, w, _NEGLIGIBLE, lanes)
-    v_low, v_high = _range(v, every, -1.0, lanes)
+    y_low, y_high, v_low, v_high = ranges[0, 0], ranges[1, 0], ranges[2, 0], ranges[3, 0]
+    for rank in range(1, ranges.shape[1]):
+        y_low, y_high = min(y_low, ranges[0, rank]), max(y_high, ranges[1, rank])
+        v_low, v_high = min(v_low, ranges[2, rank]), max(v_high, ranges[3, rank])
     first = max(min(y_low, v_low), max(y_low, v_low) - _WITHIN)
     last = min(max(y_high, v_high), min(y_high, v_high) + _WITHIN)
     if not first <= last:
@@ -104,10 +134,10 @@ def _extent(y, v, w, every, lanes):
 
 
 @compiled
-def _place(y, n, first, n_points, cell, lead, ratio):
-    """The windows of n coordinates: first cell, lead and ratio. Outside the lead is zero."""
+def _place(y, first, n_points, cell, lead, ratio):
+    """The windows at coordinates: first cell, lead and ratio. Outside the lead is zero."""
     last = n_points - POINTS
-    for i in range(n):
+    for i in range(y.size):
         x = (y[i] - first) * _POINTS_PER_UNIT
         inside = (x >= 0.0) & (x < last + 1.0)
         x = x if inside else 0.0
@@ -137,6 +167,56 @@ def _add_members(bells, n, n_dims, stride, lattice):
             else:
                 at += stride * np.int64(cell[1, i])
                 add_to_plane(lattice, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
+
+
+@pasted
+def _choose_lattices(n_members, n_points):
+    """How many lattices share the members: a power of two, as numbers of ranks often are."""
+    n_lattices = 1
+    if n_members > _ONE_LATTICE:
+        most = min(float(_MOST_LATTICES), _POINTS_A_MEMBER * n_members / n_points)
+        while 2 * n_lattices <= most:
+            n_lattices *= 2
+    return n_lattices
+
+
+@pasted
+def _add_stretch(sources, i, j, n_dims, place, bells, lattice):
+    """Make a lattice of the members from i on to before j."""
+    (first, extent), (cell, lead, ratio) = place, bells
+    for point in range(lattice.size):
+        lattice[point] = 0.0
+    for a in range(n_dims):
+        _place(sources.rows[1 + a, i:j], first[a], extent[a], cell[a], lead[a], ratio[a])
+    _weigh(sources.rows[0, i:j], lead[0])
+    _add_members(bells, j - i, n_dims, np.int64(extent[0]) + 2 * _BLUR, lattice)
+
+
+@pasted
+def _add_all(share, sources, n_dims, n_points, place, bells, lattices):
+    """The sum of the lattices of all members, of n_points each.
+
+    The members of a lattice are those that a rank would have if there were as many ranks: where
+    each rank has as many lattices, their members are its own.
+    """
+    n_lattices = _choose_lattices(sources.size, n_points)
+    if not sources.known and n_lattices % share.n_ranks != 0:
+        complete_points(share, sources, n_dims)
+    begin, end = np.int64(0), np.int64(1)
+    if n_lattices > 1:
+        begin, end = part(share, n_lattices, BLOCKS)
+    for m in range(begin, end):
+        i, j = part(Share(m, n_lattices, 0), sources.size, MEMBERS)
+        lattice = lattices[0, m * n_points : (m + 1) * n_points]
+        _add_stretch(sources, i, j, n_dims, place, bells, lattice)
+    if n_lattices > 1:
+        complete(share, lattices[:, : n_lattices * n_points], n_points)
+    total = lattices[0]
+    for m in range(1, n_lattices):
+        lattice = lattices[0, m * n_points : (m + 1) * n_points]
+        for point in range(n_points):
+            total[point] += lattice[point]
+    return total
 
 
 @pasted
@@ -174,36 +254,33 @@ def _blur(n_dims, columns, rows, lattice, other):
 
 
 @compiled
-def lattice_sums(w, sources, targets, n_dims, work, out):
-    """sum_l w_l exp(-|y_l - v_i|^2) for the columns of ``targets``, in one or two directions.
+def lattice_sums(share, sources, targets, n_dims, work):
+    """sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
 
-    Zero where it is not known. Returns False if the lattice would be too large.
+    Zero where it is not known. What a rank needs to know of others' members it learns here. Returns
+    False if the lattice would be too large.
     """
-    bells, lanes, (first, extent), (lattice, other) = work
+    bells, lanes, ranges, (first, extent), (lattices, other) = work
     cell, lead, ratio = bells
+    begin, end = part(share, targets.size, MEMBERS)
+    sums = targets.rows[0, begin:end]
+    for i in range(sums.size):
+        sums[i] = 0.0
+    _find_ranges(share, sources, targets, n_dims, lanes, ranges)
     extent[1] = 1.0
-    for i in range(out.size):
-        out[i] = 0.0
     for a in range(n_dims):
-        first[a], extent[a] = _extent(sources[a], targets[a], w, out, lanes)
+        first[a], extent[a] = _extent(ranges[4 * a : 4 * a + 4])
     if extent[0] == 0.0 or extent[1] == 0.0:
         return True
     n_points = (extent[0] + 2.0 * _BLUR) * (extent[1] + 2.0 * _BLUR * (n_dims - 1))
-    if n_points > min(lattice.size, 0.25 * w.size * out.size):
+    if n_points > min(other.size, 0.25 * sources.size * targets.size):
         return False
     columns, rows = np.int64(extent[0]), np.int64(extent[1])
-
-    # Members
-    for a in range(n_dims):
-        _place(sources[a], w.size, first[a], extent[a], cell[a], lead[a], ratio[a])
-    _weigh(w, lead[0])
-    for i in range(rows * (columns + 2 * _BLUR)):
-        lattice[i] = 0.0
-    _add_members(bells, w.size, n_dims, columns + 2 * _BLUR, lattice)
-
-    # Targets
+    n_added, place = rows * (columns + 2 * _BLUR), (first, extent)
+    lattice = _add_all(share, sources, n_dims, n_added, place, bells, lattices)
     blurred, start = _blur(n_dims, columns, rows, lattice, other)
     for a in range(n_dims):
-        _place(targets[a], out.size, first[a], extent[a], cell[a], lead[a], ratio[a])
-    _sum_targets(bells, n_dims, start, columns, blurred, out)
+        v = targets.rows[1 + a, begin:end]
+        _place(v, first[a], extent[a], cell[a], lead[a], ratio[a])
+    _sum_targets(bells, n_dims, start, columns, blurred, sums)
     return True

@@ -19,6 +19,8 @@ from pymc_statespace_filters.filters._noise import (
 )
 from pymc_statespace_filters.filters._random import FILL_NORMALS
 from pymc_statespace_filters.filters._resampling import resample_if_few, resampler
+from pymc_statespace_filters.filters._share import Share
+from pymc_statespace_filters.filters._sums import own_members
 from pymc_statespace_filters.filters._system import initialise, propagate, read_system
 from pymc_statespace_filters.filters._witness import ENDED, FORECAST, RESAMPLED, UPDATED, tell
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, digest
@@ -32,6 +34,7 @@ _ARGUMENTS = (
     types.float64,  # t0
     types.int64, NUMBERS, types.intp,  # seed, stored normals
     types.intp, types.intp, types.intp,  # who watches, see `_witness`, and its two vectors
+    types.intp, types.intp, types.intp,  # our share of the members, see `_share`
     NUMBERS, NUMBERS,  # terms, health
 )  # fmt: skip
 
@@ -39,7 +42,7 @@ _N_LEADING = 6  # number of members and five of `NoiseSizes`
 
 
 class Members(NamedTuple):
-    """The members of a filter, as columns, and what every update needs of them.
+    """Our own members of a filter, as columns, and what every update needs of them.
 
     ``w`` and ``log_w`` are the normalised weights, of which ``log_w`` lasts from one observation to
     the next. ``D`` (p, N), ``X_f`` (n, N), ``log_p`` and ``alive`` are an update's own: simulated
@@ -56,10 +59,11 @@ class Members(NamedTuple):
 
 
 @pasted
-def _members(n, p, N):
+def _members(n, p, own):
+    N = own.size
     log_w = np.empty(N)
     for i in range(N):
-        log_w[i] = -math.log(N)
+        log_w[i] = -math.log(own.n_members)
     return Members(
         np.empty((n, N)), np.empty((p, N)), np.empty((n, N)),
         np.empty(N), log_w, np.empty(N), np.empty(N, np.bool_),
@@ -67,16 +71,20 @@ def _members(n, p, N):
 
 
 @pasted
-def _resampler(settings, n, N):
-    return resampler(settings[0], np.int64(settings[1]), n, N)
+def _n_sums(system):
+    """Enough rows for the weights, means and covariances of an update."""
+    return 8 + 2 * (system.n + system.p) ** 2
 
 
 @pasted
-def _resample(resampling, noise, j, k, n_effective, members):
+def _resampler(settings, n, own):
+    return resampler(settings[0], np.int64(settings[1]), n, own)
+
+
+@pasted
+def _resample(resampling, noise, j, k, n_effective, members, own):
     z = resampling_normals(noise, j, k)
-    return resample_if_few(
-        resampling, n_effective, z, members.log_w, members.w, members.X, members.X_f
-    )
+    return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, own)
 
 
 class _NoResampling(NamedTuple):
@@ -84,12 +92,12 @@ class _NoResampling(NamedTuple):
 
 
 @pasted
-def _no_resampler(settings, n, N):
+def _no_resampler(settings, n, own):
     return _NoResampling(np.empty(0, np.int64))
 
 
 @pasted
-def _keep_all(resampling, noise, j, k, n_effective, members):
+def _keep_all(resampling, noise, j, k, n_effective, members, own):
     return False
 
 
@@ -101,13 +109,14 @@ def filter_entry(
     Parameters
     ----------
     name : str
-    workspace : njit function ``(system, n_members, width, settings) -> tuple``
+    workspace : njit function ``(system, own, settings) -> tuple``
         Allocates, once an evaluation, what ``update`` needs beside the members; the filter's
-        settings go with it. ``width`` is the number of members padded to whole blocks.
+        settings go with it. ``own`` is an `Own`: which of all members these are.
     update : njit function
-        ``(system, j, k, t, d, noise, members, work) -> (increment, n_effective, failure)``.
+        ``(system, j, k, t, d, noise, members, own, work) -> (increment, n_effective, failure)``.
         Replaces the forecast members by the analysis of observation j at step k, with normalised
-        weights, and returns log p(d_j | d_1 .. d_{j-1}).
+        weights, and returns log p(d_j | d_1 .. d_{j-1}). What it returns, and where it branches,
+        is the same on all ranks.
     n_settings : int
         How many settings, as numbers, the filter has besides the number of members.
     resamples : bool
@@ -126,24 +135,26 @@ def filter_entry(
 
     def run(
         table, dt, settings, theta, n_theta, steps, n_observations, observed, inputs,
-        n_rows, t0, seed, normals, n_normals, witness, counts, numbers, terms, health,
+        n_rows, t0, seed, normals, n_normals, witness, counts, numbers,
+        rank, n_ranks, address, terms, health,
     ):  # fmt: skip
         given = carray(settings, (_N_LEADING + n_settings,))
-        n_members, width = int(given[0]), int(given[1])
-        sizes = NoiseSizes(width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
+        n_members = int(given[0])
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
+        own = own_members(Share(rank, n_ranks, address), n_members, _n_sums(system))
+        width = own.width
+        sizes = NoiseSizes(width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
         at = carray(steps, (n_observations,))
         record = carray(observed, (n_observations, system.p))
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
         n_steps = at[n_observations - 1] if n_observations else np.int64(0)
-        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps)
-        own = given[_N_LEADING:]
-        work = workspace(system, n_members, width, own)
-        resampling = make_resampler(own, system.n, n_members)
-        members = _members(system.n, system.p, n_members)
+        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps, own.first_block)
+        work = workspace(system, own, given[_N_LEADING:])
+        resampling = make_resampler(given[_N_LEADING:], system.n, own)
+        members = _members(system.n, system.p, own)
         watched = (witness, counts, numbers)
         state[0], state[1], state[2] = n_members, NONE, -1
-        initialise(system, initial_normals(noise), sizes.width, members.X)
+        initialise(system, initial_normals(noise), width, members.X)
         k = np.int64(0)
         nothing, ancestors = np.empty(0), resampling.ancestors
         tell(watched, FORECAST, -1, k, members, nothing, ancestors)
@@ -156,7 +167,7 @@ def filter_entry(
                 out[j] = 0.0
                 continue
             increment, n_effective, failure = update(
-                system, j, k, t0 + k * dt, record[j], noise, members, work
+                system, j, k, t0 + k * dt, record[j], noise, members, own, work
             )
             state[0] = min(state[0], n_effective)
             if failure != NONE:
@@ -164,7 +175,7 @@ def filter_entry(
                 break
             out[j] = increment
             tell(watched, UPDATED, j, k, members, record[j], ancestors)
-            if resample(resampling, noise, j, k, n_effective, members):
+            if resample(resampling, noise, j, k, n_effective, members, own):
                 tell(watched, RESAMPLED, j, k, members, nothing, ancestors)
         if state[1] == NONE:
             tell(watched, ENDED, n_observations, k, members, nothing, ancestors)

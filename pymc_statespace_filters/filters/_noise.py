@@ -38,21 +38,26 @@ class NoiseSizes(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Source of one evaluation's normals: ``stored``, or ``seed`` where nothing is stored."""
+    """Source of one evaluation's normals: ``stored``, or ``seed`` where nothing is stored.
+
+    Rows are those of our own members, which begin with ``first_block``. What is stored is of all
+    members: there, all must be our own.
+    """
 
     seed: int
     stored: np.ndarray
     buffer: np.ndarray
     sizes: NoiseSizes
     n_steps: int
+    first_block: int
 
 
 @pasted
-def noise_of(seed, stored, sizes, n_steps):
+def noise_of(seed, stored, sizes, n_steps, first_block):
     """The source of normals for a record whose last observation is at step ``n_steps``."""
     rows = max(sizes.initial, sizes.process, sizes.observation)
     buffer = np.empty(0 if stored.size else max(rows * sizes.width, sizes.resampling))
-    return Noise(seed, stored, buffer, sizes, n_steps)
+    return Noise(seed, stored, buffer, sizes, n_steps, first_block)
 
 
 @pasted
@@ -68,7 +73,7 @@ def _normals(noise, purpose, step, place, n_rows, width):
     if noise.stored.size > 0:
         return np.int64(noise.stored.ctypes.data) + _NUMBER_BYTES * place
     address = np.int64(noise.buffer.ctypes.data)
-    _fill(noise.seed, purpose, step, address, n_rows, width)
+    _fill(noise.seed, purpose, step, noise.first_block, address, n_rows, width)
     return address
 
 
@@ -97,14 +102,13 @@ def observation_normals(noise, j, k):
 
 @pasted
 def resampling_normals(noise, j, k):
-    """Normals of a resampling after observation j, at step k, a vector."""
+    """Normals of a resampling after observation j, at step k, a vector; on every rank the same."""
     sizes = noise.sizes
     if noise.stored.size > 0:
         place = n_stored(sizes, noise.n_steps, j) + sizes.observation * sizes.width
         return noise.stored[place : place + sizes.resampling]
-    _fill(
-        noise.seed, np.int64(RESAMPLING), k, noise.buffer.ctypes.data, np.int64(1), sizes.resampling
-    )
+    one, first, address = np.int64(1), np.int64(0), noise.buffer.ctypes.data
+    _fill(noise.seed, np.int64(RESAMPLING), k, first, address, one, sizes.resampling)
     return noise.buffer[: sizes.resampling]
 
 
@@ -112,16 +116,16 @@ def _store(seed, steps, n_observations, width, initial, process, observation, re
     one, first = np.int64(1), np.int64(0)
     n_steps = carray(steps, (n_observations,))[n_observations - 1] if n_observations else 0
     at = out
-    _fill(seed, np.int64(INITIAL), first, at, initial, width)
+    _fill(seed, np.int64(INITIAL), first, first, at, initial, width)
     at += _NUMBER_BYTES * initial * width
     for k in range(n_steps):
-        _fill(seed, np.int64(PROCESS), np.int64(k), at, process, width)
+        _fill(seed, np.int64(PROCESS), np.int64(k), first, at, process, width)
         at += _NUMBER_BYTES * process * width
     for j in range(n_observations):
         k = carray(steps, (n_observations,))[j]
-        _fill(seed, np.int64(OBSERVATION), k, at, observation, width)
+        _fill(seed, np.int64(OBSERVATION), k, first, at, observation, width)
         at += _NUMBER_BYTES * observation * width
-        _fill(seed, np.int64(RESAMPLING), k, at, one, resampling)
+        _fill(seed, np.int64(RESAMPLING), k, first, at, one, resampling)
         at += _NUMBER_BYTES * resampling
 
 

@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.filters._compile import compiled, reducing
+from pymc_statespace_filters.filters._compile import compiled, keep, reducing
 from pymc_statespace_filters.filters._ensemble import mark_finite
 from pymc_statespace_filters.filters._ensemble_states import (
     finite_weights,
     forget_row,
-    keep,
     results,
     summarise_row,
 )

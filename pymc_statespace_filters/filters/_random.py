@@ -87,8 +87,8 @@ def padded(n_members: int) -> int:
 
 
 @compiled
-def fill_normals(seed, purpose, step, Z):
-    """Fill Z (components, padded members) with standard normals.
+def fill_normals(seed, purpose, step, Z, first_block=0):
+    """Fill Z (components, padded members) with the standard normals of members from a block on.
 
     One Philox block makes two normals: they go to members i and i + 32 of a block of 64.
     """
@@ -97,7 +97,7 @@ def fill_normals(seed, purpose, step, Z):
     for component in range(Z.shape[0]):
         c1 = np.uint64(component)
         for block in range(Z.shape[1] // BLOCK):
-            first = np.uint64(block * _PAIRS)
+            first = np.uint64((first_block + block) * _PAIRS)
             lower = Z[component, block * BLOCK : block * BLOCK + _PAIRS]
             upper = Z[component, block * BLOCK + _PAIRS : (block + 1) * BLOCK]
             for pair in range(_PAIRS):
@@ -126,13 +126,13 @@ def uniform(z0, z1):
     return exp(-exponential(z0, z1))
 
 
-def _fill(seed, purpose, step, z, n_rows, width):
-    fill_normals(seed, np.uint64(purpose), step, carray(z, (n_rows, width)))
+def _fill(seed, purpose, step, first_block, z, n_rows, width):
+    fill_normals(seed, np.uint64(purpose), step, carray(z, (n_rows, width)), first_block)
 
 
 FILL_NORMALS = Entry(
     _fill,
-    (types.int64, types.int64, types.int64, NUMBERS, types.intp, types.intp),
+    (types.int64, types.int64, types.int64, types.int64, NUMBERS, types.intp, types.intp),
     "fill_normals",
     digest("fill_normals"),
 )

@@ -71,7 +71,7 @@ def _no_tape() -> _Tape:
     return _Tape(
         jit(lambda steps: None),
         jit(lambda tape, row, s: None),
-        jit(lambda terms, health, tape, row: (terms, health)),
+        jit(lambda terms, health, tape, row, s: (terms, health)),
     )
 
 
@@ -86,10 +86,28 @@ def _tape(size: int) -> _Tape:
         for i in range(size):
             tape[row, i] = s[i]
 
-    def result(terms, health, tape, row):
+    def result(terms, health, tape, row, s):
         return terms, health, tape[: row if health[1] == NONE else 0]
 
     return _Tape(jit(new), jit(save), jit(result))
+
+
+def _tape_to_the_end(size: int) -> _Tape:
+    """The same with the last state as a last row; from a failing observation on rows are NaN."""
+    save = _tape(size).save
+
+    def new(steps):
+        n_steps = steps[-1] if steps.size else 0
+        return np.full((n_steps + steps.size + 1, size), np.nan)
+
+    def result(terms, health, tape, row, s):
+        if health[1] == NONE:
+            save(tape, row, s)
+        elif row > 0:
+            tape[row - 1] = np.nan
+        return terms, health, tape
+
+    return _Tape(jit(new), save, jit(result))
 
 
 def compile_value(recursion: Recursion) -> Compiled:
@@ -100,6 +118,11 @@ def compile_value(recursion: Recursion) -> Compiled:
 def compile_taped(recursion: Recursion) -> Compiled:
     """The same function, with the tape as a third result."""
     return _compile_forward(recursion, "taped", _tape(recursion.size))
+
+
+def compile_taped_to_the_end(recursion: Recursion) -> Compiled:
+    """The same with a tape that holds the last state too, and is there if the filter fails."""
+    return _compile_forward(recursion, "taped to the end", _tape_to_the_end(recursion.size))
 
 
 def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
@@ -116,7 +139,7 @@ def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
         states = new(steps)
         if not has_valid_covariances(theta):
             health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
-            return result(terms, health, states, 0)
+            return result(terms, health, states, 0, np.empty(0))
         c = parameters(theta)
         s = start(c)
         k, row = 0, 0
@@ -140,7 +163,7 @@ def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
                 health[1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
                 health[2] = j
                 break
-        return result(terms, health, states, row)
+        return result(terms, health, states, row, s)
 
     return compiled_of(forward, what, parts | {"valid": valid}, recursion)
 

@@ -24,7 +24,9 @@ from pymc_statespace_filters.filters._order import (
     order_particles,
     order_workspace,
 )
-from pymc_statespace_filters.filters._random import exponential, padded, uniform
+from pymc_statespace_filters.filters._random import BLOCK, exponential, padded, uniform
+from pymc_statespace_filters.filters._share import MEMBERS, complete
+from pymc_statespace_filters.filters._sums import sum_blocks
 
 
 @compiled
@@ -55,7 +57,11 @@ _MULTINOMIAL, _SORTED = SCHEMES.index("multinomial"), SCHEMES.index("sorted")
 
 
 class Resampling(NamedTuple):
-    """When and how to resample, and scratch for it."""
+    """When and how to resample, and scratch for it.
+
+    ``everyone`` holds weights and states of the particles of all ranks, (1 + n, N); ``cumulative``
+    the cumulative weights at the end of each block.
+    """
 
     threshold: float
     multinomial: bool
@@ -63,44 +69,50 @@ class Resampling(NamedTuple):
     always: bool
     points: np.ndarray
     ancestors: np.ndarray
+    everyone: np.ndarray
+    cumulative: np.ndarray
     order_work: OrderWork
     w_ordered: np.ndarray
 
 
 @pasted
-def resampler(fraction, scheme, n_states, n_particles):
+def resampler(fraction, scheme, n_states, own):
     """Resample below this fraction of the particles, by the scheme of this number."""
-    points, ancestors = np.empty(n_particles + 1), np.empty(n_particles, np.int64)
-    in_order = scheme == _SORTED
-    n_ordered = n_particles if in_order else 0
+    N, in_order = own.n_members, scheme == _SORTED
+    n_ordered = N if in_order else 0
     return Resampling(
-        fraction * n_particles, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
-        points, ancestors, order_workspace(n_states, n_ordered), np.empty(n_ordered),
+        fraction * N, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
+        np.empty(N + 1), np.empty(own.size, np.int64),
+        np.empty((1 + n_states, N)), np.empty(own.sums.shape[1]),
+        order_workspace(n_states, n_ordered), np.empty(n_ordered),
     )  # fmt: skip
 
 
 @pasted
-def resample_if_few(resampling, n_effective, z, log_w, w, X, buffer):
+def resample_if_few(resampling, n_effective, z, log_w, w, X, own):
     """Draw new particles of equal weight if the effective number is below the threshold.
 
-    ``z`` are the normals that a resampling takes; ``buffer`` is of the size of X. Returns whether
-    it was done; ``ancestors`` tell then who became whom.
+    ``z`` are the normals that a resampling takes. Returns whether it was done; ``ancestors`` tell
+    then who became whom.
     """
     if not (resampling.always or n_effective < resampling.threshold):
         return False
-    points, ancestors, N = resampling.points, resampling.ancestors, w.size
+    points, ancestors, everyone = resampling.points, resampling.ancestors, resampling.everyone
     if resampling.multinomial:
         multinomial(z, points)
     else:
         systematic(z, points)
+    gather_particles(w, X, own, everyone)
+    w_all, X_all, own_points = everyone[0], everyone[1:], points[own.first :]
     if resampling.in_order:
-        order = order_particles(w, X, resampling.order_work)
-        choose_in_order(w, order, points, resampling.w_ordered, ancestors)
+        order = order_particles(w_all, X_all, resampling.order_work)
+        w_ordered = resampling.w_ordered
+        choose_in_order(w_all, order, own_points, w_ordered, resampling.cumulative, ancestors)
     else:
-        choose_ancestors(w, points, ancestors)
-    copy_ancestors(ancestors, X, buffer)
-    for i in range(N):
-        log_w[i] = -math.log(N)
+        choose_ancestors(w_all, own_points, resampling.cumulative, ancestors)
+    copy_ancestors(X_all, ancestors, X)
+    for i in range(log_w.size):
+        log_w[i] = -math.log(own.n_members)
     return True
 
 
@@ -130,42 +142,73 @@ def check_sortable(scheme: str, n_states: int) -> None:
 
 
 @compiled
-def choose_ancestors(w, points, ancestors):
+def gather_particles(w, X, own, everyone):
+    """Weights and states of the particles of all ranks, (1 + n, N)."""
+    own_columns = everyone[:, own.first : own.first + own.size]
+    for i in range(w.size):
+        own_columns[0, i] = w[i]
+    for a in range(X.shape[0]):
+        for i in range(w.size):
+            own_columns[1 + a, i] = X[a, i]
+    complete(own.share, everyone, MEMBERS)
+
+
+@compiled
+def choose_ancestors(w, points, cumulative, ancestors):
     """Ancestor of each point: the n with v_{n-1} <= u < v_n, v the cumulative weights (Eq. 4.44).
+
+    Within a block of 64 they are added up from the end of the block before, which is written to
+    ``cumulative``: so points need not be walked to from the very first particle.
 
     A particle of zero weight has an empty interval. The end is the last particle that has weight,
     whatever rounding makes of the last cumulative sum.
     """
-    last = w.size - 1
-    while last > 0 and not w[last] > 0.0:
-        last -= 1
-    total = 0.0
-    for weight in w:
-        total += weight
-    n, cumulative = 0, w[0]
+    sum_blocks(w, cumulative)
+    last_block = cumulative.size - 1
+    for block in range(last_block):
+        cumulative[block + 1] += cumulative[block]
+    total = cumulative[last_block]
+    while last_block > 0 and cumulative[last_block - 1] == total:
+        last_block -= 1
+    block, end, n, last, v = -1, -1.0, 0, 0, 0.0
     for i in range(ancestors.size):
-        while n < last and points[i] * total >= cumulative:
+        u = points[i] * total
+        if u >= end:
+            block += 1
+            while block < last_block and u >= cumulative[block]:
+                block += 1
+            end = cumulative[block] if block < last_block else np.inf
+            n, last = BLOCK * block, _last_of_weight(w, BLOCK * block)
+            v = w[n] + (cumulative[block - 1] if block > 0 else 0.0)
+        while n < last and u >= v:
             n += 1
-            cumulative += w[n]
+            v += w[n]
         ancestors[i] = n
 
 
+@pasted
+def _last_of_weight(w, first):
+    """The last particle of a block that has weight; the first, if none has."""
+    last = min(first + BLOCK, w.size) - 1
+    while last > first and not w[last] > 0.0:
+        last -= 1
+    return last
+
+
 @compiled
-def choose_in_order(w, order, points, w_ordered, ancestors):
+def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
     """Ancestor of each point on a walk along the particles in this order."""
     for i in range(order.size):
         w_ordered[i] = w[order[i]]
-    choose_ancestors(w_ordered, points, ancestors)
+    choose_ancestors(w_ordered, points, cumulative, ancestors)
     for i in range(ancestors.size):
         ancestors[i] = order[ancestors[i]]
 
 
 @compiled
-def copy_ancestors(ancestors, X, buffer):
-    """Replace the columns of X (states, particles) by those of their ancestors."""
+def copy_ancestors(X_all, ancestors, X):
+    """Make the columns of X (states, particles) those of their ancestors in X_all."""
     for a in range(X.shape[0]):
-        row, old = X[a], buffer[a]
-        for i in range(row.size):
-            old[i] = row[i]
+        old, row = X_all[a], X[a]
         for i in range(row.size):
             row[i] = old[ancestors[i]]

@@ -6,7 +6,8 @@ For any shift t of the targets
 
 so sums at far targets are sums at near ones, with other weights. The shift moves the mean of the
 targets onto the mean of the members that matter there, each in proportion to its term of the sum.
-First all targets are tried as they are, then, if many are left, these are shifted.
+First all targets are tried as they are, then, if many are left, these are shifted. What is still
+left is summed exactly, by all ranks together: the tails may be those of one rank's members alone.
 """
 
 import math
@@ -16,34 +17,46 @@ import numpy as np
 from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.filters._elementary import exp, log
 from pymc_statespace_filters.filters._kernel_sum import compact, log_kernel_sum
-from pymc_statespace_filters.filters._lattice_sum import FLOOR, lattice_sums
+from pymc_statespace_filters.filters._lattice_sum import (
+    FLOOR,
+    lattice_sums,
+)
+from pymc_statespace_filters.filters._points import Points, complete_points
+from pymc_statespace_filters.filters._share import BLOCKS, MEMBERS, complete, part
 
 _LOG_FLOOR = math.log(FLOOR)
 _FEW = 64  # exact sums that cost less than another lattice; both grow with the number of members
 
 
 @compiled
-def tilted_workspace(n, width):
-    """Scratch of ``log_lattice_sums``: shifted targets, weights, sums, and the shift."""
-    return np.empty((n, width)), np.empty(width), np.empty(width), np.empty(n)
+def tilted_workspace(n_ranks, n, width):
+    """Scratch of ``log_lattice_sums``.
+
+    Missed targets and their number on each rank; these targets shifted, and the shift; exact sums.
+    """
+    missed, counts = np.empty(width, np.int64), np.empty((1, n_ranks))
+    return missed, counts, np.empty((1 + n, width)), np.empty(n), np.empty((1, width))
 
 
 @pasted
-def _collect(sums, targets, n_dims, shift, log_total, missed, out):
-    """Logs of the sums above the floor; the others stay in ``missed``. Return how many."""
-    for k in range(sums.size):
-        sums[k] = log(sums[k])
-    n_left = 0
-    for k in range(sums.size):
-        i = missed[k]
-        value = log_total + sums[k]
-        for a in range(n_dims):
-            value += shift[a] * (shift[a] - 2.0 * targets[a, i])
-        out[i] = value
-        if not sums[k] > _LOG_FLOOR:
-            missed[n_left] = i
-            n_left += 1
-    return n_left
+def _take_logs(share, targets):
+    """Replace a rank's own sums by their logs; return how many are below the floor."""
+    begin, end = part(share, targets.size, MEMBERS)
+    sums, n_missed = targets.rows[0, begin:end], 0
+    for i in range(sums.size):
+        sums[i] = log(sums[i])
+        n_missed += not sums[i] > _LOG_FLOOR
+    return n_missed
+
+
+@pasted
+def _total(share, counts, count):
+    counts[0, share.rank] = count
+    complete(share, counts, BLOCKS)
+    total = 0.0
+    for rank in range(counts.size):
+        total += counts[0, rank]
+    return np.int64(total)
 
 
 @compiled
@@ -88,33 +101,69 @@ def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
 
 
 @pasted
-def log_lattice_sums(w, sources, targets, n_dims, works, missed, out):
-    """log sum_l w_l exp(-|y_l - v_i|^2) for the columns of ``targets``, in one or two directions.
-
-    Returns how many targets it leaves out, their indices at the front of ``missed``, and what
-    ``compact`` returned, or zeros if it was not needed.
-    """
-    members = np.int64(0), np.int64(0)
-    sum_work, lattice_work, (shifted, tilted, all_sums, shift) = works
-    n_missed, log_total, weights, at = out.size, 0.0, w, targets
-    for i in range(n_missed):
-        missed[i] = i
+def _sum_shifted(share, members, sources, targets, n_missed, n_dims, works):
+    """Sums at shifted targets; returns how many targets are still missed."""
+    sum_work, lattice_work, (missed, _, shifted, shift, _) = works
+    y, v, some = sources.rows[1:], targets.rows[1:], missed[:n_missed]
+    if not _choose_shift(y, n_dims, members, v, some, sum_work, shifted[1:], shift):
+        return n_missed
+    log_total = _tilt(y, n_dims, members[0], sum_work[0], shift, sources.rows[0])
     for a in range(n_dims):
-        shift[a] = 0.0
-    for attempt in range(2):
-        left, sums = missed[:n_missed], all_sums[:n_missed]
-        if attempt == 1:
-            members = compact(w, sources, n_dims, sum_work)
-            if not _choose_shift(sources, n_dims, members, targets, left, sum_work, shifted, shift):
-                break
-            log_total = _tilt(sources, n_dims, members[0], sum_work[0], shift, tilted)
-            weights, at = tilted[: members[0]], shifted
-            for a in range(n_dims):
-                for k in range(n_missed):
-                    shifted[a, k] = targets[a, left[k]] - shift[a]
-        if not lattice_sums(weights, sources, at, n_dims, lattice_work, sums):
-            break
-        n_missed = _collect(sums, targets, n_dims, shift, log_total, left, out)
-        if n_missed <= _FEW:
-            break
-    return n_missed, members
+        for k in range(n_missed):
+            shifted[1 + a, k] = v[a, some[k]] - shift[a]
+    tilted, at = Points(sources.rows, members[0], True), Points(shifted, n_missed, True)
+    if not lattice_sums(share, tilted, at, n_dims, lattice_work):
+        return n_missed
+    _take_logs(share, at)
+    complete(share, shifted[:1, :n_missed], MEMBERS)
+    n_left = 0
+    for k in range(n_missed):
+        i, log_sum = some[k], shifted[0, k]
+        value = log_total + log_sum
+        for a in range(n_dims):
+            value += shift[a] * (shift[a] - 2.0 * v[a, i])
+        targets.rows[0, i] = value
+        if not log_sum > _LOG_FLOOR:
+            missed[n_left] = i
+            n_left += 1
+    return n_left
+
+
+@pasted
+def _sum_tails(share, sources, targets, n_dims, works):
+    """Sums at the targets that a lattice over the cloud has missed; all ranks know all of them."""
+    sum_work, _, (missed, _, _, _, exact) = works
+    complete_points(share, sources, n_dims)
+    complete_points(share, targets, n_dims)
+    logs, y, v = targets.rows[0], sources.rows[1:], targets.rows[1:]
+    n_missed = 0
+    for i in range(targets.size):
+        if not logs[i] > _LOG_FLOOR:
+            missed[n_missed] = i
+            n_missed += 1
+    members = compact(sources.rows[0, : sources.size], y, n_dims, sum_work)
+    if n_missed > _FEW:
+        n_missed = _sum_shifted(share, members, sources, targets, n_missed, n_dims, works)
+    if n_missed == 0:
+        return
+    begin, end = part(share, n_missed, BLOCKS)
+    for k in range(begin, end):
+        exact[0, k] = log_kernel_sum(y, n_dims, members[1], v, missed[k], sum_work)
+    complete(share, exact[:, :n_missed], BLOCKS)
+    for k in range(n_missed):
+        logs[missed[k]] = exact[0, k]
+
+
+@pasted
+def log_lattice_sums(share, sources, targets, n_dims, works):
+    """log sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
+
+    ``sources`` and ``targets`` are `Points`; the sums go to the latter. Returns False if the
+    lattice would be too large.
+    """
+    _, lattice_work, (_, counts, _, _, _) = works
+    if not lattice_sums(share, sources, targets, n_dims, lattice_work):
+        return False
+    if _total(share, counts, _take_logs(share, targets)) > 0:
+        _sum_tails(share, sources, targets, n_dims, works)
+    return True

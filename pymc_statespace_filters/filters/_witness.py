@@ -17,6 +17,9 @@ FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
 has updated members and weights, members have been resampled (``ancestors`` tells from whom), the
 record is over."""
 
+NOBODY = (0, 0, 0)
+"""No witness."""
+
 WITNESS_ARGUMENTS = (
     COUNTS, NUMBERS,  # the witness's own
     types.int64, types.int64, types.int64,  # event, observation, step

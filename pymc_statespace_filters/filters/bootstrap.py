@@ -21,32 +21,38 @@ from pymc_statespace_filters.filters._resampling import (
     n_normals,
     smooth_resampling,
 )
+from pymc_statespace_filters.filters._sums import exchange, sum_values, total
 from pymc_statespace_filters.filters._system import log_density
-from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
 from pymc_statespace_filters.lowering import Machine
 from pymc_statespace_filters.machine_code import Entry
 from pymc_statespace_filters.model import StateSpaceModel
 
 
 @pasted
-def _workspace(system, n_members, width, settings):
+def _workspace(system, own, settings):
     return ()
 
 
 @pasted
-def _update(system, j, k, t, d, noise, members, work):
+def _update(system, j, k, t, d, noise, members, own, work):
     X, _, _, w, log_w, log_p, alive = members
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
-    if mark_finite(X, X, alive) == 0:
-        return -np.inf, 0.0, NO_FINITE_MEMBER
+    mark_finite(X, X, alive)
     log_density(system, k, t, d, X, log_p)
     for i in range(alive.size):
         log_w[i] = log_w[i] + log_p[i] if alive[i] else -np.inf
-    increment = normalise(log_w, w)
+    weigh(log_w, w, own, 0)
+    sum_values(alive, own, 3)
+    exchange(own, 4)
+    if total(own, 3) == 0.0:
+        return -np.inf, 0.0, NO_FINITE_MEMBER
+    increment, n_effective = total_weight(own, 0)  # Eq. 4.43
     if increment == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
-    return increment, effective_number(w), NONE  # Eq. 4.43
+    normalise_own(increment, log_w, w, own, 0)
+    return increment, n_effective, NONE
 
 
 @dataclass(frozen=True)

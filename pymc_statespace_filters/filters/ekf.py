@@ -12,6 +12,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters._batch import compile_batch
+from pymc_statespace_filters.filters._gaussian_run import compile_run
+from pymc_statespace_filters.filters._gaussian_states import StatesPass, compile_states, states_pass
 from pymc_statespace_filters.filters._linearised import (
     Symbols,
     move_from,
@@ -22,7 +24,6 @@ from pymc_statespace_filters.filters._linearised import (
 )
 from pymc_statespace_filters.filters._recursion import Recursion, compile_taped, compile_value
 from pymc_statespace_filters.filters._reverse import compile_gradient, compile_reverse
-from pymc_statespace_filters.filters._states import StatesPass, compile_states, states_pass
 from pymc_statespace_filters.lowering import (
     Compiled,
     Graph,
@@ -106,6 +107,13 @@ class EKF:
         are a path. See `_bryson_frazier` for how both are made.
         """
         return compile_states(_states_pass(system), moment)
+
+    def compile_run(self, system: StateSpaceModel) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
+
+        See `filters`, the room, for what it returns.
+        """
+        return compile_run(_recursion(system))
 
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """What smoothed states are made by."""

@@ -2,19 +2,14 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from pymc_statespace_filters.filters._base import EnsembleFilter
 from pymc_statespace_filters.filters._checks import check_choice, check_count
 from pymc_statespace_filters.filters._compile import pasted
-from pymc_statespace_filters.filters._ensemble import (
-    equal_weights,
-    forecast_moments,
-    mark_finite,
-    nudge,
-)
+from pymc_statespace_filters.filters._ensemble import forecast_moments, mark_finite, nudge
 from pymc_statespace_filters.filters._failures import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -25,8 +20,15 @@ from pymc_statespace_filters.filters._gaussian import log_gaussian
 from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals
 from pymc_statespace_filters.filters._past import past_kernel
+from pymc_statespace_filters.filters._sums import (
+    exchange,
+    means,
+    sum_members,
+    sum_values,
+    total,
+)
 from pymc_statespace_filters.filters._system import log_density, observe
-from pymc_statespace_filters.filters._weights import effective_number, normalise
+from pymc_statespace_filters.filters._weights import total_weight, weigh
 from pymc_statespace_filters.lowering import Machine
 from pymc_statespace_filters.machine_code import Entry
 from pymc_statespace_filters.model import StateSpaceModel
@@ -35,68 +37,82 @@ _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0
 
 
-@pasted
-def _ensemble_mean(log_w, log_p, w):
-    """Mean over the members of p(d | x^f_i): the log of Eq. 4.26.
+class _Scratch(NamedTuple):
+    """Of one update: moments of the forecast, and what the two likelihoods need."""
 
-    How many members carry the mean is the same question as in a particle filter (Eq. 4.43).
-    """
-    for i in range(log_w.size):
-        log_w[i] += log_p[i]
-    increment = normalise(log_w, w)
-    return increment, effective_number(w) if increment > -np.inf else 0.0
+    moments: tuple
+    log_share: np.ndarray
+    share: np.ndarray
+    residual: np.ndarray
 
 
 @pasted
-def _gaussian_fit(d, moments, residual, n_alive):
-    """log N(d; d_bar, P_dd), observed components only; every member alive carries it."""
-    _, d_mean, _, P_dd_chol = moments
-    n_present = 0
-    for b in range(d.size):
-        present = not np.isnan(d[b])
-        residual[b] = d[b] - d_mean[b] if present else 0.0
-        n_present += present
-    return log_gaussian(residual, P_dd_chol, n_present), float(n_alive)
-
-
-@pasted
-def _workspace(system, n_members, width, settings):
+def _workspace(system, own, settings):
     n, p = system.n, system.p
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    return settings[0] == _ENSEMBLE, np.empty(n_members), moments, np.empty(p)
+    scratch = _Scratch(moments, np.empty(own.size), np.empty(own.size), np.empty(p))
+    return settings[0] == _ENSEMBLE, scratch
 
 
 @pasted
-def _update(system, j, k, t, d, noise, members, work):
+def _update(system, j, k, t, d, noise, members, own, work):
     X, D, _, w, _, log_p, alive = members
-    of_ensemble, log_share, moments, residual = work
+    of_ensemble, (moments, log_share, share, residual) = work
+    n, p = system.n, system.p
 
     # Simulated observations
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.15
-    n_alive = mark_finite(X, D, alive)
-    if n_alive == 0:
+    mark_finite(X, D, alive)
+
+    # Sums over the members of all ranks, in one exchange
+    for i in range(alive.size):
+        w[i] = 1.0 if alive[i] else 0.0
+    sum_values(w, own, 0)
+    sum_members(w, X, own, 1)
+    sum_members(w, D, own, 1 + n)
+    n_rows = 1 + n + p
+    if of_ensemble:
+        log_density(system, k, t, d, X, log_p)
+        log_N = math.log(own.n_members)
+        for i in range(alive.size):
+            log_share[i] = log_p[i] - log_N if alive[i] else -np.inf
+        weigh(log_share, share, own, n_rows)
+    exchange(own, n_rows + 3 * of_ensemble)
+    n_alive = total(own, 0)
+    if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
 
     # Moments of the forecast
-    equal_weights(alive, n_alive, w)
-    if not forecast_moments(w, X, D, d, moments):  # Eqs. 4.16-4.19
-        return -np.inf, float(n_alive), COVARIANCE_NOT_POSITIVE
+    x_mean, d_mean, _, _ = moments
+    means(own, 1, n_alive, x_mean)  # Eq. 4.16
+    means(own, 1 + n, n_alive, d_mean)
+    # The mean over the members of p(d | x^f_i), Eq. 4.26. How many members carry it is the same
+    # question as in a particle filter (Eq. 4.43).
+    increment, n_effective = total_weight(own, n_rows) if of_ensemble else (0.0, n_alive)
+    if not forecast_moments(w, X, D, d, n_alive - 1.0, own, moments):  # Eqs. 4.17-4.19
+        return -np.inf, n_alive, COVARIANCE_NOT_POSITIVE
 
     # Increment of the log-likelihood
-    if of_ensemble:
-        log_density(system, k, t, d, X, log_p)
-        log_N = math.log(alive.size)
-        for i in range(alive.size):
-            log_share[i] = -log_N if alive[i] else -np.inf
-        increment, n_effective = _ensemble_mean(log_share, log_p, w)  # Eq. 4.26
-    else:
-        increment, n_effective = _gaussian_fit(d, moments, residual, n_alive)
+    if not of_ensemble:
+        increment = _gaussian_fit(d, moments, residual)
     if not np.isfinite(increment):
         return -np.inf, 0.0, ZERO_WEIGHTS
 
     # Analysis
     nudge(d, D, alive, system.free, moments, X)  # Eqs. 4.20-4.21
     return increment, n_effective, NONE
+
+
+@pasted
+def _gaussian_fit(d, moments, residual):
+    """log N(d; d_bar, P_dd), observed components only."""
+    _, d_mean, _, P_dd_chol = moments
+    n_present = 0
+    for b in range(d.size):
+        present = not np.isnan(d[b])
+        residual[b] = d[b] - d_mean[b] if present else 0.0
+        n_present += present
+    return log_gaussian(residual, P_dd_chol, n_present)
 
 
 @dataclass(frozen=True)

@@ -151,6 +151,14 @@ class GridFilter:
         key = key_of(f"{self} {moment} states", functions.key)
         return Compiled(_bound_states(functions, self.tolerance, MOMENTS[moment]), key)
 
+    def compile_run(self, system: StateSpaceModel) -> Compiled:
+        """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
+
+        See `filters`, the room, for what it returns.
+        """
+        functions = one_state(system)
+        return Compiled(_bound_run(functions, self.tolerance), key_of(f"{self} run", functions.key))
+
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """How smoothed states are found, in words."""
         return "point masses, forwards and back"
@@ -182,7 +190,35 @@ def _bound(functions: OneState, tolerance: float) -> Any:
 
 
 def _bound_states(functions: OneState, tolerance: float, moment: int) -> Any:
-    """Bind the entry of the states to the functions of one system."""
+    """What `GridFilter.compile_states` gives, for the functions of one system."""
+    evaluate = _bound_laws(functions, tolerance, moment)
+
+    @compiled
+    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+        record = (theta, steps, observed, inputs, t0)
+        mean, sd, drawn, _, health = evaluate(record, rows, draw_seed)
+        n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
+        return mean, sd, drawn, n_effective, health
+
+    return run
+
+
+def _bound_run(functions: OneState, tolerance: float) -> Any:
+    """What `GridFilter.compile_run` gives, for the functions of one system."""
+    evaluate = _bound_laws(functions, tolerance, MOMENTS["filtered"])
+
+    @compiled
+    def run(theta, steps, observed, inputs, t0, seed, rows):
+        record = (theta, steps, observed, inputs, t0)
+        mean, sd, _, terms, health = evaluate(record, rows, 0)
+        cov = (sd * sd).reshape(rows.size, 1, 1)
+        return terms, health, mean, cov, np.empty((rows.size, 0, 1)), np.empty((rows.size, 0))
+
+    return run
+
+
+def _bound_laws(functions: OneState, tolerance: float, moment: int) -> Any:
+    """Bind the entry of the states: (record, rows, draw_seed) -> mean, sd, drawn, terms, health."""
     entries = one_state_entries(functions)
     for entry in (GRID_STATES, *entries):
         entry.compile()
@@ -192,22 +228,24 @@ def _bound_states(functions: OneState, tolerance: float, moment: int) -> Any:
     same_every_step = int(functions.same_every_step)
 
     @compiled
-    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+    def laws(record, rows, draw_seed):
+        theta, steps, observed, inputs, t0 = record
         # One state: what is (R, 1) for the caller is a vector here.
         mean, sd = np.full((rows.size, 1), np.nan), np.full((rows.size, 1), np.nan)
-        drawn, health = np.full((rows.size, 1), np.nan), np.empty(3)
+        drawn, terms = np.full((rows.size, 1), np.nan), np.full(steps.size, -np.inf)
+        health = np.empty(3)
         health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
         evaluate(
             address_of(start), address_of(move), address_of(log_density),
             p, n_inputs, same_every_step, dt, tolerance, moment,
             theta.ctypes.data, theta.size, steps.ctypes.data, steps.size, observed.ctypes.data,
             inputs.ctypes.data, inputs.shape[0], t0, rows.ctypes.data, rows.size, draw_seed,
-            mean.ctypes.data, sd.ctypes.data, drawn.ctypes.data, health.ctypes.data,
+            mean.ctypes.data, sd.ctypes.data, drawn.ctypes.data,
+            terms.ctypes.data, health.ctypes.data,
         )  # fmt: skip
-        n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
-        return mean, sd, drawn, n_effective, health
+        return mean, sd, drawn, terms, health
 
-    return run
+    return laws
 
 
 def _point_mass(

@@ -1,29 +1,25 @@
 """Particle filter with an ensemble Kalman proposal (thesis, section 4.4, Eqs. 4.29-4.44)."""
 
-import math
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from pymc_statespace_filters.filters._base import EnsembleFilter
 from pymc_statespace_filters.filters._checks import check_choice, check_count, check_fraction
-from pymc_statespace_filters.filters._compile import compiled, pasted
+from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._ensemble import (
     copy_members,
-    count_true,
-    equal_weights,
     forecast_moments,
     mark_finite,
     nudge,
-    spread_factor,
 )
 from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters._kernel_density import (
-    density_method,
-    density_workspace,
-    log_kernel_density,
-    scott_bandwidth,
+from pymc_statespace_filters.filters._kernel_density import density_method
+from pymc_statespace_filters.filters._kernel_weights import (
+    Forecast,
+    nudging_workspace,
+    weigh_nudged,
 )
 from pymc_statespace_filters.filters._loop import filter_entry
 from pymc_statespace_filters.filters._noise import observation_normals
@@ -37,8 +33,16 @@ from pymc_statespace_filters.filters._resampling import (
     n_normals,
     smooth_resampling,
 )
+from pymc_statespace_filters.filters._sums import (
+    exchange,
+    means,
+    sum_members,
+    sum_spread,
+    sum_values,
+    total,
+)
 from pymc_statespace_filters.filters._system import log_density, observe
-from pymc_statespace_filters.filters._weights import effective_number, log_sum, normalise
+from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.lowering import Machine
 from pymc_statespace_filters.machine_code import Entry
@@ -46,117 +50,111 @@ from pymc_statespace_filters.model import StateSpaceModel
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 
-
 _LIKELIHOODS = ("predictive", "weights", "as_printed")
 _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 
-class _Scratch(NamedTuple):
-    """Of one update: moments of the forecast, and what the densities of Eq. 4.36 need."""
-
-    moments: tuple
-    w_equal: np.ndarray
-    log_prior: np.ndarray
-    log_proposal: np.ndarray
-    density: tuple
+@pasted
+def _workspace(system, own, settings):
+    return np.int64(settings[2]), nudging_workspace(system, own)
 
 
 @pasted
-def _workspace(system, n_members, width, settings):
-    n, p, N, n_free = system.n, system.p, n_members, system.free.size
-    moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    density = density_workspace(n_free, width)
-    scratch = _Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
-    return np.int64(settings[2]), scratch
-
-
-@pasted
-def _update(system, j, k, t, d, noise, members, work):
+def _update(system, j, k, t, d, noise, members, own, work):
     X, D, X_f, w, log_w, log_p, alive = members
     likelihood, scratch = work
 
     # Simulated observations and previous weights, of the particles that are alive
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.29
-    if mark_finite(X, D, alive) == 0:
+    mark_finite(X, D, alive)
+    n_alive, n_effective, log_alive = _weigh_alive(members, own)
+    if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
-    for i in range(w.size):
-        log_w[i] = log_w[i] if alive[i] else -np.inf
-    log_alive = normalise(log_w, w)
     if log_alive == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
 
     # Predicted density of the observation, then proposal and weights
     log_density(system, k, t, d, X, log_p)
-    log_forecast = log_alive + log_sum(log_w, log_p)
     copy_members(X, X_f)
+    forecast = _forecast(n_alive, n_effective, members, own, scratch)
     as_printed = likelihood == _AS_PRINTED
-    if not _move(system, k, t, d, members, scratch, as_printed):  # Eqs. 4.30-4.36
+    if not (
+        forecast.spread > _ONE_PARTICLE
+        and _nudge(system, d, members, forecast, own, scratch)  # Eqs. 4.30-4.35
+        and weigh_nudged(system, k, t, d, members, forecast, own, scratch, as_printed)  # Eq. 4.36
+    ):
         copy_members(X_f, X)
         log_density(system, k, t, d, X, log_p)
         for i in range(w.size):
             log_w[i] += log_p[i]  # Eq. 4.28
-    log_total = log_alive + normalise(log_w, w)  # Eq. 4.37
+    n_effective, log_total, log_printed = _normalise(members, own, scratch)  # Eqs. 4.37, 4.43
     if likelihood == _PREDICTIVE:
-        increment = log_forecast  # Eq. 4.42 without its double count
+        increment = log_alive + forecast.log_mean  # Eq. 4.42 without its double count
     elif likelihood == _WEIGHTS:
-        increment = log_total  # log of the mean unnormalised weight: importance sampling
+        increment = log_alive + log_total  # of the mean unnormalised weight: importance sampling
     else:
-        increment = log_sum(log_w, log_p)  # Eq. 4.42 to the letter
+        increment = log_printed  # Eq. 4.42 to the letter
     if not (np.isfinite(increment) and np.isfinite(log_total)):
         return -np.inf, 0.0, ZERO_WEIGHTS
-    return increment, effective_number(w), NONE  # Eq. 4.43
+    return increment, n_effective, NONE
 
 
 @pasted
-def _move(system, k, t, d, members, scratch, keeps_previous):
-    """Nudge X; leave the unnormalised weights in log_w and p(d | x^a) in log_p.
-
-    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if no
-    proposal can be built.
-    """
-    X, D, X_f, w, log_w, log_p, alive = members
-    moments, w_equal, log_prior, log_proposal, density = scratch
-    free, n, n_free = system.free, system.n, system.free.size
-    P, x_mean = np.empty((n, n)), np.empty(n)
-    H_f, H_a = np.empty((n_free, n_free)), np.empty((n_free, n_free))
-    spreads_f, spreads_a = np.empty(n_free, np.bool_), np.empty(n_free, np.bool_)
-
-    # Nudge
-    if spread_factor(w) < _ONE_PARTICLE:
-        return False
-    if not forecast_moments(w, X, D, d, moments):  # Eqs. 4.30-4.33
-        return False
-    nudge(d, D, alive, free, moments, X)  # Eqs. 4.34-4.35
-
-    # Bandwidths
-    n_alive = count_true(alive)
-    equal_weights(alive, n_alive, w_equal)
-    n_effective = effective_number(w)
-    if not (
-        scott_bandwidth(w_equal, float(n_alive), X, free, x_mean, P, H_a, spreads_a)  # Eq. 4.38
-        and scott_bandwidth(w, n_effective, X_f, free, x_mean, P, H_f, spreads_f)  # Eq. 4.39
-        and _agree(spreads_a, spreads_f)
-    ):
-        return False
-
-    # Weights (Eq. 4.36)
-    log_density(system, k, t, d, X, log_p)
-    log_kernel_density(w, X_f, X, free, H_f, spreads_f, density, log_prior)
-    log_kernel_density(w_equal, X, X, free, H_a, spreads_a, density, log_proposal)
+def _weigh_alive(members, own):
+    """Normalise the weights of who is alive; return how many are, N_eff, and the log of the sum."""
+    _, _, _, w, log_w, _, alive = members
     for i in range(w.size):
-        share = log_w[i] if keeps_previous else -math.log(n_alive)
-        log_weight = share + log_p[i] + (log_prior[i] - log_proposal[i])
-        log_w[i] = log_weight if alive[i] else -np.inf
+        log_w[i] = log_w[i] if alive[i] else -np.inf
+    weigh(log_w, w, own, 0)
+    sum_values(alive, own, 3)
+    exchange(own, 4)
+    log_alive, n_effective = total_weight(own, 0)
+    if log_alive > -np.inf:
+        normalise_own(log_alive, log_w, w, own, 0)
+    return total(own, 3), n_effective, log_alive
+
+
+@pasted
+def _forecast(n_alive, n_effective, members, own, scratch):
+    """Means of the forecast, and its p(d | x)."""
+    X, D, _, w, log_w, log_p, _ = members
+    x_mean, d_mean, _, _ = scratch.moments
+    n, p = X.shape[0], D.shape[0]
+    for i in range(w.size):
+        scratch.log_prior[i] = log_w[i] + log_p[i]
+    sum_spread(w, own, 0)
+    sum_members(w, X, own, 1)
+    sum_members(w, D, own, 1 + n)
+    weigh(scratch.log_prior, scratch.w_equal, own, 1 + n + p)
+    exchange(own, 1 + n + p + 3)
+    means(own, 1, 1.0, x_mean)
+    means(own, 1 + n, 1.0, d_mean)
+    return Forecast(n_alive, n_effective, total(own, 0), total_weight(own, 1 + n + p)[0])
+
+
+@pasted
+def _nudge(system, d, members, forecast, own, scratch):
+    """Move X by the Kalman gain; False if its covariance is singular or not finite."""
+    X, D, _, w, _, _, alive = members
+    if not forecast_moments(w, X, D, d, forecast.spread, own, scratch.moments):  # Eqs. 4.30-4.33
+        return False
+    nudge(d, D, alive, system.free, scratch.moments, X)  # Eqs. 4.34-4.35
     return True
 
 
-@compiled
-def _agree(spreads_a, spreads_f):
-    """Whether two ensembles spread in the same directions."""
-    for a in range(spreads_a.size):
-        if spreads_a[a] != spreads_f[a]:
-            return False
-    return True
+@pasted
+def _normalise(members, own, scratch):
+    """Normalise the weights; return N_eff, the log of their sum, and Eq. 4.42 to the letter."""
+    _, _, _, w, log_w, log_p, _ = members
+    weigh(log_w, w, own, 0)
+    for i in range(w.size):
+        scratch.log_prior[i] = log_w[i] + log_p[i]
+    weigh(scratch.log_prior, scratch.w_equal, own, 3)
+    exchange(own, 6)
+    log_total, n_effective = total_weight(own, 0)
+    if log_total > -np.inf:
+        normalise_own(log_total, log_w, w, own, 0)
+    return n_effective, log_total, total_weight(own, 3)[0] - log_total
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,11 @@
 """Machine code with a name or an address, called from other machine code; it knows no system."""
 
-from pymc_statespace_filters.machine_code.cores import available_cores
+from pymc_statespace_filters.machine_code.closed_library import closed
+from pymc_statespace_filters.machine_code.cores import (
+    available_cores,
+    core_numbers,
+    share_of_cores,
+)
 from pymc_statespace_filters.machine_code.entries import (
     COUNTS,
     NUMBERS,
@@ -24,8 +29,11 @@ __all__ = [
     "address_of",
     "available_cores",
     "call_address",
+    "closed",
+    "core_numbers",
     "digest",
     "kept",
     "key_of",
     "make_call",
+    "share_of_cores",
 ]

@@ -22,6 +22,7 @@ from numba.extending import intrinsic
 from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
+from pymc_statespace_filters.machine_code.closed_library import ClosedCompiler, closed
 from pymc_statespace_filters.machine_code.keys import FAST_MATH, digest
 
 NUMBERS = types.CPointer(types.float64)
@@ -47,7 +48,7 @@ def kept(function: Any, key: str) -> Any:
     """Keep a compiled function on PyTensor's disk cache, under a key that identifies its code."""
     if config.numba__cache:
         function._cache = _cache(function.py_func, key)
-    return function
+    return closed(function)
 
 
 def _cache(function: Callable, key: str) -> _CacheByKey:
@@ -94,7 +95,13 @@ class Entry:
         for needed in self._needs:
             needed.compile()
         options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
-        compiled: Any = CFunc(self._function, (self._arguments, types.void), {}, options)
+        compiled: Any = CFunc(
+            self._function,
+            (self._arguments, types.void),
+            {},
+            options,
+            pipeline_class=ClosedCompiler,
+        )
         if self.key is not None and config.numba__cache:
             compiled._cache = _cache(self._function, self.key)
         compiled.compile()

@@ -19,6 +19,7 @@ from numba import carray, njit, typeof, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from pymc_statespace_filters.machine_code.closed_library import closed
 from pymc_statespace_filters.machine_code.entries import COUNTS, NUMBERS, Entry, call_address
 from pymc_statespace_filters.machine_code.keys import digest
 
@@ -77,6 +78,8 @@ class NativeFunction:
         self._is_native = hasattr(function.vm, "jit_fn") and all(
             isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
         )
+        if self._is_native:
+            closed(function.vm.jit_fn)
         # The values of now, in the one layout that adapters know.
         self._data = [_contiguous(value) for value in shared] if self._is_native else []
         self.shapes = [np.shape(result) for result in self(*example)]

@@ -20,7 +20,7 @@ from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import Filter
 from pymc_statespace_filters.lowering import Compiled, jit
-from pymc_statespace_filters.machine_code import key_of
+from pymc_statespace_filters.machine_code import closed, key_of
 from pymc_statespace_filters.model import StateSpaceModel
 
 HEALTH_SIZE = 3
@@ -97,7 +97,7 @@ def evaluator(op: RecordOp) -> Any:
     function = pytensor.function(
         inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
     )
-    machine_code = function.vm.jit_fn
+    machine_code = closed(function.vm.jit_fn)
     dtypes = [dtype for _, dtype, _ in op.input_types]
 
     def evaluate(*values: Any) -> tuple:
@@ -107,9 +107,13 @@ def evaluator(op: RecordOp) -> Any:
 
 
 def check_record(system: StateSpaceModel) -> Any:
-    """Compile a check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
-    n_inputs, last_row = system.n_inputs, int(system.observation_uses_inputs)
+    """A compiled check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
+    return _check_of_inputs(system.n_inputs, int(system.observation_uses_inputs))
 
+
+# Made once for all systems of one shape: a fresh one would be compiled by the next call.
+@cache
+def _check_of_inputs(n_inputs: int, last_row: int) -> Any:
     @jit
     def check(steps, inputs):
         for j in range(steps.size):
@@ -123,9 +127,9 @@ def check_record(system: StateSpaceModel) -> Any:
     return check
 
 
-def check_observed(system: StateSpaceModel) -> Any:
-    """Compile a check that a record has the shape that the kernels read."""
-    p = system.p
+@cache
+def check_observed(p: int) -> Any:
+    """A compiled check that a record has the shape that the kernels read."""
 
     @jit
     def check(steps, observed):
@@ -191,7 +195,7 @@ def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
         "np": np,
         "run": compiled.function,
         "check": check_record(op.system),
-        "check_observed": check_observed(op.system),
+        "check_observed": check_observed(op.system.p),
         "no_normals": np.empty(0),
     }
     exec(compile(source, f"<call of {op}>", "exec"), namespace)

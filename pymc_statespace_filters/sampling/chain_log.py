@@ -14,7 +14,7 @@ import os
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -65,10 +65,13 @@ class ChainLog:
         The file; it need not exist.
     origin : bytes
         What its first record follows on: bytes that belong to this run and this chain alone.
+    check : callable
+        Raises where this log is not ours any more; called before the file is touched.
     """
 
-    def __init__(self, path: Path, origin: bytes):
+    def __init__(self, path: Path, origin: bytes, check: Callable[[], None] = lambda: None):
         self.path = path
+        self._check = check
         self._origin = _checksum(origin)
         self._file: BinaryIO | None = None
         self._tip = _Tip(0, self._origin)
@@ -88,6 +91,7 @@ class ChainLog:
         CheckpointWarning
             If something was cut off; it names the file and what is lost.
         """
+        self._check()
         stored = self._read()
         if stored is not None and self._is_loose():
             self._compact(stored)
@@ -134,6 +138,7 @@ class ChainLog:
         OSError
             If the disk refuses, for one because it is full.
         """
+        self._check()
         if self._file is None:
             self.read()
         file, is_first = self._open(), self._tip.end == 0
@@ -187,6 +192,7 @@ class ChainLog:
         self._file = None
         with suppress(OSError):
             file.close()
+        self._check()  # or it would be another's file that is cut
         os.truncate(self.path, self._tip.end)
 
     def _warn(self, n_bytes: int, n_good: int) -> None:

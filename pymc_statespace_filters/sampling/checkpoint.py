@@ -1,36 +1,46 @@
 """Checkpoints: a folder that says what was asked for, and holds one log for each chain.
 
-``run.json`` is written once, when the folder is made, and appears as a whole; a log only grows (see
-`chain_log`). So a process that is killed between any two calls leaves a folder behind that is not
-yet a checkpoint, or a good one up to the last record.
+What was asked for appears as a whole (see `run_file`), and a log only grows (see `chain_log`). So a
+process that is killed between any two calls leaves a folder behind that is not yet a checkpoint, or
+a good one up to the last record.
+
+Several ranks share a folder that all of them see: the first opens it, and the others join by its
+ticket. When a job has died, one of its ranks may still be writing while the next job opens the
+folder. Two things keep it off: a log is touched only while the lock of its job is there, and the
+next job replaces the logs by copies, so that a write on its way goes into a file without a name.
 """
 
-import json
 import os
+import platform
+import re
+import shutil
+import unicodedata
 from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling import folder_lock
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.chain_log import ChainLog, sync_folder
-from pymc_statespace_filters.sampling.folder_lock import FolderLock
+from pymc_statespace_filters.sampling.folder_lock import FolderLock, check_held, comes_in_sight
+from pymc_statespace_filters.sampling.run_file import RUN, begin, canonical, compare
 
-FORMAT = "pymc_statespace_filters checkpoint"
-VERSION = 1
+_READABLE = 40  # characters of a name
 
-_RUN = "run.json"
-_UNFINISHED = "run.json.unfinished"
-_LONGEST_SHOWN = 80
-_CURE = "delete the folder or give another path"
+
+class Ticket(NamedTuple):
+    """What another rank needs to join a checkpoint; it can be pickled."""
+
+    folder: str
+    lock: str
+    asked: str
 
 
 class Checkpoint:
     """An open checkpoint; a context manager that gives the folder free at its end.
 
-    Made by `open_checkpoint`.
+    Made by `open_checkpoint`, or by `join_checkpoint` for the rank of another process, which holds
+    nothing and gives nothing free.
 
     Attributes
     ----------
@@ -38,34 +48,55 @@ class Checkpoint:
         The folder.
     """
 
-    def __init__(self, path: Path, lock: FolderLock, asked: str):
-        self.path = path
+    def __init__(self, ticket: Ticket, lock: FolderLock | None = None):
+        self.path = Path(ticket.folder)
+        self._ticket = ticket
         self._lock = lock
-        self._asked = asked
         self._logs: dict[int, ChainLog] = {}
 
     def log(self, chain: int) -> ChainLog:
-        """Give the log of a chain, 0 the first; always the same object."""
+        """Give the log of a chain, 0 the first; always the same object.
+
+        One rank at a time uses the log of a chain, and closes it before another does.
+        """
         if chain not in self._logs:
-            origin = f"{self._asked}\n{chain}".encode()
-            self._logs[chain] = ChainLog(self.path / f"chain-{chain}.log", origin)
+            origin = f"{self._ticket.asked}\n{chain}".encode()
+            self._logs[chain] = ChainLog(self.path / f"chain-{chain}.log", origin, self.check)
         return self._logs[chain]
+
+    def ticket(self) -> Ticket:
+        """Give what other ranks need for `join_checkpoint`, until this one is closed."""
+        return self._ticket
+
+    def beat(self) -> None:
+        """Show other computers that this job lives: to be called every second or so.
+
+        From the opening to the end, or the folder is taken over. Where it was joined, this does
+        nothing.
+
+        Raises
+        ------
+        ModelError
+            If the folder is not ours any more.
+        """
+        if self._lock is not None:
+            self._lock.beat()
+
+    def check(self) -> None:
+        """Raise a `ModelError` if the folder is not ours any more."""
+        check_held(self.path / self._ticket.lock)
 
     def close(self) -> None:
         """Close the logs and give the folder free."""
         for log in self._logs.values():
             log.close()
-        self._lock.release()
+        if self._lock is not None:
+            self._lock.release()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -90,7 +121,8 @@ def open_checkpoint(path: str | os.PathLike, asked: Mapping[str, Any]) -> Checkp
         field that differs, with both values.
     ModelError
         If the folder cannot be used: it is something else, damaged, written by a newer version,
-        not writable, or in use by another process.
+        not writable, or in use by another process. A process of another computer, or of another
+        container, is watched for 20 s before its folder is taken over.
 
     Examples
     --------
@@ -106,7 +138,7 @@ def open_checkpoint(path: str | os.PathLike, asked: Mapping[str, Any]) -> Checkp
     >>> folder.cleanup()
     """
     folder = Path(path).absolute()
-    text = _canonical(dict(asked))
+    text = canonical(dict(asked))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FolderLock(folder)
@@ -117,84 +149,90 @@ def open_checkpoint(path: str | os.PathLike, asked: Mapping[str, Any]) -> Checkp
             f"checkpoint={str(folder)!r} cannot be written to ({error.strerror}): give another path"
         ) from error
     try:
-        if (folder / _RUN).exists():
-            _compare(folder, text)
+        if lock.is_taken_over:
+            _replace_logs(folder, lock)
+        if (folder / RUN).exists():
+            compare(folder, text)
         else:
-            _begin(folder, text)
+            begin(folder, text)
     except BaseException:
         lock.release()
         raise
-    return Checkpoint(folder, lock, text)
+    return Checkpoint(Ticket(str(folder), lock.path.name, text), lock)
 
 
-def _begin(folder: Path, asked: str) -> None:
-    """Make a checkpoint of an empty folder, or of one that a killed process was about to make."""
-    begun = {_UNFINISHED, *(p.name for p in folder.glob(f"{folder_lock.PREFIX}*"))}
-    if foreign := sorted(p.name for p in folder.iterdir() if p.name not in begun):
+def join_checkpoint(ticket: Ticket) -> Checkpoint:
+    """Take part in a checkpoint that the first rank has opened.
+
+    Parameters
+    ----------
+    ticket : Ticket
+        Of that checkpoint.
+
+    Returns
+    -------
+    Checkpoint
+        For the logs of the chains that this rank runs, as long as the first rank holds the folder.
+
+    Raises
+    ------
+    ModelError
+        If the folder of that name here is another one, for the first rank's lock is not in it. On a
+        network a file may come in sight late, so this takes a minute.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> with open_checkpoint(folder.name, {"draws": 4}) as first:
+    ...     with join_checkpoint(first.ticket()) as second:
+    ...         second.path == first.path
+    True
+    >>> folder.cleanup()
+    """
+    if not comes_in_sight(Path(ticket.folder, ticket.lock)):
         raise ModelError(
-            f"checkpoint={str(folder)!r} is not a checkpoint: it holds {', '.join(foreign[:3])}"
-            f"{', ...' if len(foreign) > 3 else ''} but no {_RUN}; give another path"
+            f"checkpoint={ticket.folder!r} is not on a file system that all ranks see: "
+            f"{platform.node()} does not find {ticket.lock} in it, which the first rank has put "
+            f"there; give a path on a shared file system"
         )
-    run = {"format": FORMAT, "version": VERSION, "asked": json.loads(asked)}
-    run["sum"] = _sum(run["version"], run["asked"])
-    with open(folder / _UNFINISHED, "w", encoding="utf-8") as file:
-        json.dump(run, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(folder / _UNFINISHED, folder / _RUN)
+    return Checkpoint(ticket)
+
+
+def subfolder(name: str) -> str:
+    """Give the name of a folder for something of any name.
+
+    Readable, and another one for another name also where case makes no difference, or an accent can
+    be written in two ways.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    str
+        Some letters and digits of it, and a hash of all of it.
+
+    Examples
+    --------
+    >>> subfolder("Double well / additive")
+    'Double-well-additive-0c8368e4c4'
+    """
+    letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    readable = re.sub("[^A-Za-z0-9]+", "-", letters)[:_READABLE].strip("-")
+    digest = blake2b(name.encode("utf-8", "surrogatepass"), digest_size=5).hexdigest()
+    return f"{readable}-{digest}".removeprefix("-")
+
+
+def _replace_logs(folder: Path, lock: FolderLock) -> None:
+    """Put copies in the place of the logs, whose files a dying process may still write to."""
+    for path in sorted(folder.glob("chain-*.log")):
+        copy = path.with_name(f"{path.name}.copy")
+        shutil.copyfile(path, copy)
+        with open(copy, "rb+") as file:
+            os.fsync(file.fileno())
+        lock.beat()
+        check_held(lock.path)
+        os.replace(copy, path)
     sync_folder(folder)
-    sync_folder(folder.parent)
-
-
-def _compare(folder: Path, asked: str) -> None:
-    """Raise unless the folder is a checkpoint of just this."""
-    stored, now = _stored(folder), json.loads(asked)
-    differing = [
-        f"{name}: the checkpoint has {_shown(stored, name)}, asked for {_shown(now, name)}"
-        for name in dict.fromkeys([*stored, *now])
-        if name not in stored
-        or name not in now
-        or _canonical(stored[name]) != _canonical(now[name])
-    ]
-    if differing:
-        raise DataMismatchError(
-            f"checkpoint={str(folder)!r} is of another run: {'; '.join(differing)}; {_CURE}"
-        )
-
-
-def _stored(folder: Path) -> dict[str, Any]:
-    """What the checkpoint was asked for."""
-    try:
-        run = json.loads((folder / _RUN).read_bytes())
-        format_, version = run["format"], run["version"]
-    except (ValueError, TypeError, KeyError):
-        format_, version = None, None
-    if format_ != FORMAT or not isinstance(version, int):
-        raise ModelError(
-            f"checkpoint={str(folder)!r}: its {_RUN} is damaged or not of a checkpoint; {_CURE}"
-        )
-    if version > VERSION:
-        raise ModelError(
-            f"checkpoint={str(folder)!r} has the format {version}, of a newer version of this "
-            f"package, which reads up to {VERSION}: update the package, or give another path"
-        )
-    asked = run.get("asked")
-    if not isinstance(asked, dict) or run.get("sum") != _sum(version, asked):
-        raise ModelError(f"checkpoint={str(folder)!r}: its {_RUN} is damaged; {_CURE}")
-    return asked
-
-
-def _canonical(value: Any) -> str:
-    """One text for equal values; it tells 1 from 1.0 and True, and NaN equals itself."""
-    return json.dumps(value, sort_keys=True)
-
-
-def _sum(version: int, asked: dict[str, Any]) -> str:
-    return blake2b(_canonical([version, asked]).encode(), digest_size=16).hexdigest()
-
-
-def _shown(values: Mapping[str, Any], name: str) -> str:
-    if name not in values:
-        return "nothing"
-    text = _canonical(values[name])
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."

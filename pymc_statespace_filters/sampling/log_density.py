@@ -20,16 +20,18 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import (
+    delegable_likelihoods,
     health_outputs,
-    hold_noise,
     log_density_terms,
     move_noise,
     state_space_names,
     with_filter,
 )
 from pymc_statespace_filters.machine_code import NativeFunction
+from pymc_statespace_filters.parallel import Ranks
 from pymc_statespace_filters.sampling.chain import evaluate
 from pymc_statespace_filters.sampling.chain_arrays import RAISED, Density, Evaluation
+from pymc_statespace_filters.sampling.lockstep import Leader, own_errors
 
 
 class LogDensity:
@@ -54,6 +56,9 @@ class LogDensity:
         ``correlation`` times theirs plus fresh ones, of the same variance.
     graph : TensorVariable, optional
         The log-density if it is not the model's own, see `screening_density`.
+    group : Ranks, optional
+        Ranks that evaluate the noisy likelihoods together. This one, their first, has the
+        log-density; the others `lockstep.follow`.
 
     Attributes
     ----------
@@ -72,6 +77,7 @@ class LogDensity:
         holds_noise: bool = False,
         correlation: float | None = None,
         graph: TensorVariable | None = None,
+        group: Ranks | None = None,
     ):
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
@@ -82,21 +88,30 @@ class LogDensity:
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
         noise_inputs: list[Variable] = []
         noise: list[Variable] = []
-        if holds_noise and seeds:
-            outputs, normals = hold_noise(outputs, seeds)
-            noise_inputs, noise, seed_inputs = list(normals), list(normals.values()), {}
-        elif correlation is not None and seeds:
+        self._leader: Leader | None = None
+        self._is_delegable = False
+        self._moves_noise = correlation is not None and bool(seeds) and not holds_noise
+        if self._moves_noise:
             graphs, moved = move_noise(outputs, seeds)
             outputs = [*graphs, *moved.moved]
             noise_inputs, noise = [moved.correlation, *moved.normals], list(moved.sizes)
+        else:
+            # Where there is one rank too: the same machine code gives the same bits.
+            outputs, delegable = delegable_likelihoods(outputs, seeds if holds_noise else {})
+            noise_inputs, noise = list(delegable.normals), list(delegable.normals.values())
+            if delegable.kinds:
+                self._is_delegable = True
+                noise_inputs = [delegable.address, *noise_inputs]
+            if group is not None:
+                self._leader = Leader(group, delegable.kinds)
         # Belongs to the data: the stored normals, or how many there are.
         self._make_noise: Any = compile_pymc([], noise) if noise else list
+        self._n_noises = len(noise)
         outputs, joined = join_nonshared_inputs(point, outputs, held, shared_inputs=seed_inputs)
         inputs = [joined, *not_held, *noise_inputs, *seed_inputs.values()]
         self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
         self._n_seeds = len(seeds)
-        self._reads_seeds = bool(seed_inputs)
         self._start = np.concatenate([np.ravel(point[v.name]) for v in held], dtype=np.float64)
         self._others = [np.array(point[name]) for name in self.others]
         self._native: NativeFunction | None = None
@@ -107,21 +122,17 @@ class LogDensity:
         return self.__dict__ | {"_native": None, "_normals": []}
 
     @property
-    def _moves_noise(self) -> bool:
-        return self.correlation is not None and self._reads_seeds
-
-    @property
     def n_carried(self) -> int:
         """How many normals a chain carries along; known once prepared."""
         return sum(normals.size for normals in self._normals) if self._moves_noise else 0
 
     def prepare(self) -> NativeFunction:
         """Take hold of the machine code and of the data as they are now."""
-        noise = self._make_noise()
-        self._normals = [np.zeros(int(size)) for size in noise] if self._moves_noise else noise
+        self._normals = self._first_normals()
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
         inputs = self._inputs(self._start, self._others, np.zeros(()), self._normals, seeds)
-        self._native = NativeFunction(self._function, inputs)
+        with own_errors(self._leader):
+            self._native = NativeFunction(self._function, inputs)
         return self._native
 
     def bind(self) -> "BoundDensity":
@@ -137,7 +148,8 @@ class LogDensity:
         inputs = self._inputs(position, others, correlation, normals, seeds)
         call, kept = native.bind(inputs)
         density = Density(call, position, seeds, self._n_healths)
-        return BoundDensity(density, others, correlation, carried, native, inputs, kept)
+        leader = self._leader
+        return BoundDensity(density, others, correlation, carried, native, inputs, kept, leader)
 
     def _inputs(
         self,
@@ -148,9 +160,18 @@ class LogDensity:
         seeds: np.ndarray,
     ) -> list[np.ndarray]:
         """Arguments of the compiled function, views where it reads a part."""
-        moved = [correlation] if self._moves_noise else []
+        first = [correlation] if self._moves_noise else []
+        if self._is_delegable:
+            first = [np.zeros((), np.int64) if self._leader is None else self._leader.address]
         each_seed = [seeds[i : i + 1].reshape(()) for i in range(seeds.size)]
-        return [position, *others, *moved, *normals, *(each_seed if self._reads_seeds else [])]
+        return [position, *others, *first, *normals, *each_seed]
+
+    def _first_normals(self) -> list[np.ndarray]:
+        """The stored normals; none where several ranks share the members and make their own."""
+        if self._leader is not None:
+            return [np.empty(0) for _ in range(self._n_noises)]
+        noise = self._make_noise()
+        return [np.zeros(int(size)) for size in noise] if self._moves_noise else noise
 
 
 @dataclass(frozen=True)
@@ -172,6 +193,8 @@ class BoundDensity:
         What it is called with.
     kept : object
         What must live as long as the call.
+    leader : Leader or None
+        If the likelihoods are evaluated by several ranks.
     """
 
     density: Density
@@ -181,6 +204,7 @@ class BoundDensity:
     native: NativeFunction
     inputs: list[np.ndarray]
     kept: Any
+    leader: Leader | None
 
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: ArrayLike
@@ -216,7 +240,8 @@ class BoundDensity:
 
     def raise_error(self) -> None:
         """Evaluate again in Python, to raise what the machine code met."""
-        self.native(*self.inputs)
+        with own_errors(self.leader):
+            self.native(*self.inputs)
 
 
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:

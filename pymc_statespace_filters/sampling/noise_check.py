@@ -48,7 +48,7 @@ def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
 
 
 def at_the_highest_draw(
-    draws: Sequence[Draws], tune: int, measures: Sequence[Measure], keys: Sequence[np.ndarray]
+    draws: Sequence[Draws], tune: int, measure: Measure, keys: Sequence[np.ndarray]
 ) -> tuple[SeedSpread, SamplerWarning | None]:
     """Measure where the density of all chains' draws is highest.
 
@@ -60,8 +60,8 @@ def at_the_highest_draw(
         Of each chain, whole.
     tune : int
         Iterations of warm-up, which are left out.
-    measures : sequence of callable
-        For each chain ``(position, seeds) -> SeedSpread``.
+    measure : callable
+        ``(position, seeds) -> SeedSpread``.
     keys : sequence of ndarray
         Of the chains' randomness.
 
@@ -77,6 +77,6 @@ def at_the_highest_draw(
     shape = N_SEEDS, draws[chain].seeds.shape[1]
     # Of the chain's key, which a checkpoint holds: a resumed run measures the same.
     seeds = draw_seeds(side_generator(keys[chain]), shape)
-    spread = measures[chain](draws[chain].positions[row], seeds)
+    spread = measure(draws[chain].positions[row], seeds)
     message = spread_warning(spread, "at its highest draw", chain)
     return spread, None if message is None else warning(message)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.sampling.chain_arrays import LOG_DENSITY
-from pymc_statespace_filters.sampling.runs import ChainRun, Plan
+from pymc_statespace_filters.sampling.chain_run import ChainRun, Plan
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
+import xarray as xr
 from pymc.backends.arviz import dict_to_dataset
 from pymc.backends.base import IBaseTrace, MultiTrace
 from pymc.model import Model
@@ -49,7 +50,7 @@ class ChainDraws(NamedTuple):
 def to_datatree(
     model: Model,
     held: HeldVariables,
-    chains: Sequence[ChainDraws],
+    chains: list[ChainDraws],
     *,
     tune: int,
     keep_warmup: bool,
@@ -63,9 +64,10 @@ def to_datatree(
     model : pymc.Model
     held : HeldVariables
         All value variables of the model, in the order of the positions.
-    chains : sequence of ChainDraws
-        Warm-up and draws. Where chains were interrupted at different iterations, those are kept,
-        and cut to one length, that give the most draws together.
+    chains : list of ChainDraws
+        Warm-up and draws; they are taken out of the list, so that memory holds them no longer than
+        it must. Where chains were interrupted at different iterations, those are kept, and cut to
+        one length, that give the most draws together.
     tune : int
         Iterations of warm-up, at the beginning of each chain; all of a chain that has no more.
     keep_warmup : bool
@@ -94,26 +96,32 @@ def to_datatree(
             "are warm-up: there is nothing to return"
         )
     kept = [chains[i].between(skipped, skipped + length) for i in longest]
+    chains.clear()
     fixed = [name for name in kept[0].stats if all(_is_fixed(c.stats[name]) for c in kept)]
     quantities = Quantities(model, held)
-    trace = MultiTrace(
-        [
-            _ChainTrace(
-                i, quantities(positions), {k: v for k, v in stats.items() if k not in fixed}
-            )
-            for i, (positions, stats) in enumerate(kept)
-        ]
-    )
-    # There is no public way: PyMC's own driver sets these.
-    report = trace.report
-    report._n_tune = min(tune, skipped + length)
-    report._n_draws = skipped + length - report._n_tune
-    report._t_sampling = sampling_time
-    tree = pm.to_inference_data(trace, model=model, save_warmup=keep_warmup)
-    for name in fixed:
-        _add_fixed(tree, name, np.stack([chain.stats[name][0] for chain in kept]))
+    fixed_stats = {name: np.stack([chain.stats[name][0] for chain in kept]) for name in fixed}
+
+    def tree_of(chain: ChainDraws) -> DataTree:
+        varying = {name: values for name, values in chain.stats.items() if name not in fixed}
+        trace = MultiTrace([_ChainTrace(0, quantities(chain.positions), varying)])
+        # There is no public way: PyMC's own driver sets these.
+        trace.report._n_tune = min(tune, skipped + length)
+        trace.report._n_draws = skipped + length - trace.report._n_tune
+        trace.report._t_sampling = sampling_time
+        return pm.to_inference_data(trace, model=model, save_warmup=keep_warmup)
+
+    # One by one: PyMC's converter takes a multiple of the memory of what it converts.
+    trees = [tree_of(kept.pop(0)) for _ in longest]
+    tree = trees[0]
     for group in SAMPLED.intersection(tree.children):
+        parts = [of_chain[group].to_dataset() for of_chain in trees]
+        for of_chain in trees:
+            del of_chain[group]
+        whole = xr.concat(parts, "chain", combine_attrs="override")
+        tree[group] = DataTree(whole.assign_coords(chain=np.arange(len(parts))))
         tree[group].attrs.update(attrs or {})
+    for name, values in fixed_stats.items():
+        _add_fixed(tree, name, values)
     return tree
 
 

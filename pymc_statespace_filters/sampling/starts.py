@@ -152,5 +152,6 @@ def best_start(
     because = f" ({reason(codes[-1])})" if codes[-1] else ""
     raise ModelError(
         f"the log-density is not finite at the start, {candidates[-1].tolist()} on the "
-        f"unconstrained space{because}{tried}: give a possible starting point in initvals"
+        f"unconstrained space{because}{tried}: give a possible starting point in initvals, or a "
+        "pilot to sample_dram whose chains end at possible points"
     )

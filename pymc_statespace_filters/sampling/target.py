@@ -8,6 +8,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.inspection import exactness, noise_seeds, state_space_names
+from pymc_statespace_filters.parallel import Ranks
 from pymc_statespace_filters.sampling.chain_arrays import Random
 from pymc_statespace_filters.sampling.health import Growth
 from pymc_statespace_filters.sampling.held_variables import (
@@ -15,6 +16,7 @@ from pymc_statespace_filters.sampling.held_variables import (
     check_noise_is_held,
     continuous_value_vars,
 )
+from pymc_statespace_filters.sampling.lockstep import check_group
 from pymc_statespace_filters.sampling.log_density import LogDensity, screening_density
 from pymc_statespace_filters.sampling.randomness import random_block
 from pymc_statespace_filters.sampling.settings import DRAMSettings, checked_proposal_cov
@@ -35,6 +37,8 @@ class Target:
         Passed to PyMC's compiler.
     graph : TensorVariable, optional
         The log-density if it is not the model's own.
+    group : Ranks, optional
+        Ranks that evaluate the noisy likelihoods together, of which this is the first.
 
     Attributes
     ----------
@@ -55,7 +59,7 @@ class Target:
     ------
     ModelError
         If a variable is discrete, there are none, a noisy StateSpace depends on others than
-        ``vars``, or ``proposal_cov`` or the screen does not fit.
+        ``vars``, or ``proposal_cov``, the screen or the group does not fit.
     """
 
     def __init__(
@@ -67,7 +71,11 @@ class Target:
         compile_kwargs: dict | None = None,
         *,
         graph: TensorVariable | None = None,
+        group: Ranks | None = None,
     ):
+        group = None if group is None or group.size == 1 else group
+        if group is not None:
+            check_group(model, settings, group.size)
         self.settings = settings
         variables = continuous_value_vars(vars, model)
         seeds = noise_seeds(model)
@@ -92,6 +100,7 @@ class Target:
             holds_noise=not settings.refresh_noise,
             correlation=settings.correlation,
             graph=graph,
+            group=group,
         )
         self.screen = None
         if settings.screen is not None:

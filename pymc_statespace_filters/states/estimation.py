@@ -6,15 +6,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.likelihood import warn_of
-from pymc_statespace_filters.records import check_random_seed
+from pymc_statespace_filters.records import check_at, check_random_seed, rows_at
 from pymc_statespace_filters.state_graphs import observed_variables
 from pymc_statespace_filters.states.posterior import draws_of
 from pymc_statespace_filters.states.result import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
-
-ROWS_AT = {"observations": lambda steps: steps, "steps": lambda steps: np.arange(steps[-1] + 1)}
 
 
 def filtered_states(
@@ -171,15 +168,14 @@ def _add_states(
     progressbar: bool,
 ) -> xr.DataTree:
     model = pm.modelcontext(model)
-    if at not in list(ROWS_AT):
-        raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
+    check_at(at)
     rng = check_random_seed(random_seed)
     draws = draws_of(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
     for variable in chosen_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
-        rows = ROWS_AT[at](at_draws.steps)
+        rows = rows_at(at, at_draws.steps)
         states = at_draws.states(moment, rows, rng, progressbar=progressbar)
         name, system = variable.name, variable.system
         time, state = variable.dims[0], dims[name]

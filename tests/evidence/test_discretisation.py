@@ -13,8 +13,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.doubts import discretisation, doubts_of_steps
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
-from pymc_statespace_filters.evidence.posterior.draws import unconstrained_draws
 from pymc_statespace_filters.integration_steps import densities_by_steps
+from pymc_statespace_filters.stored_draws import unconstrained_draws
 
 POSITION = {"observation": lambda x: [x[0]]}
 

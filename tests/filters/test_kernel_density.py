@@ -7,27 +7,36 @@ from scipy.stats import multivariate_normal
 
 from pymc_statespace_filters.filters._kernel_density import (
     density_workspace,
+    kernel_workspace,
     log_kernel_density,
     scott_bandwidth,
 )
-from pymc_statespace_filters.filters._random import padded
+from pymc_statespace_filters.filters._share import Share
+from pymc_statespace_filters.filters._sums import own_members, sum_products
+
+ALONE = Share(0, 1, 0)
 
 
-def bandwidth(X, w, free=None, n_effective=None):
-    n = X.shape[0]
+def all_members(n_members, n):
+    return own_members.py_func(ALONE, n_members, n * n)
+
+
+def bandwidth(X, w, free=None):
+    n, N = X.shape
     free = np.arange(n) if free is None else np.array(free)
-    n_effective = 1 / np.sum(w**2) if n_effective is None else n_effective
-    H, active = np.empty((free.size, free.size)), np.empty(free.size, dtype=bool)
-    ok = scott_bandwidth(w, n_effective, X, free, np.empty(n), np.empty((n, n)), H, active)
-    return ok, H, active, free
+    own, kernel = all_members(N, n), kernel_workspace.py_func(n, free.size)
+    kernel.mean[:] = np.where(w > 0, X, 0) @ w
+    sum_products(w, X, kernel.mean, X, kernel.mean, own, 0)
+    ok = scott_bandwidth(own, 0, 1 - w @ w, 1 / (w @ w), free, kernel)
+    return ok, kernel, free
 
 
 def log_density(X, w, V, free=None):
-    ok, H, active, free = bandwidth(X, w, free)
+    ok, kernel, free = bandwidth(X, w, free)
     assert ok
-    out = np.full(w.size, np.nan)
-    work = density_workspace(free.size, padded(w.size))
-    log_kernel_density(w, X, V, free, H, active, work, out)
+    out, own = np.full(w.size, np.nan), all_members(w.size, 1)
+    work = density_workspace(own, free.size)
+    log_kernel_density(own, w, X, V, free, kernel, work, out)
     return out
 
 
@@ -101,16 +110,16 @@ def test_carried_states_are_not_part_of_the_density():
 def test_a_state_known_exactly_is_left_out(constant):
     _, X, w = weighted_particles(2, 90, seed=8)
     with_constant = np.stack([X[0], np.full(90, constant), X[1]])
-    _, _, active, _ = bandwidth(with_constant, w)
-    assert active.tolist() == [True, False, True]
+    _, kernel, _ = bandwidth(with_constant, w)
+    assert kernel.active.tolist() == [True, False, True]
     out = log_density(with_constant, w, with_constant)
     assert out == pytest.approx(oracle(X, w, X), rel=1e-10)
 
 
 def test_a_copy_of_another_state_is_left_out():
     _, X, w = weighted_particles(1, 90, seed=9)
-    _, _, active, _ = bandwidth(np.concatenate([X, -3 * X]), w)
-    assert active.tolist() == [True, False]
+    _, kernel, _ = bandwidth(np.concatenate([X, -3 * X]), w)
+    assert kernel.active.tolist() == [True, False]
 
 
 def test_no_spread_at_all_leaves_a_density_of_one():

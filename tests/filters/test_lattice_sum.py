@@ -9,8 +9,14 @@ from numba import njit
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.filters._kernel_density import density_method
-from pymc_statespace_filters.filters._lattice_sum import FLOOR, lattice_sums, lattice_workspace
+from pymc_statespace_filters.filters._lattice_sum import (
+    FLOOR,
+    lattice_sums,
+    lattice_workspace,
+)
+from pymc_statespace_filters.filters._points import Points
 from pymc_statespace_filters.filters._random import padded
+from pymc_statespace_filters.filters._share import Share
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.filters.laws import OSCILLATOR, run
 from tests.filters.machines import scalar_record
@@ -22,15 +28,20 @@ REACHED = 2e-9  # what the module promises of a pair, and a little for what wind
 
 
 @njit
-def _sums(w, sources, targets, work, out):
-    return lattice_sums(w, sources, targets, sources.shape[0], work, out)
+def _sums(sources, targets, work):
+    share, n_members, n_dims = Share(0, 1, 0), sources.shape[1], sources.shape[0] - 1
+    sources, targets = Points(sources, n_members, True), Points(targets, n_members, True)
+    return lattice_sums(share, sources, targets, n_dims, work)
 
 
 def sums(w, Y, V):
     """The lattice alone: whether it was used, and its sums, in units of the kernel."""
-    out = np.full(w.size, np.nan)
-    work = lattice_workspace(padded(w.size))
-    return _sums(w, Y / np.sqrt(2), V / np.sqrt(2), work, out), out
+    return lattice(w, Y, V, lattice_workspace(1, padded(w.size)))
+
+
+def lattice(w, Y, V, work):
+    sources, targets = np.vstack([w, Y / np.sqrt(2)]), np.vstack([w, V / np.sqrt(2)])
+    return _sums(sources, targets, work), targets[0]
 
 
 def exact(X, w, V, H):
@@ -43,7 +54,7 @@ def exact(X, w, V, H):
 
 
 def errors(X, w, V, check=slice(None)):
-    _, H, _, _ = bandwidth(X, w)
+    H = bandwidth(X, w)[1].H
     return np.abs(np.expm1(log_density(X, w, V)[check] - exact(X, w, V[:, check], H)))
 
 
@@ -95,7 +106,7 @@ def test_any_number_of_particles(n, N):
 @pytest.mark.parametrize("n", [1, 2])
 def test_targets_outside_the_cloud(n, bandwidths):
     _, X, w = cloud(n, 1000)
-    _, H, _, _ = bandwidth(X, w)
+    H = bandwidth(X, w)[1].H
     V = X.copy()
     V[:, ::3] = X.max(axis=1)[:, None] + bandwidths * H.sum(axis=1)[:, None]
     assert errors(X, w, V).max() < REACHED
@@ -140,7 +151,7 @@ def test_dead_members_and_targets(n):
     w /= w.sum()
     dead = X.copy()
     dead[:, 200:300], dead[0, 300:350], dead[0, 350:400] = np.nan, np.inf, -np.inf
-    _, H, _, _ = bandwidth(X, w)
+    H = bandwidth(X, w)[1].H
     out = log_density(dead, w, dead)
     alive = np.isfinite(dead).all(axis=0)
     assert np.all(out[~alive] == -np.inf)
@@ -153,7 +164,7 @@ def test_all_targets_outside_the_cloud(n, bandwidths):
     # A surprising observation of a precise sensor: particles in a small heap, far from the forecast
     rng, X, _ = cloud(n, 1000)
     w = rng.dirichlet(np.full(1000, 0.5))
-    _, H, _, _ = bandwidth(X, w)
+    H = bandwidth(X, w)[1].H
     for spread in (1e-3, 1.0, 10.0):
         V = X.max(axis=1)[:, None] + H @ (bandwidths + spread * rng.standard_normal(X.shape))
         V[0, 5] = np.nan
@@ -177,12 +188,11 @@ def test_a_lattice_that_would_be_too_large_is_refused():
 
 def test_workspace_can_change_from_two_directions_to_one():
     _, X, w = cloud(2, 400)
-    work = lattice_workspace(padded(400))
-    first, second, alone = np.empty(400), np.empty(400), np.empty(400)
-    for Y, out in ((X, first), (X[:1].copy(), second)):
-        assert _sums(w, Y, Y, work, out)
-    assert _sums(w, X[:1].copy(), X[:1].copy(), lattice_workspace(padded(400)), alone)
-    assert np.array_equal(second, alone)
+    work = lattice_workspace(1, padded(400))
+    assert lattice(w, X, X, work)[0]
+    used, second = lattice(w, X[:1], X[:1], work)
+    assert used
+    assert np.array_equal(second, sums(w, X[:1], X[:1])[1])
 
 
 def test_the_method_is_reported():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pymc_statespace_filters.filters._random import RESAMPLING, fill_normals
+from pymc_statespace_filters.filters._random import BLOCK, RESAMPLING, fill_normals, padded
 from pymc_statespace_filters.filters._resampling import (
     POINTS,
     choose_ancestors,
@@ -18,8 +18,13 @@ from pymc_statespace_filters.filters._resampling import (
 
 def ancestors_at(weights, points):
     out = np.full(len(points), -1)
-    choose_ancestors(np.array(weights, dtype=float), np.append(points, np.nan), out)
+    w = np.array(weights, dtype=float)
+    choose_ancestors(w, np.array(points), np.empty(n_blocks(w)), out)
     return out.tolist()
+
+
+def n_blocks(w):
+    return padded(w.size) // BLOCK
 
 
 def normals_of(scheme, n_particles, seed, step):
@@ -32,7 +37,7 @@ def draw(scheme, weights, seed, step=0):
     w = np.array(weights, dtype=float)
     points, out = np.empty(w.size + 1), np.empty(w.size, dtype=np.int64)
     POINTS[scheme](normals_of(scheme, w.size, seed, step), points)
-    choose_ancestors(w, points, out)
+    choose_ancestors(w, points, np.empty(n_blocks(w)), out)
     return out
 
 
@@ -52,6 +57,20 @@ def test_zero_weights_are_never_chosen_not_even_at_the_ends():
     weights = [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]
     points = np.sort(np.concatenate([[0.0, 0.5, 1.0], np.random.default_rng(0).uniform(size=100)]))
     assert set(ancestors_at(weights, points)) == {1, 3}
+
+
+def test_ancestors_are_those_of_exact_sums_in_any_part_of_the_points():
+    """Weights that are multiples of 2^-k, so that no sum is rounded; whole blocks without any."""
+    rng = np.random.default_rng(4)
+    for n in (64, 65, 127, 500, 1000):
+        counts = rng.multinomial(2**20, rng.dirichlet(np.full(n, 0.05)))
+        counts[-70:-3] = 0
+        w = counts / 2.0**20
+        points = np.sort(rng.uniform(size=n))
+        expected = np.searchsorted(np.cumsum(w), points * w.sum(), side="right")
+        for first in (0, n // 3, n - 1):
+            assert ancestors_at(w, points[first:]) == expected[first:].tolist()
+        assert ancestors_at(w, [1.0]) == [np.flatnonzero(w)[-1]]
 
 
 def test_all_weight_on_one_particle():
@@ -118,10 +137,9 @@ def test_systematic_points_share_one_offset_which_is_uniform_over_seeds_and_step
 
 def test_columns_are_copied_from_their_ancestors():
     X = np.arange(12.0).reshape(2, 6)
-    original = X.copy()
-    ancestors = np.array([0, 0, 3, 3, 5, 5])
-    copy_ancestors(ancestors, X, np.empty_like(X))
-    assert np.array_equal(X, original[:, ancestors])
+    ancestors, out = np.array([0, 0, 3, 3, 5, 5]), np.empty_like(X)
+    copy_ancestors(X, ancestors, out)
+    assert np.array_equal(out, X[:, ancestors])
 
 
 def test_on_a_walk_in_order_ancestors_are_those_of_the_sorted_particles():
@@ -130,7 +148,7 @@ def test_on_a_walk_in_order_ancestors_are_those_of_the_sorted_particles():
     order = np.argsort(x)
     points, out = np.empty(41), np.empty(40, dtype=np.int64)
     systematic(normals_of("sorted", 40, 5, 0), points)
-    choose_in_order(w, order, points, np.empty(40), out)
+    choose_in_order(w, order, points, np.empty(40), np.empty(1), out)
     cumulative = np.cumsum(w[order])
     expected = order[np.searchsorted(cumulative, points[:40] * cumulative[-1], side="right")]
     assert np.array_equal(out, expected)

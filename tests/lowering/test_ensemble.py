@@ -77,8 +77,8 @@ def test_members_move_and_are_seen_as_written(machine_of):
     np.testing.assert_allclose(out, stats.norm(seen[1], np.sqrt(0.3)).logpdf(-0.4), rtol=1e-12)
 
 
-def test_general_noise_has_the_covariance_d_gamma_d(machine_of):
-    machine = machine_of(pendulum(True))
+def test_general_noise_has_the_covariance_d_gamma_d():
+    machine = ensemble_machine(pendulum(True))
     c, X, r = machine.prepare(THETA), states(), THETA[2]
     out, d = np.empty(N), np.array([0.2, -0.4])
     machine.log_density(c, INPUTS, 0, 0.0, d, X, out)

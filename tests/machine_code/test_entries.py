@@ -1,10 +1,6 @@
-"""Entries: called by name and by address, compiled once, found again by another process."""
+"""Entries: called by name and by address, and compiled once."""
 
-import os
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 from types import FunctionType
 
 import numpy as np
@@ -21,8 +17,6 @@ from pymc_statespace_filters.machine_code import (
     kept,
 )
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
-
-ROOT = Path(__file__).parents[2]
 
 
 def scale(x, n, factor):
@@ -104,31 +98,6 @@ def test_the_point_mass_filter_is_compiled_once_for_all_systems_and_tolerances()
     new = set(entries._compiled) - before
     assert new
     assert not any("point_mass" in symbol for symbol in new)
-
-
-PROCESS = """
-import pymc_statespace_filters as psf
-from pymc_statespace_filters.machine_code import entries
-from tests.small_systems import FORCE, FORCED_DATA, FORCED, STEPS
-value = psf.log_likelihood(
-    FORCED, psf.EnKF(10), {"a": 0.6}, FORCED_DATA, steps=STEPS, inputs=FORCE
-)
-print(value.sum(), sum(c.cache_hits for c in entries._compiled.values()), len(entries._compiled))
-"""
-
-
-def test_a_second_process_compiles_nothing(tmp_path):
-    def answer():
-        run = [sys.executable, "-W", "ignore", "-c", PROCESS]
-        out = subprocess.run(
-            run, capture_output=True, text=True, check=True, env=environment, cwd=ROOT
-        )
-        return out.stdout.split()
-
-    environment = os.environ | {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path}"}
-    value, hits, compiled = answer()
-    assert (hits, int(compiled) > 5) == ("0", True)
-    assert answer() == [value, compiled, compiled]
 
 
 def test_code_is_kept_for_its_module():

@@ -24,11 +24,11 @@ import pymc as pm
 import pytensor
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.chain_run import ChainRun, Plan
+from pymc_statespace_filters.sampling.chain_starts import chain_starts
 from pymc_statespace_filters.sampling.log_density import screening_density
 from pymc_statespace_filters.sampling.quantities import Quantities
 from pymc_statespace_filters.sampling.randomness import BLOCK
-from pymc_statespace_filters.sampling.runs import ChainRun, Plan
-from pymc_statespace_filters.sampling.sample import _starts
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
 from tests.sampling.autoregression import autoregression
@@ -124,7 +124,7 @@ class Replications:
         self._target = Target(self.model, None, settings, graph=graph)
         self._quantities = Quantities(self.model, self._target.held)
         seeds = [np.random.SeedSequence(0)]  # of a start that is not random
-        (self._candidates,) = _starts(self._target, self.model, None, seeds, disperse=True)
+        (self._candidates,) = chain_starts(self.model, self._target, None, seeds, disperse=True)
         # Machine code runs in threads; what PyTensor has compiled is called by one at a time.
         self._lock = Lock()
 

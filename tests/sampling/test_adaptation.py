@@ -15,7 +15,7 @@ from pymc_statespace_filters.sampling.adaptation_state import (
     start_adaptation,
     unpack,
 )
-from pymc_statespace_filters.sampling.runs import ChainRun, Plan
+from pymc_statespace_filters.sampling.chain_run import ChainRun, Plan
 from pymc_statespace_filters.sampling.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target import Target
 

@@ -145,15 +145,6 @@ def test_same_seed_same_draws_in_sequence_and_in_processes():
     )
 
 
-def test_pickled_into_fresh_processes():
-    """Under spawn; `test_state_space` does the same under forkserver."""
-    with simple_model():
-        step = DRAM()
-        one = sample(step, draws=50, tune=100)
-        two = sample(step, draws=50, tune=100, cores=2, mp_ctx="spawn")
-    np.testing.assert_array_equal(one["posterior"]["mu"], two["posterior"]["mu"])
-
-
 def test_a_stored_state_goes_on_draw_for_draw():
     with simple_model() as model:
         step, twin = DRAM(), DRAM()

@@ -101,7 +101,7 @@ def assert_same(found, expected):
 def test_equals_the_tree_of_pm_sample(sampled):
     model, expected, chains = sampled
     found = to_datatree(
-        model, held_of(model), chains, tune=TUNE, keep_warmup=True, sampling_time=1.5
+        model, held_of(model), [*chains], tune=TUNE, keep_warmup=True, sampling_time=1.5
     )
     assert_same(found, expected)
     assert {"posterior", "warmup_posterior", "constant_data"} < set(found.children)
@@ -115,7 +115,7 @@ def test_warmup_is_left_out_on_request(sampled):
     found = to_datatree(
         model,
         held_of(model),
-        chains,
+        [*chains],
         tune=TUNE,
         keep_warmup=False,
         sampling_time=1.5,
@@ -166,7 +166,7 @@ def some_chains(*lengths, dim=2, **stats):
 def test_interrupted_chains(lengths, keep_warmup, chosen, warmup, draws):
     model, chains = normal_model(), some_chains(*lengths)
     tree = to_datatree(
-        model, held_of(model), chains, tune=20, keep_warmup=keep_warmup, sampling_time=1.0
+        model, held_of(model), [*chains], tune=20, keep_warmup=keep_warmup, sampling_time=1.0
     )
     begin = 0 if keep_warmup else 20
     for group, n, start in (("warmup_", warmup, begin), ("", draws, begin + warmup)):
@@ -319,7 +319,7 @@ def state_space():
     logp = model.compile_logp()
     chains = [ChainDraws(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
     tree = to_datatree(
-        model, held_of(model), chains, tune=100, keep_warmup=False, sampling_time=1.0
+        model, held_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
     )
     return model, tree
 

@@ -198,7 +198,8 @@ def test_stored_estimates_are_those_of_their_seeds(noisy):
     [
         ({"draws": -1}, ModelError, r"draws=-1: expected an integer, at least 0"),
         ({"tune": 1.5}, ModelError, r"tune=1\.5"),
-        ({"draws": 0}, ModelError, r"after 200, 200 iterations.*nothing to return"),
+        ({"draws": 0}, ModelError, r"draws=0, tune=200, discard_tuned_samples=True: nothing"),
+        ({"draws": 0, "tune": 0, "discard_tuned_samples": False}, ModelError, r"draws=0, tune=0"),
         ({"chains": 0}, ModelError, r"chains=0: expected an integer, at least 1"),
         ({"cores": 0}, ModelError, r"cores=0: expected an integer, at least 1, or None"),
         ({"random_seed": -1}, ModelError, r"random_seed=-1"),
@@ -385,12 +386,22 @@ def test_an_interrupt_returns_what_is_there(seconds, tune, presses):
     assert sizes.get("warmup_posterior", {"draw": 0})["draw"] == tune
 
 
+@pytest.mark.parametrize("asked", [True, False])
+def test_convergence_is_judged_if_it_is_asked_for(asked, caplog):
+    """What the chains have met is said in any case."""
+    caplog.set_level("INFO", LOGGER)
+    still = {"draws": 99, "tune": 0, "proposal_cov": 1e12 * np.eye(2)}
+    sample_dram(simple_model(), compute_convergence_checks=asked, **still)
+    assert ("too small to check convergence" in caplog.text) == asked
+    assert caplog.text.count("accepted 0 of") == 2
+
+
 @pytest.mark.parametrize("last", ["at_the_highest_draw", "run_convergence_checks"])
 def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
     expected = sample_dram(noisy, draws=300, tune=300)
-    monkeypatch.setattr(f"pymc_statespace_filters.sampling.sample.{last}", interrupted)
+    monkeypatch.setattr(f"pymc_statespace_filters.sampling.model_run.{last}", interrupted)
     found = sample_dram(noisy, draws=300, tune=300)
     assert found["posterior"].equals(expected["posterior"])

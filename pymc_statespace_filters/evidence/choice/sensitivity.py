@@ -26,7 +26,7 @@ from pymc_statespace_filters.evidence.choice.stretched_prior import (
     Reweighted,
     StretchedPrior,
 )
-from pymc_statespace_filters.evidence.posterior import unconstrained_draws
+from pymc_statespace_filters.stored_draws import unconstrained_draws
 
 EXPONENTS = np.linspace(0, 4, 41)
 WIDTHS = np.geomspace(0.25, 4, 17)

@@ -1,12 +1,7 @@
 """The posterior and the prior of a model as numbers: what estimators integrate."""
 
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity, RowFunction
-from pymc_statespace_filters.evidence.posterior.draws import (
-    Posterior,
-    Prior,
-    posterior_of,
-    unconstrained_draws,
-)
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, Prior, posterior_of
 
 __all__ = [
     "ModelDensity",
@@ -14,5 +9,4 @@ __all__ = [
     "Prior",
     "RowFunction",
     "posterior_of",
-    "unconstrained_draws",
 ]

@@ -203,8 +203,8 @@ def _noise(system: StateSpaceModel) -> Compiled:
     def noise(theta, n_steps, draw_seed):
         width = BLOCK * (n_steps // BLOCK + 1)  # a column for each step, and some to spare
         X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
-        fill(draw_seed, purpose, _AT_START, X.ctypes.data, n, BLOCK)
-        fill(draw_seed, purpose, _ALONG, Z.ctypes.data, n_rows, width)
+        fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
+        fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
         values = covariances(theta)
         colour(values, 0, n, X)
         if not is_white:

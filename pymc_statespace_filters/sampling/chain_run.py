@@ -1,14 +1,12 @@
-"""All chains of a run, in threads: who goes on when, what is shown, what is kept on disk.
+"""A chain from its start to its end, in a thread of its own, and what is kept of it on disk.
 
-A chain's thread is in machine code nearly all the time and holds no interpreter lock. It comes back
-to Python for the next block of random numbers, and where the main thread has asked for a pause: to
+The thread is in machine code nearly all the time and holds no interpreter lock. It comes back to
+Python for the next block of random numbers, and where the main thread has asked for a pause: to
 write a checkpoint, or to stop.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import suppress
 from threading import Event
 from typing import NamedTuple
 
@@ -22,16 +20,14 @@ from pymc_statespace_filters.sampling.chain_arrays import (
     PAUSE,
     SCALING,
     STAGE,
+    Draws,
     Random,
 )
 from pymc_statespace_filters.sampling.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.progress import watch
 from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key, draw_seeds
 from pymc_statespace_filters.sampling.running import Halted, RunningChain
-from pymc_statespace_filters.sampling.seed_spread import SeedSpread
 from pymc_statespace_filters.sampling.target import Target
 
-_REFRESH_SECONDS = 0.1
 CHECKPOINT_SECONDS = 5.0
 
 
@@ -64,6 +60,28 @@ class Plan(NamedTuple):
         return self.tune + self.draws
 
 
+class ChainResult(NamedTuple):
+    """What is left of a chain at its end.
+
+    Attributes
+    ----------
+    draws : Draws
+        Of ``done`` iterations.
+    done : int
+        Fewer than were planned after an interruption.
+    key : ndarray of uint64, shape (2,)
+    proposal_cov : ndarray, shape (d, d)
+        Of the first stage, as it was last.
+    seconds : float
+    """
+
+    draws: Draws
+    done: int
+    key: np.ndarray
+    proposal_cov: np.ndarray
+    seconds: float
+
+
 class ChainRun:
     """One chain from its start, or from its checkpoint, to its end.
 
@@ -75,6 +93,8 @@ class ChainRun:
     index : int
         Which chain.
     checkpoint : Checkpoint, optional
+    name : str, optional
+        For messages.
 
     Attributes
     ----------
@@ -85,8 +105,16 @@ class ChainRun:
         How long it took from start to end; 0 if a checkpoint had begun it.
     """
 
-    def __init__(self, target: Target, plan: Plan, index: int, checkpoint: Checkpoint | None):
+    def __init__(
+        self,
+        target: Target,
+        plan: Plan,
+        index: int,
+        checkpoint: Checkpoint | None,
+        name: str | None = None,
+    ):
         self._target, self._plan, self._index = target, plan, index
+        self._name = name or f"chain {index}"
         n_covs = plan.tune if plan.keeps_warmup else 0
         self.running = RunningChain(target, plan.n_iterations, n_covs)
         self._rng = np.random.default_rng(plan.seeds[index])
@@ -131,13 +159,18 @@ class ChainRun:
         except Halted:
             return
         except Exception as error:
-            error.add_note(f"in chain {self._index}, after {self.done} iterations")
+            error.add_note(f"in {self._name}, after {self.done} iterations")
             raise
 
-    def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
-        """Measure the scatter of the estimates at a point, once the chain has ended."""
-        self.running.talk[PAUSE] = 0
-        return self.running.seed_spread(position, seeds)
+    def result(self) -> ChainResult:
+        """What is left of the chain; its machine code goes."""
+        done = self.done
+        cut = {
+            name: array if name == "covs" else array[:done]
+            for name, array in self.running.draws._asdict().items()
+        }
+        cov = self.running.proposal_cov.copy()
+        return ChainResult(Draws(**cut), done, self.key, cov, self.seconds)
 
     def progress(self) -> dict[str, float]:
         """What a progress bar shows of the iterations made so far, one at least."""
@@ -189,80 +222,3 @@ class ChainRun:
             self._log.append(draws, state | {"key": self.key})
             self._n_saved = self.done
         self._saved_at = time.monotonic()
-
-
-def run_chains(
-    target: Target,
-    plan: Plan,
-    *,
-    cores: int,
-    checkpoint: Checkpoint | None,
-    progressbar: bool | str,
-) -> list[ChainRun]:
-    """Run all chains to their end, or until the user interrupts.
-
-    Parameters
-    ----------
-    target : Target
-        Prepared.
-    plan : Plan
-    cores : int
-        Threads.
-    checkpoint : Checkpoint or None
-    progressbar : bool or str
-        As in ``pm.sample``.
-
-    Returns
-    -------
-    list of ChainRun
-        After an interruption (Ctrl-C) some have made fewer iterations, or none.
-
-    Raises
-    ------
-    Exception
-        What the model raised, with a note that names the chain. The other chains are stopped.
-    """
-    runs = [ChainRun(target, plan, i, checkpoint) for i in range(len(plan.seeds))]
-    stop = Event()
-    bars = watch(len(runs), plan.draws, plan.tune, progressbar)
-    with bars, ThreadPoolExecutor(cores) as pool:
-        futures = [pool.submit(run.run, stop) for run in runs]
-        try:
-            with suppress(KeyboardInterrupt):
-                _watch(runs, futures, bars, stop)
-        finally:
-            _halt(runs, futures, stop)
-    for future in futures:
-        if not future.cancelled():
-            future.result()
-    return runs
-
-
-def _watch(runs: Sequence[ChainRun], futures: Sequence[Future], bars: watch, stop: Event) -> None:
-    """Show how the chains go on and ask for pauses, until all have ended or one has raised."""
-    waiting = set(range(len(runs)))
-    pending = set(futures)
-    while pending:
-        ended, pending = wait(pending, timeout=_REFRESH_SECONDS, return_when=FIRST_EXCEPTION)
-        for future in ended:
-            future.result()
-        for i, (run, future) in enumerate(zip(runs, futures, strict=True)):
-            run.ask_for_pause(stop)
-            if i in waiting and (future.running() or future.done()):
-                waiting.remove(i)
-                bars.begin(i)
-            if run.done > 0:
-                bars.update(i, run.done, run.progress(), run.seconds)
-
-
-def _halt(runs: Sequence[ChainRun], futures: Sequence[Future], stop: Event) -> None:
-    """Bring all chains to a halt, however often the user interrupts meanwhile."""
-    stop.set()
-    for future in futures:
-        future.cancel()
-    running = {future for future in futures if not future.cancelled()}
-    while running:
-        with suppress(KeyboardInterrupt):
-            for run in runs:
-                run.ask_for_pause(stop)
-            _, running = wait(running, timeout=_REFRESH_SECONDS)

@@ -1,0 +1,62 @@
+"""What an exchange between two ranks of one machine costs: run by two ranks.
+
+From machine code, by way of the callback, as a filter does it; and the bare call of mpi4py, with
+the other rank and alone, whose difference is one message.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks.mpi.watched import many_exchanges
+from pymc_statespace_filters.filters._share import Share
+from pymc_statespace_filters.parallel import ranks_of
+
+ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as the filters have them
+ROUNDS = 300  # short ones: some meet a moment without neighbours
+
+
+def seconds(work: Callable[[int], object], n: int) -> float:
+    """Seconds of one of n, in the quickest of some rounds: neighbours only make it slower."""
+    rounds = []
+    for _ in range(ROUNDS):
+        MPI.COMM_WORLD.Barrier()
+        start = time.perf_counter()
+        work(n)
+        rounds.append((time.perf_counter() - start) / n)
+    return min(rounds)
+
+
+def bare(comm: MPI.Comm, array: np.ndarray) -> Callable[[int], None]:
+    counts = [array.size // comm.size] * comm.size
+
+    def work(n: int) -> None:
+        for _ in range(n):
+            comm.Allgatherv(MPI.IN_PLACE, [array, (counts, None), MPI.DOUBLE])
+
+    return work
+
+
+def main(target: str) -> None:
+    ranks = ranks_of("world")
+    share = Share(ranks.rank, ranks.size, ranks.exchange)
+    many_exchanges(share, np.zeros((ROWS, 2)), 1)
+    found = {"n_bytes": [8 * ROWS * columns for columns in COLUMNS], "callback": []}
+    for columns in COLUMNS:
+        array = np.zeros((ROWS, columns))
+        n = max(2, min(50, 100_000 // columns))
+        found["callback"].append(seconds(lambda n, a=array: many_exchanges(share, a, n), n))
+    small = np.zeros(2)
+    found["bare"] = seconds(bare(MPI.COMM_WORLD, small), 50)
+    found["alone"] = seconds(bare(MPI.COMM_SELF, small), 50)
+    if ranks.rank == 0:
+        Path(target).write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

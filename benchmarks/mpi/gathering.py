@@ -1,0 +1,89 @@
+"""Draws on their way to rank 0: seconds, and memory there. Run by two ranks, and by one.
+
+Four chains of 100,000 draws of five parameters, of a density that costs next to nothing.
+"""
+
+import json
+import logging
+import sys
+import time
+from pathlib import Path
+from statistics import median
+
+import pymc as pm
+from mpi4py import MPI
+from xarray import DataTree
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.parallel import Ranks
+
+CHAINS, DRAWS, N = 4, 100_000, 5
+ROUNDS = 5
+MEGABYTE = 2**20
+
+
+class Clock:
+    """Seconds that a rank spends in some methods of `Ranks`."""
+
+    def __init__(self, names: tuple[str, ...]):
+        self.seconds = 0.0
+        for name in names:
+            setattr(Ranks, name, self.around(getattr(Ranks, name)))
+
+    def around(self, method):
+        def timed(*arguments):
+            start = time.perf_counter()
+            try:
+                return method(*arguments)
+            finally:
+                self.seconds += time.perf_counter() - start
+
+        return timed
+
+
+def memory(what: str) -> float:
+    """VmRSS, or VmHWM, its peak since it was last forgotten, in megabytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(what)) / 1024
+
+
+def forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def size(tree: DataTree) -> float:
+    return sum(node.to_dataset().nbytes for node in tree.subtree) / MEGABYTE
+
+
+def main(target: str) -> None:
+    logging.getLogger("pymc").setLevel(logging.CRITICAL)  # of far too short chains
+    clock = Clock(("receive", "receive_arrays"))
+    with pm.Model() as model:
+        pm.Normal("x", 0, 1, shape=N)
+
+    def sample(draws: int):
+        start = time.perf_counter()
+        clock.seconds = 0.0
+        settings = {"tune": 200, "chains": CHAINS, "cores": 1, "random_seed": 1, "model": model}
+        idata = psf.sample_dram(draws, comm="world", progressbar=False, **settings)
+        return idata, time.perf_counter() - start
+
+    sample(10)
+    found: dict[str, list[float]] = {"received": [], "wall": []}
+    for i in range(ROUNDS):
+        MPI.COMM_WORLD.Barrier()
+        baseline = memory("VmRSS")
+        forget_peak()
+        idata, wall = sample(DRAWS)
+        if idata is not None:
+            found["wall"].append(wall)
+            found["received"].append(clock.seconds)
+            if i == 0:  # later ones find memory that this one has given back to Python alone
+                found |= {"peak": [memory("VmHWM") - baseline], "result": [size(idata)]}
+    if MPI.COMM_WORLD.rank == 0:
+        Path(target).write_text(json.dumps(found))
+        print({name: median(values) for name, values in found.items()}, flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

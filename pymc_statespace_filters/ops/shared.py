@@ -1,0 +1,28 @@
+"""The log-likelihood of a record by a filter whose members belong to several ranks."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.record import RECORD_INPUTS
+
+
+class SharedLogLikelihood(LogLikelihood):
+    """`LogLikelihood` of a noisy filter, called by all ranks at once; the same numbers on each.
+
+    Three inputs more: ``rank``, ``n_ranks``, and the address of their ``exchange``.
+    """
+
+    input_types = (
+        *RECORD_INPUTS,
+        ("rank", "int64", 0),
+        ("n_ranks", "int64", 0),
+        ("exchange", "int64", 0),
+    )
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
+    handed_as: ClassVar[Mapping[str, str]] = {}
+
+    def compile(self) -> Compiled:
+        """The filter's machine code for one rank's share."""
+        return self.filter.compile_shared(self.system)  # type: ignore[union-attr]

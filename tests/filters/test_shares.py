@@ -1,0 +1,240 @@
+"""Filters over ranks: the same bits for any number of ranks, and sums that are the exact ones."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.filters import BootstrapPF, EnKF
+from pymc_statespace_filters.filters._compile import compiled
+from pymc_statespace_filters.filters._random import INITIAL, PROCESS, fill_normals
+from pymc_statespace_filters.filters._resampling import SCHEMES
+from pymc_statespace_filters.filters._share import BLOCKS, MEMBERS, Share, part
+from pymc_statespace_filters.filters._sums import (
+    exchange,
+    own_members,
+    sum_members,
+    sum_products,
+    sum_spread,
+    sum_values,
+    total,
+)
+from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.likelihood import check_ranks, shared_evaluator
+from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
+from tests.ranks import on_ranks
+from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
+
+NUMBERS = (1, 2, 3, 4)
+N = 300  # members: four whole blocks, and a part of one
+EVERY_SCHEME = [
+    BootstrapPF(N, resample_below=0),
+    BootstrapPF(N, resample_below=1 / 3),
+    *(BootstrapPF(N, resampling=s, resample_below=1) for s in SCHEMES),
+]
+EVERY_FILTER = [EnKF(N), EnKF(N, likelihood="gaussian"), *EVERY_SCHEME]
+IN_THE_WELL = [EnKF(N), EnKF(N, likelihood="gaussian"), BootstrapPF(N)]
+_shared = {}
+
+
+def shared_kernel(filter_, machine):
+    """Compiled once for all tests of this file."""
+    key = filter_, id(machine)
+    if key not in _shared:
+        _shared[key] = filter_.shared_kernel(machine), machine
+    return _shared[key][0]
+
+
+def evaluations(filter_, machine, steps, observed, theta=(1.0,), seed=3, numbers=NUMBERS):
+    """Terms and health on every rank, for several numbers of ranks."""
+    run = shared_kernel(filter_, machine)
+    record = (
+        np.array(theta, dtype=float),
+        np.asarray(steps, dtype=np.int64),
+        np.asarray(observed, dtype=float),
+        np.zeros((0, 0)),
+        0.0,
+        seed,
+    )
+    for n in numbers:
+        yield from on_ranks(n, lambda ours: run(*record, ours.rank, ours.size, ours.exchange))
+
+
+def assert_all_the_same(results):
+    results = list(results)
+    for terms, health in results[1:]:
+        assert np.array_equal(terms, results[0][0])
+        assert np.array_equal(health, results[0][1])
+    return results[0]
+
+
+# ---- the division
+
+
+@pytest.mark.parametrize("per_block", [MEMBERS, BLOCKS])
+@pytest.mark.parametrize("n", [1, 63, 64, 65, 128, 1000, 1250])
+def test_every_column_belongs_to_one_rank_and_ranks_to_whole_blocks(n, per_block):
+    n_blocks = -(-n // per_block)
+    for size in {1, 2, 3, 7, n_blocks} & set(range(1, n_blocks + 1)):
+        ends = [part.py_func(Share(rank, size, 0), n, per_block) for rank in range(size)]
+        assert ends[0][0] == 0
+        assert ends[-1][1] == n
+        assert all(before[1] == after[0] for before, after in pairwise(ends))
+        lengths = [last - first for first, last in ends]
+        assert min(lengths) > 0
+        assert max(lengths) < min(lengths[:-1] or lengths) + 2 * per_block
+        assert all(first % per_block == 0 for first, _ in ends)
+
+
+def test_normals_of_a_part_are_those_of_the_whole():
+    whole, few = np.empty((2, 256)), np.empty((2, 128))
+    fill_normals(5, PROCESS, 7, whole)
+    fill_normals(5, PROCESS, 7, few, 1)
+    assert np.array_equal(few, whole[:, 64:192])
+
+
+# ---- sums
+
+
+@compiled
+def all_sums(rank, n_ranks, address, w, X, log_w):
+    """Sums of our part of w, X and log_w, by way of the ranks' exchange."""
+    own = own_members(Share(rank, n_ranks, address), w.size, 12)
+    mine = slice(own.first, own.first + own.size)
+    v, Y, out, log_v = w[mine].copy(), X[:, mine].copy(), np.empty(9), log_w[mine].copy()
+    relative, zeros = np.empty(v.size), np.zeros(2)
+    sum_values(v, own, 0)
+    sum_spread(v, own, 1)
+    sum_members(v, Y, own, 2)
+    sum_products(v, Y, zeros, Y[:1], zeros, own, 4)
+    weigh(log_v, relative, own, 6)
+    exchange(own, 9)
+    for row in range(6):
+        out[row] = total(own, row)
+    out[6], out[7] = total_weight(own, 6)
+    normalise_own(out[6], log_v, relative, own, 6)
+    sum_values(relative, own, 0)
+    exchange(own, 1)
+    out[8] = total(own, 0)
+    return out
+
+
+@pytest.mark.parametrize("n", [250, 256, 331])
+def test_sums_are_those_of_exact_arithmetic_and_the_same_on_any_number_of_ranks(n):
+    rng = np.random.default_rng(n)
+    w, X = rng.uniform(size=n) / n, rng.standard_normal((2, n))
+    w[70:140] = 0.0
+    X[:, 75] = np.nan
+    log_w = 300 * rng.standard_normal(n)  # some blocks weigh nothing beside others
+    log_w[:64], log_w[200], log_w[201] = -np.inf, np.nan, np.inf
+    sums = [
+        out
+        for size in NUMBERS
+        for out in on_ranks(
+            size, lambda ours: all_sums(ours.rank, ours.size, ours.exchange, w, X, log_w)
+        )
+    ]
+    assert all(np.array_equal(other, sums[0]) for other in sums)
+    alive = w > 0
+    v, Y = w[alive], X[:, alive]
+    exact = [math.fsum(v), math.fsum(v * (1 - v)), *(math.fsum(v * y) for y in Y)]
+    exact += [math.fsum(v * y * Y[0]) for y in Y]
+    assert sums[0][:6] == pytest.approx(exact, rel=1e-13, abs=1e-15)
+    finite = log_w[np.isfinite(log_w)]
+    share = np.exp(finite - finite.max())
+    assert sums[0][6] == pytest.approx(finite.max() + math.log(math.fsum(share)), rel=1e-14)
+    assert sums[0][7] == pytest.approx(math.fsum(share) ** 2 / math.fsum(share**2), rel=1e-13)
+    assert sums[0][8] == pytest.approx(1, rel=1e-13)
+
+
+# ---- whole filters
+
+
+@pytest.mark.parametrize("filter_", EVERY_FILTER, ids=str)
+def test_two_states_with_missing_rows_and_components(filter_):
+    terms, health = assert_all_the_same(evaluations(filter_, *OSCILLATOR))
+    assert np.all(np.isfinite(terms))
+    assert 1 < health[0] <= N
+
+
+def test_one_seed_is_not_another():
+    a, b = (next(evaluations(EnKF(N), *OSCILLATOR, seed=s, numbers=(2,)))[0] for s in (3, 4))
+    assert not np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("filter_", IN_THE_WELL, ids=str)
+def test_ranks_of_whose_members_none_is_alive(filter_):
+    """A few members begin between the cliffs, none of them in the first two blocks of five."""
+
+    def survivors(seed):
+        return np.flatnonzero(np.abs(300 * normals(seed, INITIAL, 0, (1, N))[0]) < 4)
+
+    seed = next(s for s in range(1000) if survivors(s).size > 3 and survivors(s)[0] >= 128)
+    steps, observed = well_record()
+    record = WELL, steps + 10, observed, (4.0, -4.0, 0.0, 300.0)
+    terms, health = assert_all_the_same(evaluations(filter_, *record, seed=seed))
+    assert np.all(np.isfinite(terms))
+    assert health[0] < 20
+
+
+@pytest.mark.parametrize("filter_", IN_THE_WELL, ids=str)
+@pytest.mark.parametrize(
+    ("theta", "outlier", "code"),
+    [(LOST_START, 1000.0, 1), ((4.0, -4.0, 1.0, 0.7), 1e200, 3)],
+)
+def test_failures_of_all_members(filter_, theta, outlier, code):
+    """Whether none is finite, or all weights are zero: every rank gives up at the same place."""
+    steps, observed = well_record()
+    observed[2] = outlier
+    terms, health = assert_all_the_same(evaluations(filter_, WELL, steps + 1, observed, theta))
+    assert health[1] == code
+    assert np.all(terms[int(health[2]) :] == -np.inf)
+
+
+@pytest.mark.parametrize("filter_", [EnKF(200), BootstrapPF(200, resample_below=1)], ids=str)
+def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filter_):
+    record = np.array([0.9]), STEPS, FORCED_DATA[:, None], FORCE[:, None], 0.0, 5
+    results = [
+        result
+        for size in (1, 2, 3)
+        for result in on_ranks(size, lambda ours: shared_evaluator(FORCED, filter_, ours)(*record))
+    ]
+    terms, _ = assert_all_the_same(results)
+    alone = psf.log_likelihood(
+        FORCED, filter_, {"a": 0.9}, FORCED_DATA, steps=STEPS, inputs=FORCE, seed=5
+    )
+    assert np.array_equal(terms, alone)
+
+
+def test_a_likelihood_has_few_exchanges():
+    """They cost more than the sums: two an update, one in a particle filter, one to resample."""
+    for filter_, each in ((EnKF(N), 2), (BootstrapPF(N, resample_below=1), 2)):
+        machine, steps, observed = OSCILLATOR
+        run = shared_kernel(filter_, machine)
+        arguments = np.ones(1), steps, observed, np.zeros((0, 0)), 0.0, 3
+
+        def count(ours, run=run, arguments=arguments):
+            run(*arguments, ours.rank, ours.size, ours.exchange)
+            return len(ours.exchanged)
+
+        n_updates = np.sum(~np.isnan(observed).all(axis=1))
+        assert on_ranks(2, count) == [each * n_updates] * 2
+
+
+# ---- refusals
+
+
+def test_a_filter_without_members_has_nothing_to_spread():
+    for filter_ in (psf.EKF(), psf.GridFilter()):
+        check_ranks(filter_, 1)
+        with pytest.raises(psf.ModelError, match=r"has no members to spread over 2 ranks"):
+            check_ranks(filter_, 2)
+
+
+def test_more_ranks_than_blocks_of_members():
+    check_ranks(EnKF(192), 3)
+    for n_members in (192, 255):  # a part of a block is no block
+        with pytest.raises(psf.ModelError, match=r"has members for 3 of 4 ranks alone"):
+            check_ranks(EnKF(n_members), 4)

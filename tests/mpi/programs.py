@@ -1,0 +1,92 @@
+"""What users' scripts do, and what may befall them: each function is one, by its name."""
+
+import os
+import pickle
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pymc as pm
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling import chain_run
+from tests.sampling.test_sample_dram import state_space_model
+
+CHAINS = 3
+
+
+class Fragile(Op):
+    """Zero, in Python; an error at the hundredth value above four."""
+
+    __props__ = ()
+    evaluations: ClassVar[list[float]] = []
+
+    def make_node(self, mu):
+        return Apply(self, [mu], [mu.type()])
+
+    def perform(self, node, inputs, output_storage):
+        (mu,) = inputs
+        time.sleep(0.001)
+        if mu > 4:
+            self.evaluations.append(mu)
+        if mu > 4 and len(self.evaluations) >= 100:
+            os.write(2, b"raised at %f\n" % time.time())
+            raise ArithmeticError("no more")
+        output_storage[0][0] = np.zeros_like(inputs[0])
+
+
+def failing(chain: str) -> None:
+    """A model that raises in one chain, in the midst of it."""
+    with pm.Model() as model:
+        pm.Potential("fragile", Fragile()(pm.Normal("mu", sigma=100)))
+    psf.sample_dram(
+        10**6,
+        tune=0,
+        chains=CHAINS,
+        cores=2,
+        model=model,
+        initvals=[{"mu": 7.0 if i == int(chain) else 0.0} for i in range(CHAINS)],
+        proposal_cov=[[1e-9]],
+        progressbar=False,
+        comm="world",
+    )
+
+
+def resumed(**settings):
+    """A run that is long enough to be ended in its midst."""
+    return psf.sample_dram(
+        6000,
+        tune=3000,
+        chains=CHAINS,
+        cores=1,
+        model=state_space_model(psf.BootstrapPF(20)),
+        random_seed=1,
+        progressbar=False,
+        **settings,
+    )
+
+
+def long_run(folder: str, seconds: str = "0") -> None:
+    """Store it often, and after every block of iterations wait for so long to be killed."""
+    made = chain_run.ChainRun._advance
+
+    def advance(self):
+        made(self)
+        time.sleep(float(seconds))
+
+    chain_run.ChainRun._advance = advance
+    chain_run.CHECKPOINT_SECONDS = 0.02
+    tree = resumed(checkpoint=Path(folder, "run"), comm="world")
+    if tree is not None:
+        draws = {name: tree["posterior"][name].values for name in tree["posterior"].data_vars}
+        Path(folder, "draws").write_bytes(pickle.dumps(draws))
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")  # of object mode
+    globals()[sys.argv[1]](*sys.argv[2:])

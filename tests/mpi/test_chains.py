@@ -1,0 +1,50 @@
+"""Chains of several models over two and four ranks: the draws of a process without MPI."""
+
+import numpy as np
+
+import pymc_statespace_filters as psf
+from tests.mpi.launch import on_ranks
+from tests.sampling.test_sample_dram import state_space_model
+
+FILTERS = {"exact": [psf.EKF()], "noisy": [psf.BootstrapPF(20), psf.EKF()]}
+
+
+def draws_of_all(**settings):
+    """Everything that was drawn, by model, group and name; of unequal costs, some with warm-up."""
+    trees = psf.run_models(
+        {name: state_space_model(*filters) for name, filters in FILTERS.items()},
+        draws=150,
+        tune=100,
+        chains=3,
+        random_seed=4,
+        discard_tuned_samples=False,
+        progressbar=False,
+        **settings,
+    )
+    return {
+        (model, group, name): tree[group][name].values
+        for model, tree in trees.items()
+        for group in ("posterior", "warmup_posterior", "sample_stats")
+        for name in tree[group].data_vars
+        if "time" not in name
+    }
+
+
+def by_sizes(comm):
+    """The same by communicators of two and of four of the four ranks."""
+    sizes = {}
+    for size in (2, 4):
+        part = comm.Split(comm.rank // size)
+        sizes[size] = draws_of_all(comm=part, gather="all", cores=1)
+        part.Free()
+    return sizes
+
+
+def test_draws_are_bitwise_equal_on_any_number_of_ranks():
+    expected = draws_of_all()
+    assert {"d0_seed", "phi"} <= {name for _, _, name in expected}
+    for rank, sizes in enumerate(on_ranks(4, by_sizes)):
+        for size, found in sizes.items():
+            assert found.keys() == expected.keys()
+            for what, values in found.items():
+                np.testing.assert_array_equal(values, expected[what], f"{rank} {size} {what}")

@@ -1,0 +1,128 @@
+"""Ranks that fail, are killed or disagree: the job ends soon, says why, and can go on later."""
+
+import os
+import pickle
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from tests.mpi.launch import Job, mpiexec, on_ranks
+from tests.mpi.programs import resumed
+from tests.sampling.test_sample_dram import state_space_model
+
+PROGRAMS = ["-m", "tests.mpi.programs"]
+
+
+@pytest.mark.parametrize(("chain", "rank", "abort"), [(2, 1, True), (0, 0, False)])
+def test_a_model_that_raises_stops_all_ranks(chain, rank, abort):
+    """The first chains are those of rank 0."""
+    done = mpiexec(2, [*PROGRAMS, "failing"], chain, abort=abort)
+    raised = float(re.search(r"raised at (\S+)", done.stderr).group(1))
+    assert time.time() - raised < 10
+    assert done.status == 1
+    where = rf"in chain {chain}, after \d+ iterations"
+    assert re.search(rf"^ArithmeticError: no more\n{where}", done.stderr, re.MULTILINE)
+    told = (
+        rf"ParallelError: rank {rank} of 2 has stopped the run: ArithmeticError: no more \({where}"
+    )
+    assert re.search(told, done.stderr)
+
+
+# A rank that fails before it comes to the package, while another waits there for it.
+EARLY_ERROR = """
+from mpi4py import MPI
+if MPI.COMM_WORLD.rank == 1:
+    raise FileNotFoundError("no data on this computer")
+from pymc_statespace_filters.parallel import ranks_of
+ranks_of("world").wait_for_all()
+"""
+
+
+def test_a_script_that_fails_on_one_rank_does_not_leave_the_others_waiting():
+    done = mpiexec(2, ["-c", EARLY_ERROR])
+    assert done.status == 1
+    assert "FileNotFoundError: no data on this computer" in done.stderr
+
+
+def disagreements(comm):
+    """What is said where rank 1 makes another call than rank 0."""
+    model, other = (state_space_model(psf.EKF(), *more) for more in ([], [psf.EKF()]))
+    call = {"draws": 20, "tune": 10, "random_seed": 1, "progressbar": False, "comm": comm}
+    variants = [
+        {"draws": 30},
+        {"random_seed": 2},
+        {"checkpoint": "never-made"},
+        {"gather": "all"},
+        {"ranks_per_chain": 2},
+        {"initvals": {"phi": 0.1}},
+        {"models": {"another": model}},
+        {"models": {"M": model, "M2": model}},
+        {"models": {"M": other}},
+        {"random_seed": np.random.default_rng(1)},
+        {"proposal_cov": [[1.0]]},
+    ]
+    heard = []
+    for changes in variants:
+        with pytest.raises(psf.DataMismatchError) as caught:
+            psf.run_models(**{"models": {"M": model}} | call | (changes if comm.rank == 1 else {}))
+        heard.append(str(caught.value))
+    return heard
+
+
+def test_ranks_that_make_different_calls_are_told():
+    zero, one = on_ranks(2, disagreements)
+    assert zero == one
+    said = [
+        re.search("rank 1 of 2 was asked .* than rank 0: (.*);", text).group(1) for text in zero
+    ]
+    assert said[:6] == [
+        "draws", "random_seed", "checkpoint", "gather", "ranks_per_chain", "initvals"
+    ]  # fmt: skip
+    assert said[6:8] == ["models", "models"]
+    assert said[8].startswith("model")
+    assert [("the same integer as random_seed" in text) for text in zero] == [
+        "random_seed" in what for what in said
+    ]
+    assert said[9:] == ["random_seed", "proposal_cov"]
+    assert [("the same pilot" in text) for text in zero] == [False] * 10 + [True]
+
+
+def wait_for_a_checkpoint(folder, since):
+    """Wait until chains have been stored after a time."""
+    begin = time.monotonic()
+    while time.monotonic() - begin < 60:
+        logs = [log.stat() for log in folder.glob("run/chain-*.log")]
+        if any(log.st_mtime > since and log.st_size > 10_000 for log in logs):
+            return
+        time.sleep(0.05)
+    raise AssertionError("nothing was stored")
+
+
+def disturb(n, folder, how):
+    """Start the long run, and end it in its midst."""
+    begin = time.time()
+    job = Job(n, "-m", "mpi4py", *PROGRAMS, "long_run", folder, "0.3")
+    try:
+        wait_for_a_checkpoint(folder, begin)
+        how(job)
+        done = job.wait(timeout=15)
+    finally:
+        job.end()
+    assert done.status != 0
+    assert not (folder / "draws").exists()
+
+
+def test_killed_and_interrupted_and_taken_up_by_other_numbers_of_ranks(tmp_path):
+    disturb(2, tmp_path, lambda job: os.kill(max(job.ranks()), signal.SIGKILL))
+    disturb(3, tmp_path, lambda job: job.process.send_signal(signal.SIGINT))
+    done = mpiexec(2, [*PROGRAMS, "long_run"], tmp_path)
+    assert done.status == 0, done.stderr
+    found = pickle.loads((tmp_path / "draws").read_bytes())
+    undisturbed = resumed()["posterior"]
+    assert list(found) == list(undisturbed.data_vars)
+    for name, draws in found.items():
+        np.testing.assert_array_equal(draws, undisturbed[name])

@@ -1,0 +1,45 @@
+"""Ctrl-C where it must not raise."""
+
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from pymc_statespace_filters.sampling.interrupts import (
+    interrupts_left_to_another_rank,
+    noticed_interrupts,
+)
+
+
+@pytest.fixture(autouse=True)
+def _interrupts_arrive():
+    """Whatever started these tests may have had them ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_is_noticed():
+    with noticed_interrupts() as interrupted:
+        assert not interrupted.is_set()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupted.is_set()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_is_left_to_another_rank():
+    with interrupts_left_to_another_rank():
+        signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("context", [noticed_interrupts, interrupts_left_to_another_rank])
+def test_other_threads_are_never_interrupted(context):
+    def inside():
+        with context():
+            return signal.getsignal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(inside).result() is signal.default_int_handler

@@ -1,0 +1,184 @@
+"""``run_models`` in one process: each model's draws are its own, whatever the other models."""
+
+import re
+import time
+import tracemalloc
+import weakref
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from pytensor.compile.ops import wrap_py
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.sampling import model_run
+from pymc_statespace_filters.sampling.crew import Crew, Job
+from pymc_statespace_filters.sampling.model_run import Asked, ModelRun
+from pymc_statespace_filters.sampling.settings import DRAMSettings
+from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
+
+SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
+
+
+def asked():
+    return Asked(50, 50, 2, [1], True, None, False, None, DRAMSettings.of({}))
+
+
+def normal_model(sd=1.0):
+    with pm.Model() as model:
+        pm.Normal("y", pm.Normal("mu", sigma=sd), 1.0, observed=[1.0, 2.0])
+    return model
+
+
+@pytest.fixture(scope="module")
+def models():
+    return {"cheap one": normal_model(), "dear/one": state_space_model(psf.BootstrapPF(50))}
+
+
+def test_each_model_as_if_alone(models):
+    trees = psf.run_models(models, **SETTINGS)
+    assert list(trees) == list(models)
+    for name, model in models.items():
+        assert_identical(trees[name], sample_dram(model, **SETTINGS))
+
+
+def test_the_dearest_chains_begin(models, monkeypatch):
+    order, start = [], Crew.start
+    monkeypatch.setattr(
+        Crew, "start", lambda crew, job, run: (order.append(job), start(crew, job, run))
+    )
+    psf.run_models(models, **SETTINGS)
+    assert order == [Job(1, 0), Job(1, 1), Job(0, 0), Job(0, 1)]
+
+
+def test_a_cost_is_measured_on_arrays_that_live(models):
+    """With what they read gone, these evaluations called whatever address came in its place."""
+    run = ModelRun(models["dear/one"], asked())
+    bind, seen = run.prepare().density.bind, []
+
+    def watched():
+        bound = bind()
+        seen.append(weakref.ref(bound))
+        return bound
+
+    run.prepare().density.bind = watched
+    alive = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model_run, "evaluate", lambda density: alive.append(seen[-1]() is not None))
+        assert run.cost() > 0.0
+    assert alive == [True] * 3
+
+
+def test_threads_are_shared_by_all_models(models, monkeypatch):
+    at_once, ended = [], Crew.ended
+    monkeypatch.setattr(
+        Crew, "ended", lambda crew, *of: (at_once.append(len(crew.at_work)), ended(crew, *of))[1]
+    )
+    psf.run_models(models, cores=3, **SETTINGS)
+    assert max(at_once) == 3
+
+
+def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
+    expected = psf.run_models(models, **SETTINGS)
+    asked = SETTINGS | {"checkpoint": tmp_path, "cores": 2}
+
+    def interrupted(crew, *others):
+        while min(run.done for run in crew.at_work.values()) < 100:
+            time.sleep(0.001)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Crew, "ended", interrupted)
+        with pytest.raises(ModelError, match="nothing to return"):  # of the model not begun
+            psf.run_models(models, **asked)
+    assert [len(list(folder.glob("*.log"))) for folder in sorted(tmp_path.iterdir())] == [2, 2]
+    trees = psf.run_models(models, **asked)
+    for name in models:
+        assert_identical(trees[name], expected[name])
+    with pytest.raises(DataMismatchError, match="draws: "):
+        psf.run_models(models, **asked | {"draws": 60})
+
+
+def test_messages_name_the_model(caplog):
+    models = {"first": normal_model(), "second": normal_model(3.0)}
+    psf.run_models(models, **SETTINGS | {"tune": 0}, proposal_cov=[[1e12]])  # they stand still
+    named = [re.match(r"Model '(\w+)': ", record.message) for record in caplog.records]
+    assert {match.group(1) for match in named if match} == set(models)
+    assert all(named)
+
+
+def breaking(mu):
+    if mu > 3.0:
+        raise ArithmeticError("no more")
+    return np.asarray(mu * 0.0)
+
+
+def test_a_result_takes_less_than_twice_its_memory(monkeypatch):
+    """On the way from chains to the tree, with 0.2 MB for all else."""
+    with pm.Model() as model:
+        for name in "abcde":
+            pm.Normal(name)
+    highest = []
+
+    def before_the_checks(*arguments):
+        highest.append(tracemalloc.get_traced_memory()[1])
+        return []
+
+    settings = SETTINGS | {"draws": 40_000, "chains": 4}
+    psf.sample_dram(model=model, **SETTINGS)
+    monkeypatch.setattr(model_run, "run_convergence_checks", before_the_checks)
+    tracemalloc.start()
+    try:
+        tree = psf.sample_dram(model=model, **settings)
+    finally:
+        tracemalloc.stop()
+    stored = sum(
+        values.nbytes
+        for group in ("posterior", "sample_stats")
+        for name, values in tree[group].data_vars.items()
+        if name != "proposal_cov"  # a view of one matrix a chain
+    )
+    assert highest[0] < 2 * stored + 200_000
+
+
+@pytest.mark.filterwarnings("ignore:Numba will use object mode")
+def test_an_error_names_chain_and_model(models):
+    with pm.Model() as broken:
+        pm.Potential("p", wrap_py([pt.dscalar], [pt.dscalar])(breaking)(pm.Normal("mu", 0, 3)))
+    with pytest.raises(ArithmeticError) as caught:
+        psf.run_models(models | {"broken": broken}, **SETTINGS | {"draws": 10**5})
+    assert re.fullmatch(
+        r"in chain \d of model 'broken', after \d+ iterations", caught.value.__notes__[-1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("models", "message"),
+    [
+        ([normal_model()], "expected a mapping"),
+        ({}, r"models=\{\}: expected a mapping"),
+        ({1: normal_model()}, "1 is no name"),
+        ({"": normal_model()}, "'' is no name"),
+        ({"a": "b"}, r"models\['a'\] must be a pymc.Model, got 'b'"),
+    ],
+)
+def test_bad_models(models, message):
+    with pytest.raises(ModelError, match=message):
+        psf.run_models(models)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gather": "some"}, "gather='some'"),
+        ({"ranks_per_chain": 0}, "ranks_per_chain=0"),
+        ({"ranks_per_chain": 2}, "ranks_per_chain=2 without comm"),
+        ({"cores": 0}, "cores=0"),
+        ({"draws": -1}, "draws=-1"),
+    ],
+)
+def test_bad_settings(settings, message):
+    with pytest.raises(ModelError, match=message):
+        psf.run_models({"a": normal_model()}, **settings)
