@@ -22,10 +22,12 @@ PYTEST = -m pytest -n 2 --dist loadfile
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-quick thesis thesis-quick test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
+.PHONY: help environment demo demo-quick thesis thesis-quick test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
+
+environment: $(VENV)/.installed  ## what all commands need, in .venv; they make it themselves
 
 demo: $(VENV)/.installed  ## three rival models of a double well, in out/; CSV=yours for your own record
 	$(IN)/python examples/double_well.py $(if $(CSV),--csv "$(CSV)")
@@ -46,7 +48,7 @@ test-mpi: $(VENV)/.installed  ## the tests by real MPI, on one, two and four ran
 	$(IN)/python -m pytest -m "mpi and not slow" tests/mpi
 
 test-slow: $(VENV)/.installed  ## the statistical calibrations that `make test` leaves out
-	$(IN)/python $(PYTEST) -m slow
+	$(IN)/python $(PYTEST) -m slow -o faulthandler_timeout=0
 
 test-latest: $(LATEST)/.exists  ## the tests with the newest release of every dependency
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[test]'
