@@ -17,7 +17,6 @@ FILTERS = {EXACT: psf.PFEnKF, FAST: psf.PFEnKF, BOOTSTRAP: psf.BootstrapPF, ENKF
 SIZES = (1000, 10_000, 100_000)
 RANKS = (1, 2, 4, 8, 16, 20, 40, 100)
 THREADS = (1, 2, 4, 8, 16)  # more at a time measure each other
-BLOCK = 64  # a rank has whole blocks of so many members
 
 
 class Ranks(Protocol):
@@ -48,7 +47,7 @@ class Case:
         return STEPS.size / self.n_seen
 
     def fits(self, n_ranks: int) -> bool:
-        return n_ranks <= -(-self.n // BLOCK)
+        return n_ranks <= FILTERS[self.kind](self.n).most_ranks()
 
 
 def cases(exact: bool) -> list[Case]:
