@@ -14,12 +14,9 @@ from pymc_statespace_filters.ops import FilterRun, evaluator
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import (
     check_at,
-    check_inputs,
-    check_observed,
     check_seed,
-    check_t0,
+    checked_record,
     rows_at,
-    steps_of,
 )
 
 
@@ -107,10 +104,7 @@ def run_filter(
     """
     check_kinds(system, filter)
     check_at(at)
-    t0 = check_t0(t0)
-    steps = steps_of(steps, times, system.dt, t0)
-    data = check_observed(observed, system, steps.size)
-    forces = check_inputs(inputs, system, steps)
+    record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     if theta.ndim != 1:
         raise ModelError(
@@ -119,12 +113,13 @@ def run_filter(
     noise = check_seed("seed", seed)
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
-    rows = rows_at(at, steps)
+    rows = rows_at(at, record.steps)
     evaluate = evaluator(FilterRun(system, filter))
-    terms, health, *states = evaluate(theta, steps, data, forces, t0, noise, rows)
+    terms, health, *states = evaluate(theta, *record, noise, rows)
     warn_of(filter, health[None])
     dataset = _dataset(system, *states).assign(log_likelihood=("obs_time", terms))
-    times_of = {"time": t0 + rows * system.dt, "obs_time": t0 + steps * system.dt}
+    seen = {"time": rows, "obs_time": record.steps}
+    times_of = {name: record.t0 + at_steps * system.dt for name, at_steps in seen.items()}
     return dataset.assign_coords(times_of).assign_attrs(filter=repr(filter), at=at)
 
 

@@ -22,12 +22,9 @@ from pymc_statespace_filters.ops import (
 from pymc_statespace_filters.parallel import Ranks, ranks_of
 from pymc_statespace_filters.parameters import flat_parameters
 from pymc_statespace_filters.records import (
-    check_inputs,
-    check_observed,
     check_seed,
     check_system,
-    check_t0,
-    steps_of,
+    checked_record,
 )
 
 
@@ -103,10 +100,7 @@ def log_likelihood(
     (2,)
     """
     check_kinds(system, filter)
-    t0 = check_t0(t0)
-    at = steps_of(steps, times, system.dt, t0)
-    data = check_observed(observed, system, at.size)
-    forces = check_inputs(inputs, system, at)
+    record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
     try:
@@ -119,14 +113,13 @@ def log_likelihood(
     theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
     seeds = np.broadcast_to(seeds, shape)
     points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
-    record = (at, data, forces, np.asarray(t0))
     with ranks_of(comm) as ranks:
         if ranks.size > 1:
             _check_agreement(ranks, filter, (points, *record, seeds))
         terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
         if ranks.rank == 0:
             warn_of(filter, health)
-    return terms.reshape(*shape, at.size)
+    return terms.reshape(*shape, record.steps.size)
 
 
 def _check_agreement(ranks: Ranks, filter: Filter, arrays: Sequence[np.ndarray]) -> None:

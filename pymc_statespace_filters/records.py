@@ -1,7 +1,7 @@
 """The record that a system is compared with: observation steps, data, inputs; checked once."""
 
 from numbers import Integral
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,25 @@ from pymc_statespace_filters.model import StateSpaceModel
 GRID_TOLERANCE = 1e-6
 
 ROWS_AT = ("observations", "steps")
+
+
+class CheckedRecord(NamedTuple):
+    """A record as machine code reads it: steps (J,), data (J, p), inputs (rows, n), t0 ()."""
+
+    steps: np.ndarray
+    observed: np.ndarray
+    inputs: np.ndarray
+    t0: np.ndarray
+
+
+def checked_record(
+    system: StateSpaceModel, observed: Any, *, steps: Any, times: Any, inputs: Any, t0: Any
+) -> CheckedRecord:
+    """The record that a user gives for a system, every part of it checked."""
+    t0 = check_t0(t0)
+    at = steps_of(steps, times, system.dt, t0)
+    data = check_observed(observed, system, at.size)
+    return CheckedRecord(at, data, check_inputs(inputs, system, at), np.asarray(t0))
 
 
 def check_system(system: Any) -> None:

@@ -9,7 +9,7 @@ from pymc_statespace_filters.filters._compile import compiled, keep
 from pymc_statespace_filters.filters._ensemble_states import finite_weights
 from pymc_statespace_filters.filters._failures import NONE
 from pymc_statespace_filters.filters._weights import effective_number
-from pymc_statespace_filters.filters._witness import UPDATED, WITNESS_ARGUMENTS
+from pymc_statespace_filters.filters._witness import UPDATED, WITNESS_ARGUMENTS, place_of
 from pymc_statespace_filters.machine_code import Entry, address_of, digest
 
 # The witness's whole numbers: states, members, rows, next row; then the steps of the rows. Its real
@@ -24,9 +24,7 @@ def _note_down(counts, numbers, event, j, k, members, log_weights, d, simulated,
     if event > UPDATED:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + R,))[_N_COUNTS:]
-    while of[_NEXT] < R and rows[of[_NEXT]] < k:
-        of[_NEXT] += 1
-    row = of[_NEXT]
+    row = of[_NEXT] = place_of(k, rows, of[_NEXT])
     if row == R or rows[row] != k:
         return
     X = carray(members, (n, N))

@@ -10,7 +10,7 @@ from pymc_statespace_filters.filters._compile import compiled, keep
 from pymc_statespace_filters.filters._failures import NONE
 from pymc_statespace_filters.filters._random import STATES, uniform_at
 from pymc_statespace_filters.filters._weights import effective_number, normalise
-from pymc_statespace_filters.filters._witness import FORECAST, UPDATED, WITNESS_ARGUMENTS
+from pymc_statespace_filters.filters._witness import FORECAST, UPDATED, WITNESS_ARGUMENTS, place_of
 from pymc_statespace_filters.machine_code import Entry, address_of, digest
 
 # The last event at a step that a moment knows of.
@@ -28,9 +28,7 @@ def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated,
     if event > of[_LAST]:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + n_rows,))[_N_COUNTS:]
-    while of[_NEXT] < n_rows and rows[of[_NEXT]] < k:
-        of[_NEXT] += 1
-    row = of[_NEXT]
+    row = of[_NEXT] = place_of(k, rows, of[_NEXT])
     if row == n_rows or rows[row] != k:
         return
     X = carray(members, (n, N))

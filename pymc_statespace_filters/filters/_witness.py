@@ -9,7 +9,7 @@ the filters, and whoever wants the likelihood alone has no witness and pays noth
 import numpy as np
 from numba import types
 
-from pymc_statespace_filters.filters._compile import pasted
+from pymc_statespace_filters.filters._compile import compiled, pasted
 from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, call_address
 
 FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
@@ -39,3 +39,12 @@ def tell(watched, event, j, k, members, d, ancestors):
             members.X, members.log_w, d, members.D, ancestors,
         )  # fmt: skip
         call_address(witness, arguments)
+
+
+@compiled
+def place_of(k, rows, first):
+    """The first of increasing rows, from number ``first`` on, that is not before step k."""
+    place = first
+    while place < rows.size and rows[place] < k:
+        place += 1
+    return place
