@@ -8,14 +8,10 @@ there are. Where all members are one process's own, nothing is exchanged.
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
 
 from pymc_statespace_filters.filters._compile import pasted
 from pymc_statespace_filters.filters._random import BLOCK
-from pymc_statespace_filters.machine_code import NUMBERS, call_address
-
-EXCHANGE_ARGUMENTS = (NUMBERS, types.intp, types.intp, types.intp)
-"""Of the function that completes an array: its address, rows, columns, and columns of a block."""
+from pymc_statespace_filters.machine_code import call_address
 
 MEMBERS, BLOCKS = BLOCK, 1
 """Columns of a block: an array has a column for each member, or one for each block.
@@ -25,7 +21,10 @@ With one column a block, an array may also be any list whose columns are dealt o
 
 
 class Share(NamedTuple):
-    """A rank, the number of ranks, and the address of their exchange, 0 where there is one rank."""
+    """A rank, the number of ranks, and the address of their exchange, 0 where there is one rank.
+
+    An exchange takes the address of an array, its rows, its columns, and the columns of a block.
+    """
 
     rank: int
     n_ranks: int
