@@ -22,9 +22,21 @@ def key_of(what: str, *keys: str | None) -> str | None:
 
 @cache
 def _source_digest() -> str:
-    """Machine code on disk must not outlive the code that it was made by."""
-    package = Path(__file__).parent.parent
-    # All that a model's machine code can be made by.
-    folders = (".", "machine_code", "lowering", "filters", "ops")
-    files = sorted(f for folder in folders for f in package.glob(folder + "/*.py"))
-    return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
+    return digest_of_sources(Path(__file__).parent.parent)
+
+
+def digest_of_sources(package: Path) -> str:
+    """The digest of all sources that machine code can be made by, in nested folders too.
+
+    Machine code on disk must not outlive the code that it was made by. A file's place counts, for
+    machine code is loaded by way of the module that it was made in.
+    """
+    files = [*package.glob("*.py")]
+    for folder in ("machine_code", "lowering", "filters", "ops"):
+        files += package.joinpath(folder).rglob("*.py")
+    sources = [
+        part
+        for file in sorted(files)
+        for part in (file.relative_to(package).as_posix().encode(), file.read_bytes())
+    ]
+    return hashlib.sha256(b"\0".join(sources)).hexdigest()
