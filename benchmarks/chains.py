@@ -21,9 +21,9 @@ from numba import njit
 import pymc_statespace_filters as psf
 from benchmarks.sampling import double_well_model
 from benchmarks.systems import DOUBLE_WELL_TRUTH
-from pymc_statespace_filters.sampling.chain import evaluate
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.kernel.transition import evaluate
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 
 ROUNDS = 5
 

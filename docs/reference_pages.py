@@ -10,15 +10,9 @@ PACKAGE = psf.__name__
 
 # Where a name stands follows from the room it comes from; a room that is not here stops the build.
 GROUPS = {
-    "Systems and records": (
-        "model",
-        "integrators",
-        "nonlinearities",
-        "records",
-        "simulation",
-    ),
-    "Filters": ("filters", "likelihood", "filter_run"),
-    "In a PyMC model": ("distribution", "sampling"),
+    "Systems and records": ("system",),
+    "Filters": ("filters", "evaluation"),
+    "In a PyMC model": ("pymc_model", "sampling"),
     "States, forecasts, diagnostics": ("states", "diagnostics"),
     "Evidence and model choice": ("evidence",),
     "Plots": ("plots",),
@@ -50,11 +44,8 @@ def _grouped() -> dict[str, list[str]]:
     rooms = {room: title for title, rooms in GROUPS.items() for room in rooms}
     groups: dict[str, list[str]] = {title: [] for title in GROUPS}
     for name in psf.__all__:
-        room = (
-            getattr(psf, name)
-            .__module__.removeprefix(f"{PACKAGE}.")
-            .split(".")[0]
-        )
+        module = getattr(psf, name).__module__
+        room = module.removeprefix(f"{PACKAGE}.").split(".")[0]
         groups[rooms[room]].append(name)
     return {title: names for title, names in groups.items() if names}
 

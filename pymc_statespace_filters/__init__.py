@@ -5,7 +5,6 @@ from pymc_statespace_filters.diagnostics import (
     filter_diagnostics,
     leave_future_out,
 )
-from pymc_statespace_filters.distribution import StateSpace
 from pymc_statespace_filters.errors import (
     CheckpointWarning,
     DataMismatchError,
@@ -18,6 +17,9 @@ from pymc_statespace_filters.errors import (
     ParallelWarning,
     StateSpaceFiltersError,
 )
+from pymc_statespace_filters.evaluation.log_likelihood import log_likelihood
+from pymc_statespace_filters.evaluation.run_filter import run_filter
+from pymc_statespace_filters.evaluation.simulate import simulate
 from pymc_statespace_filters.evidence import (
     DimensionCorrection,
     Evidence,
@@ -28,17 +30,7 @@ from pymc_statespace_filters.evidence import (
     marginal_modes,
     prior_sensitivity,
 )
-from pymc_statespace_filters.filter_run import run_filter
 from pymc_statespace_filters.filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
-from pymc_statespace_filters.integrators import EulerMaruyama
-from pymc_statespace_filters.likelihood import log_likelihood
-from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.nonlinearities import (
-    cubic,
-    freeplay,
-    hysteresis,
-    hysteresis_branch,
-)
 from pymc_statespace_filters.plots import (
     plot_average,
     plot_evidence,
@@ -49,10 +41,13 @@ from pymc_statespace_filters.plots import (
     plot_prior_sensitivity,
     plot_states,
 )
-from pymc_statespace_filters.records import nearest_steps
+from pymc_statespace_filters.pymc_model.distribution import StateSpace
 from pymc_statespace_filters.sampling import DRAM, run_models, sample_dram, suggest_particles
-from pymc_statespace_filters.simulation import simulate
 from pymc_statespace_filters.states import filtered_states, forecast, smoothed_states
+from pymc_statespace_filters.system.forces import cubic, freeplay, hysteresis, hysteresis_branch
+from pymc_statespace_filters.system.integrators import EulerMaruyama
+from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.record import nearest_steps
 
 __all__ = [
     "DRAM",

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.parallel import Message
+from pymc_statespace_filters.parallel.communicator import Message
 
 _EXCHANGE = ctypes.CFUNCTYPE(
     None, ctypes.POINTER(ctypes.c_double), ctypes.c_ssize_t, ctypes.c_ssize_t, ctypes.c_ssize_t

@@ -15,7 +15,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.ops import cache_key
+from pymc_statespace_filters.ops.base import cache_key
 from tests.small_systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
 
 ROOT = Path(__file__).parents[1]
@@ -52,8 +52,8 @@ SCRIPT = """
 import json, sys
 import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.machine_code import entries
-from pymc_statespace_filters.ops import cache_key
+from pymc_statespace_filters.compiler.native import entry_point as entries
+from pymc_statespace_filters.ops.base import cache_key
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
 results = []

@@ -9,8 +9,8 @@ import numpy as np
 
 import pymc_statespace_filters as psf
 from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, STEPS, simulated, theta_of
-from pymc_statespace_filters.filters import _kernel_density
-from pymc_statespace_filters.likelihood import shared_evaluator
+from pymc_statespace_filters.evaluation.log_likelihood import shared_evaluator
+from pymc_statespace_filters.filters.kernel_density import density as _kernel_density
 
 EXACT, FAST, BOOTSTRAP, ENKF = "PFEnKF, exact kernels", "PFEnKF", "BootstrapPF", "EnKF"
 FILTERS = {EXACT: psf.PFEnKF, FAST: psf.PFEnKF, BOOTSTRAP: psf.BootstrapPF, ENKF: psf.EnKF}

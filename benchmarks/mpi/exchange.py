@@ -14,8 +14,8 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.mpi.watched import many_exchanges
-from pymc_statespace_filters.filters._share import Share
-from pymc_statespace_filters.parallel import ranks_of
+from pymc_statespace_filters.filters.ensemble.partition import Share
+from pymc_statespace_filters.parallel.communicator import ranks_of
 
 ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as the filters have them
 ROUNDS = 300  # short ones: some meet a moment without neighbours

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from xarray import DataTree
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.parallel import Ranks
+from pymc_statespace_filters.parallel.communicator import Ranks
 
 CHAINS, DRAWS, N = 4, 100_000, 5
 ROUNDS = 5

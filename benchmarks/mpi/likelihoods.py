@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from benchmarks.mpi.cases import Case, cases, evaluation, with_exact_kernels
 from benchmarks.mpi.watched import Watched
-from pymc_statespace_filters.parallel import ranks_of
+from pymc_statespace_filters.parallel.communicator import ranks_of
 
 SECONDS, MOST, LEAST = 40.0, 15, 5  # of a case: about so long, at most and at least so many rounds
 

@@ -2,6 +2,6 @@
 
 from pymc_statespace_filters.diagnostics.cross_validation import leave_future_out
 from pymc_statespace_filters.diagnostics.filter_health import filter_diagnostics
-from pymc_statespace_filters.diagnostics.pointwise_terms import compute_log_likelihood
+from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import compute_log_likelihood
 
 __all__ = ["compute_log_likelihood", "filter_diagnostics", "leave_future_out"]

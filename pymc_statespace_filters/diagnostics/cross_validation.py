@@ -11,13 +11,13 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.diagnostics.pointwise_terms import SEQUENTIAL, terms_at
-from pymc_statespace_filters.diagnostics.shortened_record import record_of, shortened
+from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import SEQUENTIAL, terms_at
+from pymc_statespace_filters.diagnostics.truncated_data import record_of, shortened
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.records import is_whole
-from pymc_statespace_filters.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.variable import chosen_variables
+from pymc_statespace_filters.system.record import is_whole
 
 Refit = Callable[[pm.Model], xr.DataTree]
 

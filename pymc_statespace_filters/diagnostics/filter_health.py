@@ -14,14 +14,14 @@ from pymc_statespace_filters.diagnostics.calibration import (
     uniformity_of,
     whiteness_of,
 )
-from pymc_statespace_filters.diagnostics.shortened_record import record_of
-from pymc_statespace_filters.inspection import COLLAPSED
-from pymc_statespace_filters.records import check_random_seed
-from pymc_statespace_filters.simulation import observer
-from pymc_statespace_filters.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.posterior import PosteriorDraws, draws_of
-from pymc_statespace_filters.states.result import with_group
+from pymc_statespace_filters.diagnostics.truncated_data import record_of
+from pymc_statespace_filters.evaluation.simulate import observer
+from pymc_statespace_filters.pymc_model.inspection import COLLAPSED
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
+from pymc_statespace_filters.states.groups import with_group
 from pymc_statespace_filters.states.variable import States, VariableAtDraws, chosen_variables
+from pymc_statespace_filters.system.record import check_random_seed
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Evidence of a model from its draws, and what follows for the choice between models."""
 
-from pymc_statespace_filters.evidence.choice import (
+from pymc_statespace_filters.evidence.comparison import (
     DimensionCorrection,
     average_models,
     compare_evidence,
@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimation import (
     chib_jeliazkov,
     estimate_evidence,
 )
-from pymc_statespace_filters.evidence.result import Evidence
+from pymc_statespace_filters.evidence.evidence import Evidence
 
 __all__ = [
     "DimensionCorrection",

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2
 
-from pymc_statespace_filters.evidence.result import Evidence
+from pymc_statespace_filters.evidence.evidence import Evidence
 
 # One false alarm in a thousand sets of estimates, and none over what no choice depends on.
 LEVEL = 0.001

@@ -19,8 +19,8 @@ from pymc_statespace_filters.evidence.estimators import (
     PriorMonteCarlo,
     TemperedSMC,
 )
-from pymc_statespace_filters.evidence.report import evidences_of
-from pymc_statespace_filters.evidence.result import Evidence
+from pymc_statespace_filters.evidence.evidence import Evidence
+from pymc_statespace_filters.evidence.runner import evidences_of
 
 ESTIMATORS: Mapping[str, Estimator] = {
     "chib_jeliazkov": ChibJeliazkov(),

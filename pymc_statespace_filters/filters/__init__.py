@@ -18,11 +18,11 @@ noisy ones, ``compile_batch``, and with a gradient ``compile_gradient``, ``compi
 ``compile_reverse``.
 """
 
-from pymc_statespace_filters.filters._failures import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.enkf import EnKF
 from pymc_statespace_filters.filters.grid import GridFilter
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 
 type Filter = EKF | EnKF | BootstrapPF | PFEnKF | GridFilter

@@ -5,28 +5,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.filters._base import EnsembleFilter
-from pymc_statespace_filters.filters._checks import check_choice, check_count, check_fraction
-from pymc_statespace_filters.filters._compile import pasted
-from pymc_statespace_filters.filters._ensemble import mark_finite
-from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters._loop import filter_entry
-from pymc_statespace_filters.filters._particle_smoother import (
+from pymc_statespace_filters.compiler.lowering.ensemble import Machine
+from pymc_statespace_filters.compiler.native.entry_point import Entry
+from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
+from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
+from pymc_statespace_filters.filters.ensemble.loop import filter_entry
+from pymc_statespace_filters.filters.ensemble.particle_filter import (
     particle_smoother,
     particle_smoothing_method,
 )
-from pymc_statespace_filters.filters._resampling import (
+from pymc_statespace_filters.filters.ensemble.reductions import exchange, sum_values, total
+from pymc_statespace_filters.filters.ensemble.resampling import (
     SCHEMES,
     check_sortable,
     n_normals,
     smooth_resampling,
 )
-from pymc_statespace_filters.filters._sums import exchange, sum_values, total
-from pymc_statespace_filters.filters._system import log_density
-from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
-from pymc_statespace_filters.lowering import Machine
-from pymc_statespace_filters.machine_code import Entry
-from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.filters.ensemble.system_table import log_density
+from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 @pasted

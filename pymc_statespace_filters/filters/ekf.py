@@ -10,11 +10,14 @@ from functools import lru_cache
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled, Graph, VectorFunction
+from pymc_statespace_filters.compiler.lowering.gaussian import log_normal
+from pymc_statespace_filters.compiler.lowering.structure import is_linear
+from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._batch import compile_batch
-from pymc_statespace_filters.filters._gaussian_run import compile_run
-from pymc_statespace_filters.filters._gaussian_states import StatesPass, compile_states, states_pass
-from pymc_statespace_filters.filters._linearised import (
+from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_reverse
+from pymc_statespace_filters.filters.gaussian.batch import compile_batch
+from pymc_statespace_filters.filters.gaussian.linearization import (
     Symbols,
     move_from,
     pack,
@@ -22,18 +25,14 @@ from pymc_statespace_filters.filters._linearised import (
     state_size,
     unpack,
 )
-from pymc_statespace_filters.filters._recursion import Recursion, compile_taped, compile_value
-from pymc_statespace_filters.filters._reverse import compile_gradient, compile_reverse
-from pymc_statespace_filters.lowering import (
-    Compiled,
-    Graph,
-    VectorFunction,
-    call,
-    is_linear,
-    log_normal,
-    symbols_of,
+from pymc_statespace_filters.filters.gaussian.recursion import (
+    Recursion,
+    compile_taped,
+    compile_value,
 )
-from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.filters.gaussian.run import compile_run
+from pymc_statespace_filters.filters.gaussian.states import StatesPass, compile_states, states_pass
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 @dataclass(frozen=True)

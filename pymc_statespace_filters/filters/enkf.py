@@ -6,32 +6,36 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.filters._base import EnsembleFilter
-from pymc_statespace_filters.filters._checks import check_choice, check_count
-from pymc_statespace_filters.filters._compile import pasted
-from pymc_statespace_filters.filters._ensemble import forecast_moments, mark_finite, nudge
-from pymc_statespace_filters.filters._failures import (
-    COVARIANCE_NOT_POSITIVE,
-    NO_FINITE_MEMBER,
-    NONE,
-    ZERO_WEIGHTS,
+from pymc_statespace_filters.compiler.lowering.ensemble import Machine
+from pymc_statespace_filters.compiler.native.entry_point import Entry
+from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
+from pymc_statespace_filters.filters.ensemble.ancestral_smoother import past_kernel
+from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
+from pymc_statespace_filters.filters.ensemble.kalman_update import (
+    forecast_moments,
+    mark_finite,
+    nudge,
 )
-from pymc_statespace_filters.filters._gaussian import log_gaussian
-from pymc_statespace_filters.filters._loop import filter_entry
-from pymc_statespace_filters.filters._noise import observation_normals
-from pymc_statespace_filters.filters._past import past_kernel
-from pymc_statespace_filters.filters._sums import (
+from pymc_statespace_filters.filters.ensemble.loop import filter_entry
+from pymc_statespace_filters.filters.ensemble.noise import observation_normals
+from pymc_statespace_filters.filters.ensemble.reductions import (
     exchange,
     means,
     sum_members,
     sum_values,
     total,
 )
-from pymc_statespace_filters.filters._system import log_density, observe
-from pymc_statespace_filters.filters._weights import total_weight, weigh
-from pymc_statespace_filters.lowering import Machine
-from pymc_statespace_filters.machine_code import Entry
-from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.filters.ensemble.system_table import log_density, observe
+from pymc_statespace_filters.filters.ensemble.weights import total_weight, weigh
+from pymc_statespace_filters.filters.outcomes import (
+    COVARIANCE_NOT_POSITIVE,
+    NO_FINITE_MEMBER,
+    NONE,
+    ZERO_WEIGHTS,
+)
+from pymc_statespace_filters.filters.settings import check_choice, check_count
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0

@@ -16,32 +16,33 @@ from typing import Any
 import numpy as np
 from numba import carray, types
 
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.lowering.entry_points import one_state_entries
+from pymc_statespace_filters.compiler.lowering.scalar_state import (
+    OneState,
+    has_additive_process_noise,
+    has_smooth_transition,
+    one_state,
+)
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry, address_of
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._compile import compiled, pasted
-from pymc_statespace_filters.filters._failures import (
+from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
     OUT_OF_MEMORY,
     ZERO_WEIGHTS,
 )
-from pymc_statespace_filters.filters._grid_pass import (
+from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
     first_lattice,
     keep_nothing,
     next_lattice,
 )
-from pymc_statespace_filters.filters._grid_states import GRID_STATES, MOMENTS
-from pymc_statespace_filters.filters._one_state import read_one_state
-from pymc_statespace_filters.lowering import (
-    Compiled,
-    OneState,
-    has_additive_process_noise,
-    has_smooth_transition,
-    one_state,
-    one_state_entries,
-)
-from pymc_statespace_filters.machine_code import COUNTS, NUMBERS, Entry, address_of, digest, key_of
-from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.filters.point_mass.states import GRID_STATES, MOMENTS
+from pymc_statespace_filters.filters.point_mass.system_table import read_one_state
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 _ARGUMENTS = (
     types.intp, types.intp, types.intp,  # addresses of the system's functions

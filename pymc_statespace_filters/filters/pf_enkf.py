@@ -5,35 +5,24 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.filters._base import EnsembleFilter
-from pymc_statespace_filters.filters._checks import check_choice, check_count, check_fraction
-from pymc_statespace_filters.filters._compile import pasted
-from pymc_statespace_filters.filters._ensemble import (
+from pymc_statespace_filters.compiler.lowering.ensemble import Machine
+from pymc_statespace_filters.compiler.native.entry_point import Entry
+from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.filters.bootstrap import BootstrapPF
+from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
+from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
     forecast_moments,
     mark_finite,
     nudge,
 )
-from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters._kernel_density import density_method
-from pymc_statespace_filters.filters._kernel_weights import (
-    Forecast,
-    nudging_workspace,
-    weigh_nudged,
-)
-from pymc_statespace_filters.filters._loop import filter_entry
-from pymc_statespace_filters.filters._noise import observation_normals
-from pymc_statespace_filters.filters._particle_smoother import (
+from pymc_statespace_filters.filters.ensemble.loop import filter_entry
+from pymc_statespace_filters.filters.ensemble.noise import observation_normals
+from pymc_statespace_filters.filters.ensemble.particle_filter import (
     particle_smoother,
     particle_smoothing_method,
 )
-from pymc_statespace_filters.filters._resampling import (
-    SCHEMES,
-    check_sortable,
-    n_normals,
-    smooth_resampling,
-)
-from pymc_statespace_filters.filters._sums import (
+from pymc_statespace_filters.filters.ensemble.reductions import (
     exchange,
     means,
     sum_members,
@@ -41,12 +30,23 @@ from pymc_statespace_filters.filters._sums import (
     sum_values,
     total,
 )
-from pymc_statespace_filters.filters._system import log_density, observe
-from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
-from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.lowering import Machine
-from pymc_statespace_filters.machine_code import Entry
-from pymc_statespace_filters.model import StateSpaceModel
+from pymc_statespace_filters.filters.ensemble.resampling import (
+    SCHEMES,
+    check_sortable,
+    n_normals,
+    smooth_resampling,
+)
+from pymc_statespace_filters.filters.ensemble.system_table import log_density, observe
+from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.kernel_density.density import density_method
+from pymc_statespace_filters.filters.kernel_density.importance_weights import (
+    Forecast,
+    nudging_workspace,
+    weigh_nudged,
+)
+from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 

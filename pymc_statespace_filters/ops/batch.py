@@ -8,15 +8,10 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.blockwise import Blockwise
 
-from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS, RecordOp, by_theta_alone
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.record import (
-    HEALTH_SIZE,
-    RECORD_INPUTS,
-    RecordOp,
-    by_theta_alone,
-)
 
 
 class BatchLogLikelihood(RecordOp):

@@ -1,7 +1,7 @@
 """The derivative of a log-likelihood as a PyTensor operation."""
 
-from pymc_statespace_filters.lowering import Compiled
-from pymc_statespace_filters.ops.record import RECORD_INPUTS, ThetaDerivative
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, ThetaDerivative
 
 
 class LogLikelihoodGradient(ThetaDerivative):

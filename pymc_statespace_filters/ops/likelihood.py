@@ -7,10 +7,10 @@ import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
 
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
 from pymc_statespace_filters.errors import GradientUnavailableError
-from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, RecordOp, by_theta_alone
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.record import HEALTH_SIZE, RecordOp, by_theta_alone
 
 
 class LogLikelihood(RecordOp):

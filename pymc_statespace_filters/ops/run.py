@@ -3,8 +3,8 @@
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.lowering import Compiled
-from pymc_statespace_filters.ops.record import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
 
 
 class FilterRun(RecordOp):

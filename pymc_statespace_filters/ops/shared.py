@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import RECORD_INPUTS
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.record import RECORD_INPUTS
 
 
 class SharedLogLikelihood(LogLikelihood):

@@ -3,10 +3,10 @@
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
 from pymc_statespace_filters.filters import Filter
-from pymc_statespace_filters.lowering import Compiled
-from pymc_statespace_filters.model import StateSpaceModel
-from pymc_statespace_filters.ops.record import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 class States(RecordOp):

@@ -14,10 +14,10 @@ from pytensor.graph.fg import FunctionGraph
 from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.rewriting.basic import register_specialize
 
-from pymc_statespace_filters.lowering import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp, ThetaDerivative
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.record import RECORD_INPUTS, RecordOp, ThetaDerivative
 
 
 class TapedLogLikelihood(RecordOp):

@@ -12,7 +12,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots._canvas import BOUND, band, canvas, curve, written
+from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, written
 
 AVERAGE = "average"
 N_GRID = 512

@@ -11,7 +11,7 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval, note
+from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note
 
 
 def plot_evidence(

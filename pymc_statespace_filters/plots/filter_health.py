@@ -16,7 +16,7 @@ from arviz_stats.ecdf_utils import (
     simulate_confidence_bands,
 )
 
-from pymc_statespace_filters.plots._canvas import (
+from pymc_statespace_filters.plots.canvas import (
     PANELS_IN_LINE,
     band,
     canvas,
@@ -24,8 +24,8 @@ from pymc_statespace_filters.plots._canvas import (
     interval,
     logarithmic_ticks,
 )
-from pymc_statespace_filters.plots._marks import bars, draw_bands, points, time_label, write_key
-from pymc_statespace_filters.plots._results import group_of, named, variable_of
+from pymc_statespace_filters.plots.marks import bars, draw_bands, points, time_label, write_key
+from pymc_statespace_filters.plots.results import group_of, named, variable_of
 
 COLLAPSED = 3  # a filter with fewer effective particles says little
 PROB, TAIL = 0.95, 1.96  # of the bands that a calibrated filter keeps to

@@ -7,8 +7,8 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
 
-from pymc_statespace_filters.plots._canvas import canvas
-from pymc_statespace_filters.plots._marks import (
+from pymc_statespace_filters.plots.canvas import canvas
+from pymc_statespace_filters.plots.marks import (
     DATA,
     TRUTH,
     draw_bands,
@@ -18,7 +18,7 @@ from pymc_statespace_filters.plots._marks import (
     write_axes,
     write_key,
 )
-from pymc_statespace_filters.plots._results import (
+from pymc_statespace_filters.plots.results import (
     check_count,
     data_of,
     group_of,

@@ -8,7 +8,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots._canvas import canvas_of_rows, interval, note, written
+from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note, written
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 

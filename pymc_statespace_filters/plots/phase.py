@@ -9,8 +9,8 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots._canvas import canvas
-from pymc_statespace_filters.plots._marks import (
+from pymc_statespace_filters.plots.canvas import canvas
+from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
@@ -20,7 +20,7 @@ from pymc_statespace_filters.plots._marks import (
     some_draws,
     write_key,
 )
-from pymc_statespace_filters.plots._results import (
+from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     are_paths,
     check_count,

@@ -10,13 +10,7 @@ from arviz_plots.visuals import labelled_x, labelled_y, set_xticks, set_ylim
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import prior_sensitivity
-from pymc_statespace_filters.plots._canvas import (
-    band,
-    canvas,
-    curve,
-    interval,
-    logarithmic_ticks,
-)
+from pymc_statespace_filters.plots.canvas import band, canvas, curve, interval, logarithmic_ticks
 
 LABELS = {
     "prob": "exponent α of the correction",

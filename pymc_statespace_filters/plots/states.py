@@ -7,8 +7,8 @@ import xarray as xr
 from arviz_plots import PlotCollection
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots._canvas import canvas, curve
-from pymc_statespace_filters.plots._marks import (
+from pymc_statespace_filters.plots.canvas import canvas, curve
+from pymc_statespace_filters.plots.marks import (
     DATA,
     DOTS,
     PATHS,
@@ -22,7 +22,7 @@ from pymc_statespace_filters.plots._marks import (
     write_axes,
     write_key,
 )
-from pymc_statespace_filters.plots._results import (
+from pymc_statespace_filters.plots.results import (
     are_paths,
     check_count,
     chosen,

@@ -1,6 +1,6 @@
 """Samplers: they know a model's log-density and its noise seeds, and no filter."""
 
-from pymc_statespace_filters.sampling.particle_budget import suggest_particles
+from pymc_statespace_filters.sampling.particle_number.suggest import suggest_particles
 from pymc_statespace_filters.sampling.sample import run_models, sample_dram
 from pymc_statespace_filters.sampling.step import DRAM
 

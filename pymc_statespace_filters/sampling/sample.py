@@ -10,11 +10,11 @@ from pymc.model import Model, modelcontext
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint import subfolder
-from pymc_statespace_filters.sampling.collective import How, sample_models
-from pymc_statespace_filters.sampling.head_start import with_head_start
-from pymc_statespace_filters.sampling.model_run import Asked
-from pymc_statespace_filters.sampling.settings import DRAMSettings, is_count
+from pymc_statespace_filters.sampling.checkpoint.checkpoint import subfolder
+from pymc_statespace_filters.sampling.run.driver import How, sample_models
+from pymc_statespace_filters.sampling.run.model_task import Asked
+from pymc_statespace_filters.sampling.run.warm_start import with_head_start
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings, is_count
 
 
 @overload

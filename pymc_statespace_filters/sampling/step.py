@@ -16,13 +16,14 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.sampling import progress, statistics
-from pymc_statespace_filters.sampling.chain_arrays import Random, State
-from pymc_statespace_filters.sampling.health import Record, closing_warning
-from pymc_statespace_filters.sampling.randomness import BLOCK, draw_key
-from pymc_statespace_filters.sampling.running import RunningChain
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_key
+from pymc_statespace_filters.sampling.kernel.state import Random, State
+from pymc_statespace_filters.sampling.output import progress
+from pymc_statespace_filters.sampling.output import sample_stats as statistics
+from pymc_statespace_filters.sampling.output.warnings import Record, closing_warning
+from pymc_statespace_filters.sampling.run.chain import RunningChain
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 
 
 @dataclass_state

@@ -6,12 +6,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.likelihood import warn_of
-from pymc_statespace_filters.records import check_at, check_random_seed, rows_at
-from pymc_statespace_filters.state_graphs import observed_variables
-from pymc_statespace_filters.states.posterior import draws_of
-from pymc_statespace_filters.states.result import state_dims, with_group
+from pymc_statespace_filters.evaluation.log_likelihood import warn_of
+from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.states.draws import draws_of
+from pymc_statespace_filters.states.groups import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.system.record import check_at, check_random_seed, rows_at
 
 
 def filtered_states(

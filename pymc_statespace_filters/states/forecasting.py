@@ -9,19 +9,19 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.likelihood import warn_of
-from pymc_statespace_filters.records import (
+from pymc_statespace_filters.evaluation.log_likelihood import warn_of
+from pymc_statespace_filters.evaluation.simulate import continuation
+from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.states.draws import draws_of
+from pymc_statespace_filters.states.groups import state_dims, with_group
+from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.system.record import (
     check_inputs,
     check_random_seed,
     is_whole,
     n_input_rows,
     steps_of,
 )
-from pymc_statespace_filters.simulation import continuation
-from pymc_statespace_filters.state_graphs import observed_variables
-from pymc_statespace_filters.states.posterior import draws_of
-from pymc_statespace_filters.states.result import state_dims, with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
 
 Array = NDArray[np.float64]
 

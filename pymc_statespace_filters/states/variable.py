@@ -12,16 +12,16 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
+from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.machine_code import ManyCalls
 from pymc_statespace_filters.progress import watched
-from pymc_statespace_filters.state_graphs import (
+from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
     states_of,
     with_other_filter,
 )
-from pymc_statespace_filters.states.posterior import PosteriorDraws
+from pymc_statespace_filters.states.draws import PosteriorDraws
 
 Array = NDArray[np.float64]
 

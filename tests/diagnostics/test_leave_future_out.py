@@ -6,8 +6,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics import cross_validation as module
-from pymc_statespace_filters.diagnostics.shortened_record import record_of, shortened
+from pymc_statespace_filters.diagnostics.truncated_data import record_of, shortened
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.diagnostics.records import (
     MISSING,
     SPREAD,
@@ -157,7 +158,7 @@ def test_a_shortened_model_differs_by_its_record_alone(noisy):
     assert np.isnan(record_of(short, "d")[10:]).all()
     np.testing.assert_array_equal(record_of(noisy, "d")[:, 0], record())
     assert short.coords == noisy.coords
-    assert psf.inspection.noise_seeds(short).keys() == {"d"}
+    assert noise_seeds(short).keys() == {"d"}
     prior, point = short.compile_logp(vars=[short["phi"]]), {"phi": 0.5}
     params = {**point, "spread": SPREAD}
     terms = psf.log_likelihood(SYSTEM, UNBIASED, params, record()[:10], steps=STEPS[:10])

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence, average_models, compare_evidence
-from pymc_statespace_filters.evidence.choice.averaging import _counts
+from pymc_statespace_filters.evidence.comparison.averaging import _counts
 
 X = xr.DataArray([-1.0, 0.5, 2.0], dims="x", coords={"x": [-1.0, 0.5, 2.0]})
 

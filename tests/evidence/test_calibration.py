@@ -7,7 +7,7 @@ but for one time in a thousand, and for fewer the limits are as wide; seeds are 
 
 import pytest
 
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from tests.evidence.calibration import (
     CALIBRATED,
     CASES,

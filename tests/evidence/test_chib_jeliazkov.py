@@ -7,13 +7,10 @@ import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.estimators import chib_jeliazkov as module
-from pymc_statespace_filters.evidence.estimators._proposal import plan_proposal
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import plan_proposal
 from pymc_statespace_filters.evidence.estimators.single_block import estimate_in_one_block
-from pymc_statespace_filters.evidence.means import (
-    log_mean_of_chains,
-    log_mean_of_independent,
-)
+from pymc_statespace_filters.evidence.log_mean import log_mean_of_chains, log_mean_of_independent
 from tests.evidence.analytic import Regression, gaussian, half_normal
 
 LOG_EVIDENCE = -3.7  # of `gaussian`

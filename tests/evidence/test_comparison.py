@@ -9,7 +9,7 @@ import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, compare_evidence
-from pymc_statespace_filters.evidence.result import store_evidence
+from pymc_statespace_filters.evidence.evidence import store_evidence
 
 COLUMNS = [
     "log_evidence",

@@ -8,7 +8,10 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
-from pymc_statespace_filters.evidence.posterior.data import data_fingerprint, observation_count
+from pymc_statespace_filters.evidence.posterior.observed_data import (
+    data_fingerprint,
+    observation_count,
+)
 
 RECORD = np.array([[0.1, 2.0], [np.nan, 1.0], [np.nan, np.nan], [0.4, -0.0]])
 

@@ -13,8 +13,9 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.native import parallel_map as many_calls
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.machine_code import many_calls
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.sampling.autoregression import autoregression
 
 DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])
@@ -50,7 +51,7 @@ def points():
 def test_each_point_has_its_own_seeds(noisy, points):
     x, seeds = points
     found = noisy.evaluate(x, seeds)
-    shared = psf.inspection.noise_seeds(noisy.model)
+    shared = noise_seeds(noisy.model)
     log_density = noisy.model.compile_logp()
     for i in (0, 7, 22):
         for column, seed in enumerate(shared.values()):

@@ -11,10 +11,10 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.doubts import discretisation, doubts_of_steps
+from pymc_statespace_filters.evidence.checks import discretisation, doubts_of_steps
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
-from pymc_statespace_filters.integration_steps import densities_by_steps
-from pymc_statespace_filters.stored_draws import unconstrained_draws
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps
 
 POSITION = {"observation": lambda x: [x[0]]}
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import t as student
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._maximum import EdgeError, derivatives
-from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
+from pymc_statespace_filters.evidence.estimators.newton import EdgeError, derivatives
+from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.analytic import Regression, gaussian, half_normal
 

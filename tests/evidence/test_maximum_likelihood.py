@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pymc_statespace_filters.evidence.estimators._maximum import climb
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     N_VALUING,
     max_log_likelihood,
 )
+from pymc_statespace_filters.evidence.estimators.newton import climb
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.targets import (
     Banana,

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_t
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._mixture import (
+from pymc_statespace_filters.evidence.estimators.student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
     _maximised,

@@ -7,10 +7,10 @@ import pytest
 from scipy.special import comb
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.estimators import multi_block
-from pymc_statespace_filters.evidence.estimators._proposal import Proposal, plan_proposal
+from pymc_statespace_filters.evidence.estimators import block_ordinates as multi_block
+from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate_in_blocks
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.estimators.multi_block import estimate_in_blocks
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.analytic import autoregressive, gaussian, half_normal
 from tests.evidence.targets import Banana, Regression, TwoModes

@@ -8,11 +8,11 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence import chib_jeliazkov
-from pymc_statespace_filters.evidence.doubts import doubts_of_draws
+from pymc_statespace_filters.evidence.checks import doubts_of_draws
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, posterior_of
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
-from pymc_statespace_filters.stored_draws import unconstrained_draws
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 DATA = np.array([0.3, 1.2, 0.8])
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.evidence.estimators import _proposal
-from pymc_statespace_filters.evidence.estimators._proposal import Proposal, plan_proposal
+from pymc_statespace_filters.evidence.estimators import random_walk_proposal as _proposal
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.analytic import gaussian
 

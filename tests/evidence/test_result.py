@@ -10,7 +10,7 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
-from pymc_statespace_filters.evidence.result import store_evidence, stored_evidences
+from pymc_statespace_filters.evidence.evidence import store_evidence, stored_evidences
 
 EVIDENCE = Evidence(-8.0, 0.1, "bridge", 2, 21, -5.0, "0c5f")
 TOLD = replace(EVIDENCE, log_volume=5.3, uniform="a, b", improper="c")

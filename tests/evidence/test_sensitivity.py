@@ -17,8 +17,8 @@ from pymc_statespace_filters import (
     prior_sensitivity,
 )
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.choice.stretched_prior import StretchedPrior
-from pymc_statespace_filters.evidence.result import store_evidence
+from pymc_statespace_filters.evidence.comparison.scaled_prior import StretchedPrior
+from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.evidence.analytic import Regression
 
 SHAPE = (4, 1000)

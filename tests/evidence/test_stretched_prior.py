@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import halfnorm, multivariate_normal, norm, uniform
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.choice.stretched_prior import StretchedPrior, reweigh
+from pymc_statespace_filters.evidence.comparison.scaled_prior import StretchedPrior, reweigh
 from tests.evidence.analytic import Regression, autoregressive
 
 SHAPE = (4, 1000)

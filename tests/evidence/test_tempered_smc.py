@@ -8,13 +8,13 @@ from scipy.stats import norm, uniform
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators import tempered_smc
-from pymc_statespace_filters.evidence.estimators._particles import (
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.smc_moves import (
     learnt_from,
     metropolis,
     particles_of_prior,
     resampled,
 )
-from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, raised_from
 from tests.evidence.state_space import state_space
 from tests.evidence.targets import (

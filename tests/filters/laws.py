@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import pytest
 
+from pymc_statespace_filters.compiler.numerics.philox import INITIAL, OBSERVATION, PROCESS, padded
+from pymc_statespace_filters.compiler.numerics.philox import fill_normals as fill
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._random import INITIAL, OBSERVATION, PROCESS, padded
-from pymc_statespace_filters.filters._random import fill_normals as fill
 from tests.filters.machines import DOUBLE_WELL, double_well_machine, evaluate, oscillator_record
 
 _machines = {}

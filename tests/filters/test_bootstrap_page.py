@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
+from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING, uniform
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters._random import RESAMPLING, uniform
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, normals, run
 from tests.filters.machines import kalman, linear_machine, scalar_record

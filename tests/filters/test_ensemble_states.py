@@ -13,11 +13,15 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters._backward import _choose_particles, _share_out
-from pymc_statespace_filters.filters._past import LAG, _settlement
-from pymc_statespace_filters.ops import LogLikelihood, evaluator
-from pymc_statespace_filters.ops import States as StatesOp
-from pymc_statespace_filters.parameters import flat_parameters
+from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
+from pymc_statespace_filters.filters.ensemble.backward_simulation import (
+    _choose_particles,
+    _share_out,
+)
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.states import States as StatesOp
+from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.filters.test_ekf_states import assert_drawn_from
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.grid_states import GridStates

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.filters._gaussian import (
+from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     log_gaussian,
     semidefinite_cholesky,

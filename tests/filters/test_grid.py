@@ -10,14 +10,14 @@ from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters import FAILURES
-from pymc_statespace_filters.filters._failures import (
+from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
     NO_PROCESS_NOISE,
     ZERO_WEIGHTS,
 )
-from pymc_statespace_filters.inspection import exactness, noise_seeds
+from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import (

@@ -8,10 +8,10 @@ import pytest
 from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters._compile import compiled as compiled_code
-from pymc_statespace_filters.filters._failures import NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters._lattice_law import draw
-from pymc_statespace_filters.parameters import flat_parameters
+from pymc_statespace_filters.compiler.native.jit import compiled as compiled_code
+from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.point_mass.moments import draw
+from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.grid import PointMassFilter
 from tests.references.grid_states import GridStates

@@ -5,14 +5,14 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.filters._kernel_density import (
+from pymc_statespace_filters.filters.ensemble.partition import Share
+from pymc_statespace_filters.filters.ensemble.reductions import own_members, sum_products
+from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     kernel_workspace,
     log_kernel_density,
     scott_bandwidth,
 )
-from pymc_statespace_filters.filters._share import Share
-from pymc_statespace_filters.filters._sums import own_members, sum_products
 
 ALONE = Share(0, 1, 0)
 

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.filters._kernel_density import density_workspace, log_kernel_density
-from pymc_statespace_filters.filters._random import padded
-from pymc_statespace_filters.filters._share import Share
-from pymc_statespace_filters.filters._sums import own_members
+from pymc_statespace_filters.compiler.numerics.philox import padded
+from pymc_statespace_filters.filters.ensemble.partition import Share
+from pymc_statespace_filters.filters.ensemble.reductions import own_members
+from pymc_statespace_filters.filters.kernel_density.density import (
+    density_workspace,
+    log_kernel_density,
+)
 from tests.filters.test_kernel_density import bandwidth, weighted_particles
 from tests.ranks import on_ranks
 

@@ -8,15 +8,15 @@ import pytest
 from numba import njit
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.filters._kernel_density import density_method
-from pymc_statespace_filters.filters._lattice_sum import (
+from pymc_statespace_filters.compiler.numerics.philox import padded
+from pymc_statespace_filters.filters.ensemble.partition import Share
+from pymc_statespace_filters.filters.kernel_density.density import density_method
+from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
     FLOOR,
     lattice_sums,
     lattice_workspace,
 )
-from pymc_statespace_filters.filters._points import Points
-from pymc_statespace_filters.filters._random import padded
-from pymc_statespace_filters.filters._share import Share
+from pymc_statespace_filters.filters.kernel_density.points import Points
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.filters.laws import OSCILLATOR, run
 from tests.filters.machines import scalar_record

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.filters._order import (
+from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     order_particles,
     order_workspace,
     read_places,

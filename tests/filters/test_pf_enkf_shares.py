@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.filters._failures import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, WILD_START, well_record
 from tests.filters.machines import DOUBLE_WELL, linear_machine, scalar_record, simulate

@@ -5,8 +5,13 @@ import pytest
 from numba import njit
 from scipy import stats
 
-from pymc_statespace_filters.filters import _elementary, _random
-from pymc_statespace_filters.filters._random import (
+from pymc_statespace_filters.compiler.numerics import (
+    philox as _random,
+)
+from pymc_statespace_filters.compiler.numerics import (
+    restricted_domain as _elementary,
+)
+from pymc_statespace_filters.compiler.numerics.philox import (
     BLOCK,
     INITIAL,
     OBSERVATION,

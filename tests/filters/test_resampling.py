@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pymc_statespace_filters.filters._random import BLOCK, RESAMPLING, fill_normals, padded
-from pymc_statespace_filters.filters._resampling import (
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK, RESAMPLING, fill_normals, padded
+from pymc_statespace_filters.filters.ensemble.resampling import (
     POINTS,
     choose_ancestors,
     choose_in_order,

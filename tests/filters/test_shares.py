@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.native.jit import compiled
+from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS, fill_normals
+from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, shared_evaluator
 from pymc_statespace_filters.filters import BootstrapPF, EnKF
-from pymc_statespace_filters.filters._compile import compiled
-from pymc_statespace_filters.filters._random import INITIAL, PROCESS, fill_normals
-from pymc_statespace_filters.filters._resampling import SCHEMES
-from pymc_statespace_filters.filters._share import BLOCKS, MEMBERS, Share, part
-from pymc_statespace_filters.filters._sums import (
+from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, MEMBERS, Share, part
+from pymc_statespace_filters.filters.ensemble.reductions import (
     exchange,
     own_members,
     sum_members,
@@ -21,8 +21,8 @@ from pymc_statespace_filters.filters._sums import (
     sum_values,
     total,
 )
-from pymc_statespace_filters.filters._weights import normalise_own, total_weight, weigh
-from pymc_statespace_filters.likelihood import check_ranks, shared_evaluator
+from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
+from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS

@@ -14,7 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling import chain_run
+from pymc_statespace_filters.sampling.run import chain_task as chain_run
 from tests.sampling.test_sample_dram import state_space_model
 
 CHAINS = 3

@@ -11,7 +11,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.chain_run import ChainRun
+from pymc_statespace_filters.sampling.run.chain_task import ChainRun
 from tests.mpi.launch import on_ranks
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.parallel import Ranks
-from pymc_statespace_filters.sampling import lockstep
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.sampling.target import leader_follower as lockstep
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.mpi.launch import mpiexec, on_ranks
 from tests.sampling.test_lockstep import led, run_chain, two_records
 

@@ -6,8 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from pymc_statespace_filters import ParallelError, parallel
-from pymc_statespace_filters.parallel import ranks_of
+from pymc_statespace_filters import ParallelError
+from pymc_statespace_filters.parallel import communicator as parallel
+from pymc_statespace_filters.parallel.communicator import ranks_of
 from tests.mpi.launch import on_ranks
 
 

@@ -53,7 +53,7 @@ def refusals(comm):
     from mpi4py import MPI
 
     from pymc_statespace_filters import ModelError, ParallelError
-    from pymc_statespace_filters.parallel import ranks_of
+    from pymc_statespace_filters.parallel.communicator import ranks_of
 
     freed = comm.Dup()
     freed.Free()
@@ -83,7 +83,7 @@ def different(comm):
     if comm.rank == 1:
         os.environ |= {"NUMBA_CPU_NAME": "nocona", "NUMBA_CPU_FEATURES": ""}
     from pymc_statespace_filters import ParallelError, ParallelWarning
-    from pymc_statespace_filters.parallel import ranks_of
+    from pymc_statespace_filters.parallel.communicator import ranks_of
 
     with pytest.raises(ParallelError, match=r"nocona .* on rank 1.* NUMBA_CPU_NAME=x86-64-v3"):
         ranks_of(comm, in_lockstep=True)

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from pymc_statespace_filters import ModelError, plot_evidence
-from pymc_statespace_filters.evidence.result import store_evidence
+from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.plots.drawn import drawn
 
 

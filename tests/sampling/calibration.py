@@ -24,13 +24,13 @@ import pymc as pm
 import pytensor
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.chain_run import ChainRun, Plan
-from pymc_statespace_filters.sampling.chain_starts import chain_starts
-from pymc_statespace_filters.sampling.log_density import screening_density
-from pymc_statespace_filters.sampling.quantities import Quantities
-from pymc_statespace_filters.sampling.randomness import BLOCK
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK
+from pymc_statespace_filters.sampling.output.deterministics import Quantities
+from pymc_statespace_filters.sampling.run.chain_task import ChainRun, Plan
+from pymc_statespace_filters.sampling.target.initvals import chain_starts
+from pymc_statespace_filters.sampling.target.log_density import screening_density
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.autoregression import autoregression
 from tests.sampling.rank_uniformity import chi_square_p, ecdf_p
 

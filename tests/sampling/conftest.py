@@ -2,7 +2,7 @@
 
 import pytest
 
-from pymc_statespace_filters.sampling import folder_lock
+from pymc_statespace_filters.sampling.checkpoint import lease as folder_lock
 from tests.sampling.lock_clock import Clock
 
 

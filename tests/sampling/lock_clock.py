@@ -2,7 +2,7 @@
 
 from contextlib import contextmanager
 
-from pymc_statespace_filters.sampling import folder_lock
+from pymc_statespace_filters.sampling.checkpoint import lease as folder_lock
 
 
 class Clock:

@@ -8,16 +8,16 @@ import pymc as pm
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.sampling.adaptation import STALLED, AdaptationSettings, learn
-from pymc_statespace_filters.sampling.adaptation_state import (
+from pymc_statespace_filters.sampling.kernel.adaptation import STALLED, AdaptationSettings, learn
+from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     pack,
     packed_size,
     start_adaptation,
     unpack,
 )
-from pymc_statespace_filters.sampling.chain_run import ChainRun, Plan
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.run.chain_task import ChainRun, Plan
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 
 
 @njit

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.budget_search import (
+from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread
+from pymc_statespace_filters.sampling.particle_number.search import (
     LEAST,
     MOST_NUMBERS,
     Row,
@@ -11,7 +12,6 @@ from pymc_statespace_filters.sampling.budget_search import (
     pleasant,
     search,
 )
-from pymc_statespace_filters.sampling.seed_spread import SeedSpread
 
 TARGET = (1.0, 3.3)
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError, ModelError
-from pymc_statespace_filters.sampling import chain_log
-from pymc_statespace_filters.sampling.chain_log import ChainLog
-from pymc_statespace_filters.sampling.checkpoint import open_checkpoint
+from pymc_statespace_filters.sampling.checkpoint import journal as chain_log
+from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
+from pymc_statespace_filters.sampling.checkpoint.journal import ChainLog
 
 ASKED = {"draws": 1000, "chains": 2, "model": "5f2c", "stages": [2, 1], "step": None}
 
@@ -346,10 +346,15 @@ from pathlib import Path
 import numpy as np
 
 # Without PyMC, which takes seconds to import and to fork.
-for name in ("pymc_statespace_filters", "pymc_statespace_filters.sampling"):
+for name in (
+    "pymc_statespace_filters",
+    "pymc_statespace_filters.sampling",
+    "pymc_statespace_filters.sampling.checkpoint",
+):
     sys.modules[name] = types.ModuleType(name)
     sys.modules[name].__path__ = [name.replace(".", "/")]
-from pymc_statespace_filters.sampling import chain_log, checkpoint
+from pymc_statespace_filters.sampling.checkpoint import checkpoint
+from pymc_statespace_filters.sampling.checkpoint import journal as chain_log
 
 chain_log._SPARE = int(sys.argv[2])
 calls, fatal = 0, 0

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling import chain_log, checkpoint
-from pymc_statespace_filters.sampling.checkpoint import (
+from pymc_statespace_filters.sampling.checkpoint import checkpoint
+from pymc_statespace_filters.sampling.checkpoint import journal as chain_log
+from pymc_statespace_filters.sampling.checkpoint.checkpoint import (
     join_checkpoint,
     open_checkpoint,
     subfolder,

@@ -15,8 +15,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
-from pymc_statespace_filters.sampling import chain_run
-from pymc_statespace_filters.sampling.crew import Crew
+from pymc_statespace_filters.sampling.run import chain_task as chain_run
+from pymc_statespace_filters.sampling.run.thread_pool import Crew
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
 KINDS = {

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.delayed_rejection import (
+from pymc_statespace_filters.sampling.kernel.delayed_rejection import (
     gaussian_log_acceptance,
     gaussian_log_proposals,
     log_acceptance,

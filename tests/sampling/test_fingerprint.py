@@ -15,7 +15,7 @@ from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.fingerprint import (
+from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     data_fingerprint,
     describe,
     model_fingerprint,

@@ -10,8 +10,14 @@ from threading import Barrier, BrokenBarrierError, Thread
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling import folder_lock
-from pymc_statespace_filters.sampling.folder_lock import FolderLock, _name, _Owner, _owner, _place
+from pymc_statespace_filters.sampling.checkpoint import lease as folder_lock
+from pymc_statespace_filters.sampling.checkpoint.lease import (
+    FolderLock,
+    _name,
+    _Owner,
+    _owner,
+    _place,
+)
 from tests.sampling.lock_clock import lock_of_elsewhere
 
 PROC = Path("/proc/self/stat")  # where the system tells when a process began

@@ -7,10 +7,12 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling import DRAM, chain_arrays, noise_check
-from pymc_statespace_filters.sampling.health import Growth, Record, closing_warning
-from pymc_statespace_filters.sampling.noise_check import start_warning
-from pymc_statespace_filters.sampling.seed_spread import spread_of
+from pymc_statespace_filters.sampling import DRAM
+from pymc_statespace_filters.sampling.kernel import state as chain_arrays
+from pymc_statespace_filters.sampling.output import noise_check
+from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of
+from pymc_statespace_filters.sampling.output.noise_check import start_warning
+from pymc_statespace_filters.sampling.output.warnings import Growth, Record, closing_warning
 from tests.sampling.test_dram import nan_beyond, sample, simple_model
 from tests.sampling.test_sample_dram import sample_dram, state_space_model
 
@@ -149,7 +151,9 @@ def test_spreads_far_outside_are_said(caplog, monkeypatch):
     model = state_space_model(psf.BootstrapPF(20))
     quiet = sample_dram(model, draws=700)
     monkeypatch.setattr(noise_check, "HOPELESS", 1e-3)
-    monkeypatch.setattr("pymc_statespace_filters.sampling.seed_spread.TOO_NOISY", 1e-3)
+    monkeypatch.setattr(
+        "pymc_statespace_filters.sampling.output.likelihood_variance.TOO_NOISY", 1e-3
+    )
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         tree = sample_dram(model, draws=700)
     assert "at the start" not in caplog.text  # which the chains have left

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from pymc_statespace_filters.sampling.interrupts import (
+from pymc_statespace_filters.parallel.signals import (
     interrupts_left_to_another_rank,
     noticed_interrupts,
 )

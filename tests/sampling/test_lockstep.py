@@ -11,13 +11,13 @@ from pytensor.tensor import dscalar
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError, ParallelError
-from pymc_statespace_filters.sampling import lockstep
-from pymc_statespace_filters.sampling.lockstep import follow, leading
-from pymc_statespace_filters.sampling.log_density import LogDensity
-from pymc_statespace_filters.sampling.randomness import draw_key
-from pymc_statespace_filters.sampling.running import RunningChain
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key
+from pymc_statespace_filters.sampling.run.chain import RunningChain
+from pymc_statespace_filters.sampling.target import leader_follower as lockstep
+from pymc_statespace_filters.sampling.target.leader_follower import follow, leading
+from pymc_statespace_filters.sampling.target.log_density import LogDensity
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 

@@ -7,7 +7,7 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.starts import N_COMPARED
+from pymc_statespace_filters.sampling.target.initial_points import N_COMPARED
 from tests.sampling.noisy_toy import Recorder, exact_posterior, noisy_model
 
 
@@ -18,7 +18,7 @@ def toy(monkeypatch):
     def make(noise_sd, *, records=False):
         model, seed = noisy_model(noise_sd, records=records)
         monkeypatch.setattr(
-            "pymc_statespace_filters.sampling.target.noise_seeds", lambda model: {"d": seed}
+            "pymc_statespace_filters.sampling.target.target.noise_seeds", lambda model: {"d": seed}
         )
         return model
 

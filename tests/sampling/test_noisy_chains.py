@@ -9,10 +9,10 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.chain_arrays import STAGE
-from pymc_statespace_filters.sampling.running import RunningChain
-from pymc_statespace_filters.sampling.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target import Target
+from pymc_statespace_filters.sampling.kernel.state import STAGE
+from pymc_statespace_filters.sampling.run.chain import RunningChain
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_state_space import DATA as RECORD
 from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations

@@ -9,10 +9,10 @@ from scipy.optimize import minimize
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.sampling import particle_budget
-from pymc_statespace_filters.sampling.budget_search import Row
-from pymc_statespace_filters.sampling.held_variables import HeldVariables
-from pymc_statespace_filters.sampling.seed_spread import SeedSpread
+from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread
+from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
+from pymc_statespace_filters.sampling.particle_number.search import Row
+from pymc_statespace_filters.sampling.target.variables import HeldVariables
 from tests.sampling.autoregression import autoregression
 from tests.test_readme import run_code_of
 

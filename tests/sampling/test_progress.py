@@ -8,7 +8,7 @@ import pymc as pm
 import pytest
 from rich.console import Console
 
-from pymc_statespace_filters.sampling.progress import watch
+from pymc_statespace_filters.sampling.output.progress import watch
 
 TUNE, DRAWS = 100, 900
 STATS = {"accept_rate": 0.25, "stage": 2, "scaling": 0.5, "n_failed": 3}

@@ -11,10 +11,10 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling import quantities as of_quantities
-from pymc_statespace_filters.sampling.held_variables import HeldVariables
-from pymc_statespace_filters.sampling.quantities import BLOCK, Quantities
-from pymc_statespace_filters.sampling.results import ChainDraws, to_datatree
+from pymc_statespace_filters.sampling.output import deterministics as of_quantities
+from pymc_statespace_filters.sampling.output.datatree import ChainDraws, to_datatree
+from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Quantities
+from pymc_statespace_filters.sampling.target.variables import HeldVariables
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 

@@ -13,10 +13,10 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling import model_run
-from pymc_statespace_filters.sampling.crew import Crew, Job
-from pymc_statespace_filters.sampling.model_run import Asked, ModelRun
-from pymc_statespace_filters.sampling.settings import DRAMSettings
+from pymc_statespace_filters.sampling.run import model_task as model_run
+from pymc_statespace_filters.sampling.run.model_task import Asked, ModelRun
+from pymc_statespace_filters.sampling.run.thread_pool import Crew, Job
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}

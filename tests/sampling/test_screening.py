@@ -9,8 +9,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.delayed_rejection import log_acceptance
-from pymc_statespace_filters.sampling.surrogate_transition import log_surrogate_acceptance
+from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_acceptance
+from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acceptance
 from tests.sampling.test_delayed_rejection import (
     FULL,
     N_STATES,

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.chain_arrays import Evaluation
-from pymc_statespace_filters.sampling.log_density import LogDensity
-from pymc_statespace_filters.sampling.seed_spread import (
+from pymc_statespace_filters.sampling.kernel.state import Evaluation
+from pymc_statespace_filters.sampling.output.likelihood_variance import (
     MIDDLE,
     SeedSpread,
     acceptance_share,
@@ -13,6 +12,7 @@ from pymc_statespace_filters.sampling.seed_spread import (
     spread_of,
     spread_warning,
 )
+from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.noisy_toy import noisy_model
 
 

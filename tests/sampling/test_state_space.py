@@ -7,15 +7,15 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.inspection import FAILURES, noise_seeds
-from pymc_statespace_filters.ops import (
+from pymc_statespace_filters.ops.distributed import (
     DelegableLogLikelihood,
     DelegableLogLikelihoodOfNoise,
-    LogLikelihood,
-    StoredNoise,
 )
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.noise import StoredNoise
+from pymc_statespace_filters.pymc_model.inspection import FAILURES, noise_seeds
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.log_density import LogDensity
+from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 from tests.sampling.test_noise import Redrawing

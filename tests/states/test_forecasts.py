@@ -6,7 +6,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.simulation import observer
+from pymc_statespace_filters.evaluation.simulate import observer
 from tests.filters.test_ekf_states import assert_drawn_from
 from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (

@@ -14,9 +14,10 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import progress
-from pymc_statespace_filters.machine_code import ManyCalls, many_calls
-from pymc_statespace_filters.state_graphs import observed_variables
-from pymc_statespace_filters.states.posterior import draws_of
+from pymc_statespace_filters.compiler.native import parallel_map as many_calls
+from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
+from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.variable import VariableAtDraws
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 from tests.states.models import EKF, pair_model, posterior

@@ -10,7 +10,8 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.ops import LogLikelihood, evaluator
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     ALL_STEPS,

@@ -2,11 +2,11 @@
 
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate, Estimator
 from pymc_statespace_filters.evidence.estimators.importance import Importance
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import max_log_likelihood
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
 
 __all__ = [

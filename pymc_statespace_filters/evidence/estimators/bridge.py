@@ -50,9 +50,9 @@ from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._moments import moments
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
-from pymc_statespace_filters.evidence.means import (
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.whitening import moments
+from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
     LogMean,
     log_mean_of_chains,

@@ -39,17 +39,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._proposal import Plan, plan_proposal
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
-from pymc_statespace_filters.evidence.estimators.multi_block import (
+from pymc_statespace_filters.evidence.estimators.block_ordinates import (
     BlockEstimate,
     estimate_in_blocks,
 )
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Plan, plan_proposal
 from pymc_statespace_filters.evidence.estimators.single_block import (
     OneBlockEstimate,
     estimate_in_one_block,
 )
-from pymc_statespace_filters.evidence.means import MIN_EFFECTIVE
+from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_PROPOSALS = 100

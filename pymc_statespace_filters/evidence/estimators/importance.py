@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._mixture import choose_mixture
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
-from pymc_statespace_filters.evidence.means import (
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
+from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
     log_mean_of_independent,
     pareto_k,

@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._maximum import (
+from pymc_statespace_filters.evidence.estimators.newton import (
     EdgeError,
     Rows,
     best_of_chains,
     climb,
     derivatives,
 )
-from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3

@@ -7,18 +7,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from pymc_statespace_filters.evidence.estimators._factors import (
+from pymc_statespace_filters.evidence.estimators.newton import Rows, best_of_chains, climb
+from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
     evaluate_factors,
     log_likelihood_of,
     prior_of,
 )
-from pymc_statespace_filters.evidence.estimators._maximum import (
-    Rows,
-    best_of_chains,
-    climb,
-)
-from pymc_statespace_filters.evidence.estimators._moments import moments_within_chains
-from pymc_statespace_filters.evidence.means import log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
+from pymc_statespace_filters.evidence.log_mean import log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 N_STARTS = 3

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._factors import evaluate_factors, prior_of
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
-from pymc_statespace_filters.evidence.means import (
-    MIN_EFFECTIVE,
-    log_mean_of_independent,
+from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
+    evaluate_factors,
+    prior_of,
 )
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE, log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_DRAWS = 100

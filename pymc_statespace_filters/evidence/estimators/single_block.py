@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators._proposal import Proposal
-from pymc_statespace_filters.evidence.means import (
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
+from pymc_statespace_filters.evidence.log_mean import (
     LogMean,
     log_mean_of_chains,
     log_mean_of_independent,

@@ -38,14 +38,14 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators._particles import (
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.smc_moves import (
     Particles,
     learnt_from,
     metropolis,
     particles_of_prior,
     resampled,
 )
-from pymc_statespace_filters.evidence.estimators.estimate import Estimate
 from pymc_statespace_filters.evidence.posterior import Posterior
 
 MIN_RUNS, MIN_PARTICLES = 8, 50

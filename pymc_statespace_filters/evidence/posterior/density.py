@@ -14,9 +14,9 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.inspection import noise_seeds, smooth_filters, with_filter
-from pymc_statespace_filters.machine_code import ManyCalls
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds, smooth_filters, with_filter
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
-from pymc_statespace_filters.stored_draws import unconstrained_draws
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 N_CHECKED = 16  # draws whose stored log-density is recomputed
 STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats

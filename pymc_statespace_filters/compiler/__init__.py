@@ -1,0 +1,1 @@
+"""From traced equations to machine code."""

@@ -1,0 +1,1 @@
+"""From a PyTensor graph to scalar expressions, source and compiled functions."""

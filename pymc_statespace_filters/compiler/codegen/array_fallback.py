@@ -1,0 +1,145 @@
+"""Functions on arrays, for graphs that are too large or hold an operation without a scalar form."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+import pytensor
+from pytensor.compile.mode import get_mode
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.traversal import io_toposort
+from pytensor.link.numba.dispatch.basic import numba_funcify_and_cache_key
+
+from pymc_statespace_filters.compiler.codegen.array_linalg import use_loops
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    MEMBER_INPUTS,
+    Compiled,
+    Graph,
+    VectorFunction,
+    function_of,
+)
+from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_ONE
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.errors import LoweringError
+
+# How the code reads a whole input.
+_WHOLE = {
+    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "d": "d", "x": "X[:, member].copy()",
+    "z": "Z[:{n}, member].copy()", "s": "s", "s_bar": "s_bar", "c_bar": "c_bar",
+    "term_bar": "np.asarray(term_bar)",
+    "tape": "tape[row]",
+}  # fmt: skip
+
+
+def array_vector_function(name: str, function: VectorFunction) -> Compiled:
+    """A vector function that hands arrays on; NaN where the array code raises."""
+    graph = function.graph
+    used = _used(graph.inputs, graph.outputs)
+    compiled = array_code(list(used.values()), graph.outputs)
+    results = [
+        f"out[{i}].item()" if scalar else f"out[{i}].copy()"
+        for i, scalar in enumerate(function.scalar)
+    ]
+    nothing = [
+        "nan" if scalar else f"np.full({output.type.shape[0]}, nan)"
+        for scalar, output in zip(function.scalar, graph.outputs, strict=True)
+    ]
+    body = [
+        "try:",
+        f"    out = array_code({_whole(used)})",
+        f"    return {', '.join(results)}",
+        "except Exception:",  # a singular matrix, say
+        f"    return {', '.join(nothing)}",
+    ]
+    return _build(name, function.arguments, body, array_code=compiled)
+
+
+def array_member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
+    """A member function that calls array code for each member."""
+    members = [v for n, v in graph.inputs.items() if n in MEMBER_INPUTS]
+    common = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
+    shared = _frontier(list(graph.inputs.values()), members, graph.outputs)
+    used_common = _used(common, shared)
+    used_members = _used(
+        {n: v for n, v in graph.inputs.items() if n in MEMBER_INPUTS}, graph.outputs
+    )
+    before = array_code(list(used_common.values()), shared)
+    inside = array_code([*used_members.values(), *shared], graph.outputs)
+    whole, _, element = target.partition("[")
+    row = "i, " if "{i}" in element else ""
+    members = [_whole(used_members)] if used_members else []
+    calls = ", ".join([*members, *(f"shared[{i}]" for i in range(len(shared)))])
+    body = [
+        "try:",
+        f"    shared = before({_whole(used_common)})",
+        "except Exception:",  # a singular matrix, say
+        f"    {whole}[:] = nan",
+        "    return",
+        f"for member in range({whole}.shape[-1]):",
+        "    try:",
+        f"        result = inside({calls})[0]",
+        "    except Exception:",
+        f"        {whole}[..., member] = nan",
+        "    else:",
+        "        for i in range(result.size):",
+        f"            {whole}[{row}member] = result[i]",
+    ]
+    return _build(name, arguments, body, before=before, inside=inside)
+
+
+def _build(name: str, arguments: str, body: list[str], **parts: Compiled) -> Compiled:
+    namespace = FOR_ONE | {part: compiled.function for part, compiled in parts.items()}
+    function, source = function_of(name, arguments, body, namespace)
+    return Compiled(function, key_of(source, *(part.key for part in parts.values())))
+
+
+def _whole(inputs: Mapping[str, Variable]) -> str:
+    sizes = {n: (v.type.shape[0] if v.type.ndim else 1) for n, v in inputs.items()}
+    return ", ".join(_WHOLE[name].format(n=n) for name, n in sizes.items())
+
+
+def _used(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[str, Variable]:
+    found = {i for node in io_toposort(list(inputs.values()), outputs) for i in node.inputs}
+    found |= set(outputs)
+    return {name: variable for name, variable in inputs.items() if variable in found}
+
+
+def _frontier(
+    inputs: list[Variable], members: list[Variable], outputs: Sequence[Variable]
+) -> list[Variable]:
+    """Variables that no member enters and that something a member enters reads."""
+    dependent, frontier = set(members), []
+    nodes = io_toposort(inputs, outputs)
+    for node in nodes:
+        if any(i in dependent for i in node.inputs):
+            dependent.update(node.outputs)
+    for node in nodes:
+        if any(o in dependent for o in node.outputs):
+            frontier += [
+                i for i in node.inputs if i not in dependent and not isinstance(i, Constant)
+            ]
+    frontier += [o for o in outputs if o not in dependent]
+    return list(dict.fromkeys(frontier))
+
+
+def array_code(inputs: list, outputs: Sequence[Variable]) -> Compiled:
+    """A graph as PyTensor itself compiles it: arrays in, a tuple of arrays out."""
+    # PyMC's checks of parameters become minus infinity: nothing may raise inside a filter.
+    mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
+    with warnings.catch_warnings():
+        # Python code called back from machine code: slow, not cacheable, and it holds the lock.
+        warnings.filterwarnings("error", "Numba will use object mode", UserWarning)
+        try:
+            function = pytensor.function(
+                inputs, list(outputs), mode=mode, on_unused_input="ignore", trust_input=True
+            )
+            graph: FunctionGraph = function.maker.fgraph
+            use_loops(graph)
+            code, key = numba_funcify_and_cache_key(graph)
+        except (NotImplementedError, UserWarning) as error:
+            raise LoweringError(
+                f"A function of the system holds an operation without a compiled form ({error}) "
+                f"Write the function without it, in terms of pytensor.tensor operations that "
+                f"numba supports."
+            ) from error
+    return Compiled(code, None if key is None else digest(str(key)))

@@ -1,0 +1,53 @@
+"""Compiled functions: what they are made of, and how they are compiled."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+from pytensor.graph.basic import Variable
+
+from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
+
+# Inputs of which every member of an ensemble has its own.
+MEMBER_INPUTS = frozenset({"x", "z"})
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A compiled function and the key that identifies its code (None: not cacheable)."""
+
+    function: Any
+    key: str | None
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Named inputs (scalars or vectors of static length) and vector outputs."""
+
+    inputs: Mapping[str, Variable]
+    outputs: Sequence[Variable]
+
+
+@dataclass(frozen=True)
+class VectorFunction:
+    """What a vector function is made of; ``scalar[i]`` tells that output i is one number."""
+
+    arguments: str
+    graph: Graph
+    scalar: Sequence[bool] = (False,)
+
+
+def function_of(
+    name: str, arguments: str, body: Sequence[str], namespace: Mapping[str, Any]
+) -> tuple[Any, str]:
+    """Compile a function from the lines of its body, which may name what is in ``namespace``."""
+    source = f"def {name}({arguments}):\n" + "".join(f"    {line}\n" for line in body)
+    names = dict(namespace)
+    exec(compile(source, f"<{name} of a state-space system>", "exec"), names)
+    return jit(names[name]), source
+
+
+def jit(function: Any) -> Any:
+    """Compile as all code of this room is compiled."""
+    return numba.njit(function, nogil=True, error_model="numpy", fastmath=FAST_MATH)

@@ -1,0 +1,187 @@
+"""Graphs of small vectors as compiled functions: written out in scalars, or array by array.
+
+A graph has named inputs, each a scalar or a vector of static length, and vector outputs. Two forms
+of function are made of it. A *vector function* maps vectors to vectors once; a *member function*
+does it for every column of an ensemble. Both are written out in scalars where that is possible and
+small enough, and call PyTensor's own array code otherwise; a caller cannot tell the difference.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytensor.scalar as ps
+from pytensor.graph.basic import Variable
+from pytensor.link.numba.dispatch.basic import numba_funcify
+
+from pymc_statespace_filters.compiler.codegen.array_fallback import (
+    array_member_function,
+    array_vector_function,
+)
+from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    MEMBER_INPUTS,
+    Compiled,
+    Graph,
+    VectorFunction,
+    function_of,
+)
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
+from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.errors import LoweringError
+
+# Up to here the arrays' code takes as long to make and is up to eighty times slower: rings of 8
+# states with a gradient and of 16 without, dense systems of 10. Beyond, nobody would wait for it.
+MAX_EXPRESSIONS = 6000
+MAX_OUTPUT_ELEMENTS = 200
+
+# LLVM makes no vector code of a loop before which more than 128 pairs of rows would have to be
+# found apart; 8 rows that are written and as many that are only read make 92.
+MAX_ROWS_COMPARED = 8
+BLOCK = 64
+
+# How generated code reads element i of an input; members are columns.
+_ELEMENT = {
+    "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]", "x": "X[{i}, member]",
+    "z": "Z[{i}, member]", "s": "s[{i}]", "s_bar": "s_bar[{i}]", "c_bar": "c_bar[{i}]",
+    "term_bar": "term_bar",
+    "tape": "tape[row, {i}]",
+}  # fmt: skip
+
+
+def unrolled(graph: Graph) -> list[list[Value]]:
+    """The elements of every output as scalar expressions."""
+    size = sum(np.prod(output.type.shape or (1,)) for output in graph.outputs)
+    if size > MAX_OUTPUT_ELEMENTS:
+        raise NotUnrollableError(f"more than {MAX_OUTPUT_ELEMENTS} numbers")
+    arena = Arena()
+    values = [_input_elements(arena, name, v) for name, v in graph.inputs.items()]
+    arrays = unroll(arena, list(graph.inputs.values()), values, graph.outputs, MAX_EXPRESSIONS)
+    return [list(np.atleast_1d(a)) for a in arrays]
+
+
+def _input_elements(arena: Arena, name: str, variable: Variable) -> np.ndarray:
+    shape = variable.type.shape
+    out = np.empty(shape, dtype=object)
+    for index in np.ndindex(shape):
+        out[index] = arena.input(f"{name}.{index[0] if index else 0}")
+    return out
+
+
+def _element_code(graph: Graph) -> dict[str, str]:
+    return {
+        f"{name}.{i}": _ELEMENT[name].format(i=i)
+        for name, variable in graph.inputs.items()
+        for i in range(variable.type.shape[0] if variable.type.ndim else 1)
+    }
+
+
+def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compiled]:
+    """Functions that hand vectors to each other: all of them in scalars, or all on arrays.
+
+    In scalars a vector is a tuple of numbers, otherwise an array; both are read by index.
+    """
+    try:
+        written = {name: unrolled(f.graph) for name, f in functions.items()}
+    except NotUnrollableError:
+        return {name: array_vector_function(name, f) for name, f in functions.items()}
+    return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
+
+
+def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> Compiled:
+    writer = Writer(_element_code(function.graph))
+    lines = writer.statements(v for group in values for v in group)
+    results = [
+        writer.as_float(group[0]) if is_scalar else _tuple([writer.as_float(v) for v in group])
+        for group, is_scalar in zip(values, function.scalar, strict=True)
+    ]
+    body = [*lines, f"return {', '.join(results)}"]
+    return build(name, function.arguments, body, writer)
+
+
+def member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
+    """``name(arguments)`` writes the first output of every member to ``target``.
+
+    What does not depend on the member is computed once, before the loop.
+    """
+    try:
+        (values,) = unrolled(graph)
+    except NotUnrollableError:
+        return array_member_function(name, arguments, graph, target)
+    writer = Writer(_element_code(graph), FOR_MEMBERS)
+    members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
+    dependent = depends_on(values, members)
+    shared = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
+    before = writer.statements(
+        [*sorted_by_number(shared), *(v for v in values if v not in dependent)]
+    )
+    inside, results = writer.statements(values), [writer.as_float(v) for v in values]
+    loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
+    return build(name, arguments, [*before, *loop(inside, results, target)], writer)
+
+
+def _loop(inside: list[str], results: list[str], target: str) -> list[str]:
+    """Lines that run ``inside`` for every member and keep its results."""
+    stores = [f"{target.format(i=i)} = {result}" for i, result in enumerate(results)]
+    head = f"for member in range({target.partition('[')[0]}.shape[-1]):"
+    return [head, *_indented([*inside, *stores])]
+
+
+def _staged_loop(inside: list[str], results: list[str], target: str) -> list[str]:
+    """The same by blocks of members, whose results are kept aside and copied.
+
+    What is written is then apart from all that is read, which LLVM need not find out row by row.
+    """
+    whole = target.partition("[")[0]
+    stores = [f"aside[{i}, j] = {result}" for i, result in enumerate(results)]
+    # An unsigned index is never counted from the end, and so leaves the loop vector code.
+    compute = ["member = np.uint64(first + j)", *inside, *stores]
+    copy = [
+        f"for i in range({len(results)}):",
+        "    for j in range(size):",
+        f"        {whole}[i, np.uint64(first + j)] = aside[i, j]",
+    ]
+    block = [
+        f"size = min({BLOCK}, {whole}.shape[-1] - first)",
+        "for j in range(size):",
+        *_indented(compute),
+        *copy,
+    ]
+    return [
+        f"aside = np.empty(({len(results)}, {BLOCK}))",
+        f"for first in range(0, {whole}.shape[-1], {BLOCK}):",
+        *_indented(block),
+    ]
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return ["    " + line for line in lines]
+
+
+def sorted_by_number(values: Iterable[Value]) -> list[Value]:
+    """Expressions in the order of their making, so that the source is canonical."""
+    return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
+
+
+def _tuple(names: Sequence[str]) -> str:
+    return "(" + "".join(f"{name}, " for name in names) + ")"
+
+
+def build(name: str, arguments: str, body: list[str], writer: Writer) -> Compiled:
+    """Compile a body that a writer wrote."""
+    others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
+    function, source = function_of(name, arguments, body, {**writer.vocabulary, **others})
+    return Compiled(function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values())))
+
+
+def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:
+    node = op.make_node(*(ps.float64() for _ in range(n_arguments)))
+    try:
+        return numba_funcify(op, node=node)
+    except NotImplementedError as error:
+        raise LoweringError(
+            f"The operation {op} has no compiled form. Write the function without it, "
+            f"in terms of pytensor.tensor operations that numba supports."
+        ) from error

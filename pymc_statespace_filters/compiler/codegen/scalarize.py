@@ -1,0 +1,320 @@
+"""Unroll a PyTensor graph of small arrays into scalar expressions.
+
+Every variable of the graph becomes a numpy object array whose elements are expressions or Python
+constants. Operations that only move elements (indexing, joining, reshaping) are run by numpy on
+those arrays; elementwise operations, sums and small linear algebra are written out.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+import pytensor.scalar as ps
+import pytensor.tensor.basic as ptb
+from pytensor.compile.builders import OpFromGraph
+from pytensor.compile.ops import DeepCopyOp, ViewOp
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.traversal import io_toposort
+from pytensor.raise_op import CheckAndRaise
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.elemwise import CAReduce, DimShuffle, Elemwise
+from pytensor.tensor.linalg.decomposition.cholesky import Cholesky
+from pytensor.tensor.linalg.solvers.triangular import SolveTriangular
+from pytensor.tensor.math import Dot
+from pytensor.tensor.reshape import JoinDims, SplitDims
+from pytensor.tensor.shape import Reshape, Shape, Shape_i, SpecifyShape
+from pytensor.tensor.subtensor import (
+    AdvancedIncSubtensor,
+    AdvancedSubtensor,
+    IncSubtensor,
+    Subtensor,
+    unflatten_index_variables,
+)
+
+from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant, plain
+
+
+class NotUnrollableError(Exception):
+    """The graph holds an operation without a scalar form, or is too large to write out."""
+
+
+def unroll(
+    arena: Arena,
+    inputs: Sequence[Variable],
+    values: Sequence[np.ndarray],
+    outputs: Sequence[Variable],
+    max_expressions: int,
+) -> list[np.ndarray]:
+    """Object arrays of scalar expressions for ``outputs``, given those for ``inputs``."""
+    known: dict[Variable, np.ndarray] = dict(zip(inputs, values, strict=True))
+    for node in io_toposort(inputs, outputs):
+        arguments = [_value(known, variable) for variable in node.inputs]
+        results = _evaluate(arena, node, arguments)
+        known.update(zip(node.outputs, map(_objects, results), strict=True))
+        if len(arena) > max_expressions:
+            raise NotUnrollableError(f"more than {max_expressions} scalar operations")
+    return [_value(known, variable) for variable in outputs]
+
+
+def _value(known: dict[Variable, np.ndarray], variable: Variable) -> np.ndarray:
+    if variable not in known:
+        if not isinstance(variable, Constant):
+            raise NotUnrollableError(f"the value {variable} comes from outside the function")
+        known[variable] = _objects(variable.data)
+    return known[variable]
+
+
+def _objects(array) -> np.ndarray:
+    """Any value as an object array of expressions and Python scalars."""
+    if isinstance(array, np.ndarray) and array.dtype == object:
+        return array
+    if array is None or isinstance(array, slice):  # a NoneConst or slice argument
+        raise NotUnrollableError("an index that is not a number")
+    if not isinstance(array, np.ndarray | np.generic | float | int | bool):
+        out = np.empty((), dtype=object)
+        out[()] = array
+        return out
+    numbers = np.asarray(array)
+    out = np.empty(numbers.shape, dtype=object)
+    for index in np.ndindex(numbers.shape):
+        out[index] = plain(numbers[index])
+    return out
+
+
+def _numbers(node_input: Variable, value: np.ndarray) -> np.ndarray:
+    """A constant object array as the numeric array that the operation expects."""
+    if not all(is_constant(v) for v in value.flat):
+        raise NotUnrollableError("an index or a shape that depends on the state or a parameter")
+    return np.asarray(value.tolist(), dtype=node_input.type.dtype)
+
+
+def _evaluate(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    for types, rule in _RULES:
+        if isinstance(node.op, types):
+            return rule(arena, node, arguments)
+    if all(is_constant(v) for value in arguments for v in value.flat):
+        return _perform(node, [_numbers(i, a) for i, a in zip(node.inputs, arguments, strict=True)])
+    raise NotUnrollableError(f"the operation {node.op}")
+
+
+def _perform(node, arguments: list) -> list:
+    storage: list[list] = [[None] for _ in node.outputs]
+    node.op.perform(node, arguments, storage)
+    return [cell[0] for cell in storage]
+
+
+def _move(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    """Run an operation that only moves the elements of its first input; the others are numbers."""
+    numbers = [_numbers(i, a) for i, a in zip(node.inputs[1:], arguments[1:], strict=True)]
+    return _perform(node, [arguments[0], *numbers])
+
+
+def _join(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    return [np.concatenate(arguments, axis=node.op.axis)]
+
+
+def _elementwise(arena: Arena, op: ps.ScalarOp, *arguments: np.ndarray) -> np.ndarray:
+    arrays = np.broadcast_arrays(*arguments)
+    out = np.empty(arrays[0].shape, dtype=object)
+    for index in np.ndindex(out.shape):
+        out[index] = _scalar(arena, op, [array[index] for array in arrays])
+    return out
+
+
+def _scalar(arena: Arena, op: ps.ScalarOp, arguments: list):
+    if not isinstance(op, ps.Composite):
+        return arena.apply(op, *arguments)
+    known = dict(zip(op.fgraph.inputs, arguments, strict=True))
+    for node in op.fgraph.toposort():
+        inner = [plain(i.data) if isinstance(i, Constant) else known[i] for i in node.inputs]
+        known[node.outputs[0]] = _scalar(arena, node.op, inner)
+    return known[op.fgraph.outputs[0]]
+
+
+def _elemwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    if len(node.outputs) != 1:
+        raise NotUnrollableError(f"the operation {node.op} with several outputs")
+    return [_elementwise(arena, node.op.scalar_op, *arguments)]
+
+
+def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    (array,) = arguments
+    axes = tuple(range(array.ndim)) if node.op.axis is None else tuple(node.op.axis)
+    kept = [axis for axis in range(array.ndim) if axis not in axes]
+    # A sum of truth values counts them.
+    counts = node.inputs[0].type.dtype == "bool" and node.outputs[0].type.dtype != "bool"
+    cast = ps.Cast(ps.get_scalar_type(node.outputs[0].type.dtype))
+    rows = np.transpose(array, (*kept, *axes)).reshape(*(array.shape[a] for a in kept), -1)
+    out = np.empty(rows.shape[:-1], dtype=object)
+    for index in np.ndindex(out.shape):
+        terms = [arena.apply(cast, term) for term in rows[index]] if counts else list(rows[index])
+        identity = plain(np.asarray(getattr(node.op.scalar_op, "identity", 0)))
+        out[index] = reduce(lambda a, b: arena.apply(node.op.scalar_op, a, b), terms or [identity])
+    return [out]
+
+
+def _matmul(arena: Arena, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    out = np.empty((a.shape[0], b.shape[1]), dtype=object)
+    for i, j in np.ndindex(out.shape):
+        out[i, j] = _inner(arena, a[i, :], b[:, j])
+    return out
+
+
+def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
+    products = [arena.apply(ps.mul, x, y) for x, y in zip(a, b, strict=True)]
+    return arena.apply(ps.add, *products) if len(products) > 1 else products[0] if products else 0.0
+
+
+def _cholesky(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    """Row by row; a negative pivot gives NaN through its square root, as LAPACK's wrapper does."""
+    (a,) = arguments
+    n = a.shape[0]
+    chol = np.full((n, n), 0.0, dtype=object)
+    for i in range(n):
+        for j in range(i + 1):
+            entry = a[i, j] if node.op.lower else a[j, i]
+            rest = arena.apply(ps.sub, entry, _inner(arena, chol[i, :j], chol[j, :j]))
+            chol[i, j] = (
+                arena.apply(ps.sqrt, rest) if i == j else arena.apply(ps.true_div, rest, chol[j, j])
+            )
+    return [chol if node.op.lower else chol.T]
+
+
+def _solve_triangular(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    a, b = arguments
+    n, columns = a.shape[0], b.reshape(a.shape[0], -1)
+    order = range(n) if node.op.lower else range(n - 1, -1, -1)
+    out = np.full(columns.shape, 0.0, dtype=object)
+    for c in range(columns.shape[1]):
+        done: list[int] = []
+        for i in order:
+            rest = arena.apply(
+                ps.sub, columns[i, c], _inner(arena, [a[i, k] for k in done], out[done, c])
+            )
+            out[i, c] = rest if node.op.unit_diagonal else arena.apply(ps.true_div, rest, a[i, i])
+            done.append(i)
+    return [out.reshape(b.shape)]
+
+
+def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    core_inputs, _ = node.op.inputs_sig, node.op.outputs_sig
+    batches = [a.shape[: a.ndim - len(sig)] for a, sig in zip(arguments, core_inputs, strict=True)]
+    batch = np.broadcast_shapes(*batches)
+    spread = [
+        np.broadcast_to(a, batch + a.shape[a.ndim - len(sig) :])
+        for a, sig in zip(arguments, core_inputs, strict=True)
+    ]
+    core_node = node.op._create_dummy_core_node(node.inputs)
+    results: list[np.ndarray] = []
+    for index in np.ndindex(batch):
+        cores = [
+            _objects(r) for r in _evaluate(arena, core_node, [_core(a, index) for a in spread])
+        ]
+        if not results:
+            results = [np.empty(batch + c.shape, dtype=object) for c in cores]
+        for result, core in zip(results, cores, strict=True):
+            result[index] = core if core.shape else core[()]
+    return results
+
+
+def _core(array: np.ndarray, index: tuple) -> np.ndarray:
+    return _as_array(array[index])
+
+
+def _as_array(element) -> np.ndarray:
+    if isinstance(element, np.ndarray):
+        return element
+    out = np.empty((), dtype=object)
+    out[()] = element
+    return out
+
+
+def _subtensor(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    source, *indices = arguments
+    return [_as_array(source[_index(node, node.inputs[1:], indices)])]
+
+
+def _inc_subtensor(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    target, update, *indices = arguments
+    where = _index(node, node.inputs[2:], indices)
+    positions = np.arange(target.size).reshape(target.shape)[where]
+    updates = np.broadcast_to(update, np.shape(positions))
+    out = target.copy()
+    for index in np.ndindex(np.shape(positions)):
+        place: Any = np.unravel_index(np.asarray(positions)[index], target.shape)
+        new: Any = updates[index]
+        out[place] = new if node.op.set_instead_of_inc else arena.apply(ps.add, out[place], new)
+    return [out]
+
+
+def _index(node, variables: Sequence[Variable], values: list[np.ndarray]) -> tuple:
+    numbers = [_numbers(v, a) for v, a in zip(variables, values, strict=True)]
+    flat = [int(a) if a.ndim == 0 else a for a in numbers]
+    return tuple(unflatten_index_variables(flat, node.op.idx_list))
+
+
+def _make_vector(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    out = np.empty(len(arguments), dtype=object)
+    out[:] = [a[()] for a in arguments]
+    return [out]
+
+
+def _alloc(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    shape = tuple(int(_numbers(i, a)) for i, a in zip(node.inputs[1:], arguments[1:], strict=True))
+    return [np.broadcast_to(arguments[0], shape).copy()]
+
+
+def _check(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    """A parameter check of a PyMC distribution: minus infinity where it fails."""
+    value, *conditions = arguments
+    for condition in conditions:
+        holds: Value = True
+        for each in condition.flat:
+            holds = arena.apply(ps.and_, holds, each)
+        value = _elementwise(arena, ps.switch, _as_array(holds), value, _as_array(float("-inf")))
+    return [value]
+
+
+def _inner_graph(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    graph = node.op.fgraph
+    return unroll(arena, graph.inputs, arguments, graph.outputs, max_expressions=10**9)
+
+
+def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    return [_matmul(arena, *arguments)]
+
+
+def _shape(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    return [np.asarray(arguments[0].shape, dtype="int64")]
+
+
+def _shape_i(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    return [np.asarray(arguments[0].shape[node.op.i], dtype="int64")]
+
+
+def _same(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    return [arguments[0]]
+
+
+_RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
+    ((Elemwise,), _elemwise),
+    ((CAReduce,), _reduce),
+    ((Dot,), _dot),
+    ((Cholesky,), _cholesky),
+    ((SolveTriangular,), _solve_triangular),
+    ((Blockwise,), _blockwise),
+    ((Subtensor, AdvancedSubtensor), _subtensor),
+    ((IncSubtensor, AdvancedIncSubtensor), _inc_subtensor),
+    ((ptb.MakeVector,), _make_vector),
+    ((ptb.Alloc,), _alloc),
+    ((Shape,), _shape),
+    ((Shape_i,), _shape_i),
+    ((CheckAndRaise,), _check),
+    ((OpFromGraph,), _inner_graph),
+    ((SpecifyShape, ViewOp, DeepCopyOp), _same),
+    ((ptb.TensorFromScalar, ptb.ScalarFromTensor), _same),
+    ((DimShuffle, ptb.ExtractDiag), _move),
+    ((Reshape, JoinDims, SplitDims, ptb.Split), _move),
+    ((ptb.Join,), _join),
+)

@@ -1,0 +1,110 @@
+"""Vector functions for several parameter points side by side, as vector code.
+
+A point is a lane. All numbers of all lanes are in one flat array ``W`` of rows of `LANES`: the
+parameters, the vector ``s``, a last number, and what depends on parameters alone, which is computed
+once. The rows' distances are constants of the source, so that LLVM knows them apart; the number of
+lanes is not, because a short loop of known length is unrolled before it can become vector code.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled, VectorFunction
+from pymc_statespace_filters.compiler.codegen.functions import build, sorted_by_number, unrolled
+from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+
+LANES = 16  # at most
+LANES_AT_ONCE = 8  # their number is a multiple of this
+
+_SHARED = {"u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]"}
+_ARGUMENTS = "W, n_lanes, inputs, k, t, d"
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Compiled functions ``name(W, n_lanes, inputs, k, t, d)``, and what ``W`` holds.
+
+    Rows ``i`` are theta, rows ``n_theta + i`` the vector ``s``, the row ``last`` what a function
+    returns beside ``s``. ``prepare`` are functions to be called once theta is in its rows.
+    """
+
+    functions: Mapping[str, Any]
+    prepare: Sequence[Any]
+    last: int
+    n_rows: int
+    key: str | None
+
+
+def lane_functions(functions: Mapping[str, VectorFunction], size: int) -> Lanes:
+    """The functions for lanes; raises NotUnrollableError where there is no scalar form."""
+    n_theta = next(iter(functions.values())).graph.inputs["theta"].type.shape[0]
+    last = n_theta + size
+    n_rows = last + 1
+    built: dict[str, Compiled] = {}
+    prepare: dict[str, Compiled] = {}
+    for name, function in functions.items():
+        values = [v for group in unrolled(function.graph) for v in group]
+        code = _element_code(function, n_theta)
+        constants = _constants(values, code)
+        rows = {v: _row(n_rows + i) for i, v in enumerate(constants)}
+        prepare[name] = _function(f"prepare_{name}", code, {}, constants, list(rows.values()))
+        targets = [_row(n_theta + i) for i in range(size)] + [_row(last)]
+        built[name] = _function(name, code, rows, values, targets[: len(values)])
+        n_rows += len(constants)
+    return Lanes(
+        {name: compiled.function for name, compiled in built.items()},
+        [compiled.function for compiled in prepare.values()],
+        last,
+        n_rows,
+        key_of(f"{LANES} lanes", *(c.key for c in (*built.values(), *prepare.values()))),
+    )
+
+
+def _row(row: int) -> str:
+    return f"W[{row * LANES} + lane]"
+
+
+def _element_code(function: VectorFunction, n_theta: int) -> dict[str, str]:
+    first = {"theta": 0, "s": n_theta}
+    return {
+        f"{name}.{i}": _SHARED[name].format(i=i) if name in _SHARED else _row(first[name] + i)
+        for name, variable in function.graph.inputs.items()
+        for i in range(variable.type.shape[0] if variable.type.ndim else 1)
+    }
+
+
+def _named(code: Mapping[str, str], *inputs: str) -> frozenset[str]:
+    return frozenset(key for key in code if key.partition(".")[0] in inputs)
+
+
+def _constants(values: Sequence[Value], code: Mapping[str, str]) -> list[Value]:
+    """What depends on theta alone and is used by something that does not, or is a result."""
+    varying = depends_on(values, _named(code, "s", "u", "t", "d"))
+    of_theta = depends_on(values, _named(code, "theta")) - varying
+    used = [*values, *(a for e in varying for a in e.args)]
+    kept = {v for v in used if v in of_theta and v.op is not None and v.kind == FLOAT}
+    return sorted_by_number(kept)
+
+
+def _function(
+    name: str,
+    code: dict[str, str],
+    known: Mapping[Value, str],
+    values: Sequence[Value],
+    targets: Sequence[str],
+) -> Compiled:
+    """Write ``values`` to ``targets`` in every lane; what lanes share is computed before."""
+    writer = Writer(code, FOR_MEMBERS, known)
+    of_lane = depends_on(values, _named(code, "theta", "s"))
+    used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
+    before = writer.statements(
+        sorted_by_number({v for v in used if isinstance(v, Expression) and v not in of_lane})
+    )
+    inside = writer.statements(values)
+    inside += [f"{t} = {writer.as_float(v)}" for t, v in zip(targets, values, strict=True)]
+    loop = ["for lane in range(n_lanes):", *(f"    {line}" for line in inside or ["pass"])]
+    return build(name, _ARGUMENTS, [*before, *loop], writer)

@@ -1,0 +1,52 @@
+"""Drawing one observation of one state, with a numpy generator."""
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
+
+from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+def observation_sampler(system: StateSpaceModel) -> Compiled:
+    """``observe(rng, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1) to out (p,)."""
+    if (draw := system.equations.observation_draw) is not None:
+        return _distribution_sampler(system, draw)
+    machine = ensemble_machine(system)
+    observe_members, p, r = machine.simulate, system.p, system.r
+
+    def observe(rng, c, inputs, k, t, x, out):
+        observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))
+
+    return Compiled(jit(observe), machine.key)
+
+
+def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> Compiled:
+    """The user's distributions, drawn by PyTensor's own code."""
+    no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}
+    symbols = symbols_of(system) | no_noise
+    core = [symbols[name] for name in SYMBOLS]
+    generators = [variable.type() for variable in graph.inputs[len(core) :]]
+    (draw,) = graph.bind([*core, *generators])
+    # A mutable generator is advanced in place; a copy would give the same draw every time.
+    mutable = [pytensor.In(generator, mutable=True) for generator in generators]
+    named = [symbols[name] for name in ("theta", "x", "u", "t")]
+    code = array_code([*named, *mutable], [draw])
+    draw_code, n_theta, n_inputs = code.function, system.n_theta, system.n_inputs
+    no_inputs = np.zeros(0)
+    copies = "rng, " * len(generators)
+    source = (
+        "def observe(rng, c, inputs, k, t, x, out):\n"
+        f"    u = {'inputs[k]' if n_inputs else 'no_inputs'}\n"
+        "    (drawn,) = draw_code(c[:n_theta].copy(), x[:, 0].copy(), u, np.asarray(t), "
+        f"{copies})\n"
+        "    out[:] = drawn\n"
+    )
+    namespace = {"np": np, "draw_code": draw_code, "n_theta": n_theta, "no_inputs": no_inputs}
+    exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
+    return Compiled(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))

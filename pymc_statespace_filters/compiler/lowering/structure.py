@@ -1,0 +1,96 @@
+"""What the Jacobians of a system tell: noises that can be drawn as one, and linearity."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
+from pymc_statespace_filters.compiler.codegen.functions import unrolled
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
+from pymc_statespace_filters.compiler.codegen.source import depends_on
+from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, call, jacobian_of, symbols_of
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+_N_TRIALS = 5
+
+
+def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
+    """B Q B^T, if g(x, q) = g(x, 0) + B q with more noises than states and B the same everywhere.
+
+    The sum of independent noises on one state, ``[[0.6, sigma_m]]``, is one noise of the same law,
+    and drawing normals is most of the cost of an ensemble.
+    """
+    if system.m <= system.n:
+        return None
+    symbols = symbols_of(system)
+    gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
+    if not is_free_of(("x", "q", "u", "t"), gain, symbols):
+        return None
+    cov = pt.as_tensor(np.eye(system.m))
+    if system.equations.process_noise is not None:
+        cov = call(system.equations.process_noise, system, symbols)
+    return FrozenFunctionGraph.from_io([symbols[s] for s in SYMBOLS], [gain @ cov @ gain.T])
+
+
+def is_linear(system: StateSpaceModel) -> bool:
+    """Whether state and noise enter the transition and the observation linearly."""
+    symbols = symbols_of(system)
+    equations, variables = system.equations, ("x", "q", "e")
+    if equations.observation is None:
+        return False
+    jacobians = [
+        jacobian_of(call(graph, system, symbols), symbols[name])
+        for graph, names in ((equations.transition, "xq"), (equations.observation, "xe"))
+        for name in names
+    ]
+    return all(is_free_of(variables, jac, symbols) for jac in jacobians)
+
+
+@lru_cache(maxsize=256)
+def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
+    """Whether the noise of one step has a covariance of full rank, at a state somewhere.
+
+    Found by trial at a few points, for parameters may have any range; at points of its own, such as
+    a noise of zero, the rank may be less.
+    """
+    if system.m < system.n:
+        return False
+    symbols = symbols_of(system)
+    gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
+    cov = pt.as_tensor(np.eye(system.m))
+    if system.equations.process_noise is not None:
+        cov = call(system.equations.process_noise, system, symbols)
+    inputs = [symbols[name] for name in ("theta", "x", "q", "u", "t")]
+    noise_cov = pytensor.function(
+        inputs, gain @ cov @ gain.T, mode="FAST_COMPILE", on_unused_input="ignore"
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(_N_TRIALS):
+        point = [np.abs(rng.normal(size=value.type.shape)) for value in inputs]
+        found = noise_cov(*point)
+        if np.isfinite(found).all() and (found.diagonal() > 0).all():
+            sd = np.sqrt(found.diagonal())
+            if np.linalg.matrix_rank(found / np.outer(sd, sd), tol=1e-10) == system.n:
+                return True
+    return False
+
+
+def is_free_of(
+    names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
+) -> bool:
+    """Whether no element depends on the named symbols; False where that cannot be seen."""
+    try:
+        (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
+    except NotUnrollableError:
+        return False
+    inputs = {f"{name}.{i}" for name in names for i in range(_size(symbols[name]))}
+    return not depends_on(values, frozenset(inputs))
+
+
+def _size(symbol: TensorVariable) -> int:
+    return symbol.type.shape[0] if symbol.type.ndim else 1

@@ -1,0 +1,66 @@
+"""The traced functions of a system at given symbols, and their Jacobians."""
+
+from collections.abc import Mapping
+
+import pytensor.tensor as pt
+from pytensor.gradient import jacobian
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+# What the traced functions of a system are functions of, in this order.
+SYMBOLS = ("theta", "x", "q", "u", "t", "e", "d")
+
+
+def _sizes(system: StateSpaceModel) -> dict[str, int | None]:
+    counts = (system.n_theta, system.n, system.m, system.n_inputs, None, system.r, system.p)
+    return dict(zip(SYMBOLS, counts, strict=True))
+
+
+def symbols_of(system: StateSpaceModel) -> dict[str, TensorVariable]:
+    """Fresh symbols with the names and sizes of the system's."""
+    return {
+        name: pt.tensor(name, shape=() if size is None else (size,), dtype="float64")
+        for name, size in _sizes(system).items()
+    }
+
+
+def call(
+    graph: FrozenFunctionGraph,
+    system: StateSpaceModel,
+    values: Mapping[str, TensorVariable],
+) -> TensorVariable:
+    """The output of a traced function at given values; symbols not given are zero."""
+    arguments = [
+        values[name] if name in values else pt.zeros(() if size is None else (size,))
+        for name, size in _sizes(system).items()
+    ]
+    (output,) = graph.bind(arguments)
+    return output
+
+
+def observation_moments(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> tuple[TensorVariable, TensorVariable]:
+    """h(x, 0) and D Gamma D^T (Eq. 4.4); for additive noise D is the identity."""
+    symbols = {name: symbol for name, symbol in symbols.items() if name != "e"}
+    cov = call(system.equations.observation_noise, system, symbols)
+    if system.additive_noise:
+        return call(system.equations.observation, system, symbols), cov
+    e = pt.tensor("e", shape=(system.r,), dtype="float64")
+    seen = call(system.equations.observation, system, {**symbols, "e": e})
+    noise_jac = jacobian_of(seen, e)
+    at_zero = FrozenFunctionGraph.from_io([e, *symbols.values()], [seen, noise_jac])
+    mean, noise_jac = at_zero.bind([pt.zeros((system.r,)), *symbols.values()])
+    return mean, noise_jac @ cov @ noise_jac.T
+
+
+def jacobian_of(output: TensorVariable, wrt: TensorVariable) -> TensorVariable:
+    """d output / d wrt, shape (len(output), len(wrt)); zeros where there is no connection."""
+    shape = (output.type.shape[0], wrt.type.shape[0])
+    if 0 in shape:
+        return pt.zeros(shape)
+    return pt.specify_shape(
+        jacobian(output, wrt, vectorize=True, disconnected_inputs="ignore"), shape
+    )

@@ -1,0 +1,131 @@
+"""One compiled function at many rows of arguments: a loop of machine code, in threads."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
+from pymc_statespace_filters.parallel.cpu_affinity import available_cores
+
+_REFRESH_SECONDS = 0.1
+# What the main thread and a calling one tell each other.
+_N_DONE, _STOP = 0, 1
+
+
+def _call_rows(call, argument, rows, results, told):
+    """Call with every row of words (m, size), until told to stop; False if one call raised."""
+    for i in range(len(rows)):
+        if told[_STOP]:
+            return True
+        for j in range(argument.size):
+            argument[j] = rows[i, j]
+        if not make_call(call):
+            return False
+        for j in range(results.shape[1]):
+            results[i, j] = call.out[1 + j]
+        told[_N_DONE] = i + 1
+    return True
+
+
+_call_rows = kept(
+    njit(_call_rows, error_model="numpy", nogil=True),
+    digest("call_rows", Path(__file__).read_text()),
+)
+
+
+class ManyCalls:
+    """A compiled PyTensor function at many points; neither order nor number of threads matters.
+
+    Parameters
+    ----------
+    function : pytensor.compile.executor.Function
+        Of float64 and int64 arguments, with numbers as results.
+    varying : sequence of ndarray
+        An example of each of its first arguments, those that differ from row to row.
+    constant : sequence of ndarray
+        The other arguments.
+
+    Attributes
+    ----------
+    shapes : list of tuple of int
+        Shapes of the results.
+    watch : callable
+        Told, in the main thread, how many rows were done since it was last told.
+    """
+
+    def __init__(
+        self, function: Any, varying: Sequence[np.ndarray], constant: Sequence[np.ndarray] = ()
+    ) -> None:
+        self._examples = [np.array(value, order="C") for value in varying]
+        self._constant = [np.array(value, order="C") for value in constant]
+        self._native = NativeFunction(function, [*self._examples, *self._constant])
+        self.shapes = self._native.shapes
+        self.watch: Callable[[int], None] = lambda count: None
+
+    def __call__(self, *columns: np.ndarray) -> NDArray[np.float64]:
+        """Results of every row, (m, size), one after the other; NaN for rows not reached.
+
+        ``columns`` are the varying arguments, each with a first dimension of length m.
+        """
+        rows = self._words(columns)
+        results = np.full((len(rows), self._native.size), np.nan)
+        n_threads = min(available_cores(), max(1, len(rows)))
+        ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
+        told = np.zeros((n_threads, 2), dtype=np.int64)
+        parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
+        with ThreadPoolExecutor(n_threads) as pool:
+            futures = [
+                pool.submit(self._call_part, rows[part], results[part], told[i])
+                for i, part in enumerate(parts)
+            ]
+            try:
+                self._wait(futures, told)
+            finally:
+                told[:, _STOP] = True
+        return results
+
+    def _words(self, columns: Sequence[np.ndarray]) -> NDArray[np.int64]:
+        """The arguments of each row as words of eight bytes, whatever their type."""
+        parts = [
+            np.ascontiguousarray(column, example.dtype)
+            .reshape(len(column), example.size)
+            .view(np.int64)
+            for column, example in zip(columns, self._examples, strict=True)
+        ]
+        return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+    def _call_part(
+        self, rows: NDArray[np.int64], results: NDArray[np.float64], told: NDArray[np.int64]
+    ) -> None:
+        argument, arguments = self._laid_out()
+        call, kept_alive = self._native.bind(arguments)
+        if not _call_rows(call, argument, rows, results, told):
+            self._native(*arguments)  # raises what the machine code met
+        del kept_alive
+
+    def _laid_out(self) -> tuple[NDArray[np.int64], list[np.ndarray]]:
+        """A vector of words, and all arguments, of which the varying ones are views of it."""
+        argument = np.concatenate([np.ravel(value).view(np.int64) for value in self._examples])
+        arguments, start = [], 0
+        for value in self._examples:
+            words = argument[start : start + value.size]
+            arguments.append(words.view(value.dtype).reshape(value.shape))
+            start += value.size
+        return argument, [*arguments, *self._constant]
+
+    def _wait(self, futures: Sequence[Future], told: NDArray[np.int64]) -> None:
+        n_told, pending = 0, set(futures)
+        while pending:
+            done, pending = wait(pending, _REFRESH_SECONDS, return_when=FIRST_EXCEPTION)
+            for future in done:
+                future.result()
+            n_done = int(told[:, _N_DONE].sum())
+            self.watch(n_done - n_told)
+            n_told = n_done

@@ -1,0 +1,217 @@
+"""A compiled PyTensor function as something that machine code can call, without Python.
+
+PyTensor's function is machine code already, with arrays as arguments and results. A call of it is
+described by a table of addresses: an adapter makes arrays of them, calls the function by its own
+address, and writes all results one after the other into a vector of float64. Adapters depend on the
+types alone, so that a second function of the same types compiles nothing.
+"""
+
+import ctypes
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import carray, njit, typeof, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry, call_address
+from pymc_statespace_filters.compiler.native.private_linkage import closed
+
+_N_ADDRESSES = 2  # of adapter and function, before those of the inputs
+
+
+class Call(NamedTuple):
+    """What machine code needs for a call; each thread has its own.
+
+    Attributes
+    ----------
+    table : ndarray of int64
+        Addresses of the adapter, of the function and of its inputs; the inputs' shapes; and the
+        length of ``out``.
+    out : ndarray, shape (1 + n,)
+        0, or 1 if the function raised; then the results, one after the other.
+    """
+
+    table: np.ndarray
+    out: np.ndarray
+
+
+@njit(error_model="numpy", nogil=True, inline="always")
+def make_call(call):
+    """Make the call, and tell whether it succeeded."""
+    call_address(call.table[0], (call.table, call.out))
+    return call.out[0] == 0.0
+
+
+class NativeFunction:
+    """A compiled PyTensor function whose inputs and outputs are arrays of numbers.
+
+    In PyTensor's modes without numba, machine code calls back into Python instead.
+
+    Parameters
+    ----------
+    function : pytensor.compile.executor.Function
+    example : sequence of ndarray
+        Inputs for a first call, from which types and shapes are learnt.
+
+    Attributes
+    ----------
+    shapes : list of tuple of int
+        Shapes of the results.
+
+    Raises
+    ------
+    Exception
+        What the function raises at the example.
+    """
+
+    def __init__(self, function: Any, example: Sequence[np.ndarray]):
+        self._function = function
+        self._one_at_a_time = Lock()  # PyTensor's functions have one storage for all threads
+        shared = [cell.storage[0] for cell in function.input_storage[len(example) :]]
+        self._is_native = hasattr(function.vm, "jit_fn") and all(
+            isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
+        )
+        if self._is_native:
+            closed(function.vm.jit_fn)
+        # The values of now, in the one layout that adapters know.
+        self._data = [_contiguous(value) for value in shared] if self._is_native else []
+        self.shapes = [np.shape(result) for result in self(*example)]
+
+    @property
+    def size(self) -> int:
+        """How many numbers the results have in all."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
+        """Call from Python."""
+        if self._is_native:
+            return self._function.vm.jit_fn(*inputs, *self._data)
+        with self._one_at_a_time:
+            return self._function(*inputs)
+
+    def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
+        """Make a call that reads these contiguous arrays each time.
+
+        Returns
+        -------
+        Call
+        object
+            Keep it as long as the call.
+        """
+        out = np.zeros(1 + self.size)
+        if not self._is_native:
+            callback = self._callback(inputs, out)
+            address = ctypes.cast(callback, ctypes.c_void_p).value
+            return Call(np.array([address], dtype=np.int64), out), (callback, inputs)
+        arrays = [*inputs, *self._data]
+        kinds = types.Tuple([typeof(array) for array in arrays])
+        overloads = self._function.vm.jit_fn.overloads
+        # PyTensor's functions take a tuple if they are kept on disk, else single arguments.
+        signature = (kinds,) if (kinds,) in overloads else kinds.types
+        compiled = overloads[signature]
+        addresses = [
+            _adapter(kinds, signature, compiled.fndesc.restype),
+            compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name),
+            *(array.ctypes.data for array in arrays),
+        ]
+        lengths = [length for array in arrays for length in array.shape]
+        return Call(np.array([*addresses, *lengths, out.size], dtype=np.int64), out), arrays
+
+    def _callback(self, inputs: Sequence[np.ndarray], out: np.ndarray) -> Any:
+        def evaluate(table: int, results: int) -> None:
+            out[0] = 1.0
+            # An exception cannot pass through machine code; whoever finds the 1 calls again.
+            with suppress(Exception):
+                values = self(*inputs)
+                out[1:] = np.concatenate([np.ravel(value) for value in values])
+                out[0] = 0.0
+
+        return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(evaluate)
+
+
+def _contiguous(value: np.ndarray) -> np.ndarray:
+    return np.array(value, order="C")
+
+
+@cache
+def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTuple) -> int:
+    """Compile, for these types, what turns a table of addresses into a call; give its address."""
+    namespace: dict[str, Any] = {"__name__": __name__, "carray": carray, "pointer": _pointer}
+    namespace["invoke"] = _invoker(signature, results)
+    arrays, n_table = "", _N_ADDRESSES + len(arguments)
+    for i, kind in enumerate(arguments):
+        namespace[f"dtype_{i}"] = np.dtype(str(kind.dtype))
+        lengths = "".join(f"of[{n_table + axis}], " for axis in range(kind.ndim))
+        arrays += f"carray(pointer(of[{_N_ADDRESSES + i}]), ({lengths}), dtype_{i}), "
+        n_table += kind.ndim
+    lines = [
+        f"of = carray(table, ({n_table + 1},))",
+        f"numbers = carray(out, (of[{n_table}],))",
+        f"raised, results = invoke(of[1], ({arrays}))",
+        "numbers[0] = raised",
+        "if raised:",
+        "    return",
+        "n = 1",
+    ]
+    for i, kind in enumerate(results):
+        if kind.ndim:
+            lines += [f"for value in results[{i}].flat:", "    numbers[n] = value", "    n += 1"]
+        else:
+            lines += [f"numbers[n] = results[{i}].item()", "n += 1"]
+    source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
+    exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
+    key = digest("adapter", Path(__file__).read_text(), source, str(signature), str(results))
+    entry = Entry(namespace["adapter"], (COUNTS, NUMBERS), "adapter", key)
+    entry.compile()
+    return entry.address
+
+
+@intrinsic
+def _pointer(typing_context, address):
+    """An integer as an address."""
+
+    def generate(context, builder, signature, values):
+        return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), generate
+
+
+def _forget_error(context: Any, builder: Any) -> None:
+    """Clear the interpreter's error: an operation in Python may have set it, and we go on."""
+    python = context.get_python_api(builder)
+    lock = python.gil_ensure()
+    python.err_clear()
+    python.gil_release(lock)
+
+
+def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
+    """Call the numba function at an address: whether it raised, and its results."""
+
+    @intrinsic
+    def invoke(typing_context, address, arguments):
+        def generate(context, builder, _, values):
+            given = [values[1]]
+            if signature != (arguments,):
+                given = list(cgutils.unpack_tuple(builder, values[1]))
+            convention = context.call_conv
+            kind = convention.get_function_type(results, signature)
+            function = builder.inttoptr(values[0], kind.as_pointer())
+            # Results of a function that raised are null arrays, which may be released.
+            status, returned = convention.call_function(
+                builder, function, results, signature, given
+            )
+            with builder.if_then(status.is_error, likely=False):
+                _forget_error(context, builder)
+            return context.make_tuple(builder, outcome, (status.is_error, returned))
+
+        outcome = types.Tuple((types.boolean, results))
+        return outcome(types.int64, arguments), generate
+
+    return invoke

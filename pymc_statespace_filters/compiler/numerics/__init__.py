@@ -1,0 +1,1 @@
+"""Compiled mathematical functions that know no model."""

@@ -1,0 +1,96 @@
+"""Small Gaussian algebra: Cholesky factors, triangular solves and the log-density, in place."""
+
+import math
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+
+LOG_TWO_PI = math.log(2.0 * math.pi)
+
+_STRICT = 1e-14  # a pivot below this share of its variance is rounding noise of a singular matrix
+_SEMIDEFINITE = 1e-12  # wider: a direction is rather dropped than divided by a noisy pivot
+
+
+@pasted
+def _eliminate(A, j):
+    """Pivot j of the factor of A whose columns before j are done."""
+    pivot = A[j, j]
+    for k in range(j):
+        pivot -= A[j, k] * A[j, k]
+    return pivot
+
+
+@pasted
+def _scale_column(A, j, root):
+    """Column j of the factor below and on the diagonal, zeros above."""
+    n = A.shape[0]
+    A[j, j] = root
+    for i in range(j + 1, n):
+        below = A[i, j]
+        for k in range(j):
+            below -= A[i, k] * A[j, k]
+        A[i, j] = below / root
+        A[j, i] = 0.0
+
+
+@compiled
+def cholesky(A):
+    """Replace A by its lower Cholesky factor; False, with A half done, if not positive definite."""
+    for j in range(A.shape[0]):
+        pivot = _eliminate(A, j)
+        if not (pivot > _STRICT * A[j, j] and pivot < np.inf):
+            return False
+        _scale_column(A, j, math.sqrt(pivot))
+    return True
+
+
+@compiled
+def semidefinite_cholesky(A, floor, active):
+    """Replace A by a lower factor in which directions without variance have a zero column.
+
+    A pivot that does not exceed its share of rounding noise, or ``floor[j]``, is such a direction:
+    ``active[j]`` becomes False. Returns False if A holds NaN or infinity.
+    """
+    for j in range(A.shape[0]):
+        pivot = _eliminate(A, j)
+        if not (pivot > -np.inf and pivot < np.inf):
+            return False
+        active[j] = pivot > _SEMIDEFINITE * A[j, j] and pivot > floor[j]
+        if active[j]:
+            _scale_column(A, j, math.sqrt(pivot))
+        else:
+            for i in range(j, A.shape[0]):
+                A[i, j] = A[j, i] = 0.0
+    return True
+
+
+@compiled
+def solve_lower(L, b):
+    """Replace b by L^-1 b."""
+    for i in range(b.size):
+        for k in range(i):
+            b[i] -= L[i, k] * b[k]
+        b[i] /= L[i, i]
+
+
+@compiled
+def solve_lower_transposed(L, b):
+    """Replace b by L^-T b."""
+    for i in range(b.size - 1, -1, -1):
+        for k in range(i + 1, b.size):
+            b[i] -= L[k, i] * b[k]
+        b[i] /= L[i, i]
+
+
+@compiled
+def log_gaussian(r, L, n_dims):
+    """log N(r; 0, L L^T) of which ``n_dims`` components count; r is overwritten.
+
+    Components that are left out have a zero in r and a row and column of the identity in L.
+    """
+    solve_lower(L, r)
+    total = -0.5 * n_dims * LOG_TWO_PI
+    for i in range(r.size):
+        total -= 0.5 * r[i] * r[i] + math.log(L[i, i])
+    return total

@@ -1,0 +1,1 @@
+"""Records, likelihoods and filtered states without PyMC."""

@@ -1,0 +1,225 @@
+"""Log-likelihoods without PyMC: numbers in, numbers out."""
+
+import hashlib
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pymc_statespace_filters.errors import DataMismatchError, FilterWarning, ModelError
+from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
+from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.shared import SharedLogLikelihood
+from pymc_statespace_filters.parallel.communicator import Ranks, ranks_of
+from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.parameters import flat_parameters
+from pymc_statespace_filters.system.record import check_seed, check_system, checked_record
+
+
+def log_likelihood(
+    system: StateSpaceModel,
+    filter: Filter,
+    params: Any,
+    observed: Any,
+    *,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    t0: float = 0.0,
+    seed: Any = 0,
+    comm: Any = None,
+) -> np.ndarray:
+    """Evaluate the log-likelihood of a record, term by term.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+    filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter
+    params : mapping
+        Parameter values by name; arrays broadcast to a shape S (a declared parameter's own shape
+        comes last).
+    observed : array_like, shape (J, p), or (J,) if p = 1
+        The record; NaN marks a missing component.
+    steps : array_like of int, shape (J,)
+        The step of each observation; 0 is where the initial state holds. Or give `times`.
+    times : array_like, shape (J,)
+        Times of the observations, on the grid ``t0 + k * dt`` to a millionth of a step.
+    inputs : array_like, shape (rows, n_inputs)
+        Row k holds during step k.
+    t0 : float
+        Time of step 0.
+    seed : int or array_like of int
+        The noise inside the filter, if it has any; broadcasts with the parameters.
+    comm : mpi4py.MPI.Intracomm or "world", optional
+        Ranks among which the filter's members are divided, in blocks of 64. All of them call this
+        with the same arguments and get the same result, to the bit that of one rank.
+
+    Returns
+    -------
+    ndarray, shape S + (J,)
+        log p(d_j | d_1 .. d_{j-1}); their sum over j is the log-likelihood. A wholly missing row
+        has the term 0; from an observation at which the filter fails on, terms are -inf.
+
+    Raises
+    ------
+    ModelError
+        If an argument does not fit the system, or the filter has not enough members for the ranks.
+    ParallelError
+        If MPI cannot be had as it was asked for, or the ranks are not alike.
+
+    Warns
+    -----
+    FilterWarning
+        Once, on the first rank, if a filter failed or its particles collapsed.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> terms = psf.log_likelihood(system, psf.EKF(), {"a": 0.9}, [0.3, 1.2], steps=[0, 3])
+    >>> terms.shape
+    (2,)
+    """
+    check_kinds(system, filter)
+    record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
+    theta = flat_parameters(system, params)
+    seeds = check_seed("seed", seed)
+    try:
+        shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
+    except ValueError:
+        raise ModelError(
+            f"seed of shape {seeds.shape} does not broadcast with parameters "
+            f"of shape {theta.shape[:-1]}"
+        ) from None
+    theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
+    seeds = np.broadcast_to(seeds, shape)
+    points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
+    with ranks_of(comm) as ranks:
+        if ranks.size > 1:
+            _check_agreement(ranks, filter, (points, *record, seeds))
+        terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
+        if ranks.rank == 0:
+            warn_of(filter, health)
+    return terms.reshape(*shape, record.steps.size)
+
+
+def _check_agreement(ranks: Ranks, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
+    """Raise, on all ranks, unless all make the same call."""
+    mine = hashlib.sha256(repr((filter, [array.shape for array in arrays])).encode())
+    for array in arrays:
+        mine.update(np.ascontiguousarray(array).tobytes())
+    digests = ranks.gather(mine.digest())
+    for rank, theirs in enumerate(digests):
+        if theirs != digests[0]:
+            raise DataMismatchError(
+                f"rank {rank} of {ranks.size} was asked for the likelihood of other parameters, "
+                f"seeds or data than rank 0, or by another filter: all must make the same call"
+            )
+
+
+def _evaluate(
+    system: StateSpaceModel,
+    filter: Filter,
+    points: np.ndarray,
+    record: tuple,
+    seeds: np.ndarray,
+    ranks: Ranks,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Terms and health of every point: side by side where the filter can, else in turn."""
+    check_ranks(filter, ranks.size)
+    if len(points) > 1 and has_batch(LogLikelihood(system, filter)):
+        # Such a filter draws nothing: any seed will do.
+        return evaluator(BatchLogLikelihood(system, filter))(points, *record, seeds[0])
+    evaluate = shared_evaluator(system, filter, ranks)
+    terms = np.empty((len(points), record[0].size))
+    health = np.empty((len(points), HEALTH_SIZE))
+    for i, point in enumerate(points):
+        terms[i], health[i] = evaluate(point, *record, np.asarray(seeds[i]))
+    return terms, health
+
+
+def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Ranks) -> Callable:
+    """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
+
+    All call it with the same arguments, each moves its own members, and all get the same result, to
+    the bit that of one rank.
+
+    Raises
+    ------
+    ModelError
+        If the filter has no members for so many ranks.
+    """
+    check_ranks(filter, ranks.size)
+    if ranks.size == 1:
+        return evaluator(LogLikelihood(system, filter))
+    evaluate = evaluator(SharedLogLikelihood(system, filter))
+
+    def evaluate_together(*record: Any) -> tuple[np.ndarray, np.ndarray]:
+        results = evaluate(*record, ranks.rank, ranks.size, ranks.exchange)
+        ranks.check_exchange()
+        return results
+
+    return evaluate_together
+
+
+def check_ranks(filter: Filter, n_ranks: int) -> None:
+    """Raise unless a filter has members for so many ranks."""
+    if n_ranks == 1:
+        return
+    if not filter.noisy:
+        raise ModelError(
+            f"{filter} has no members to spread over {n_ranks} ranks; take one rank for each "
+            f"evaluation, or a filter with members: EnKF, BootstrapPF or PFEnKF"
+        )
+    most = filter.most_ranks()  # type: ignore[union-attr]
+    if n_ranks > most:
+        raise ModelError(
+            f"{filter} has members for {most} of {n_ranks} ranks alone: a rank takes whole blocks "
+            f"of 64 members"
+        )
+
+
+def warn_of(filter: Filter, health: np.ndarray, *, stacklevel: int = 3) -> None:
+    """One warning for what went wrong in some evaluations, given their health (n, 3)."""
+    failed = health[:, 1] != 0
+    if failed.any():
+        reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
+        listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
+        warnings.warn(
+            f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
+            FilterWarning,
+            stacklevel=stacklevel,
+        )
+    collapsed = ~failed & (health[:, 0] < COLLAPSED)
+    if collapsed.any():
+        warnings.warn(
+            f"{filter}: at some observation fewer than {COLLAPSED:g} particles carried all the "
+            f"weight, in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
+            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be tens of nats too "
+            f"low, by a different amount for every seed; more particles lessen this only slowly. "
+            f"EKF() and EnKF(n, likelihood='gaussian') do not collapse, but have a bias of their "
+            f"own where the state is not Gaussian.",
+            FilterWarning,
+            stacklevel=stacklevel,
+        )
+
+
+def check_kinds(system: Any, filter: Any) -> None:
+    """Raise unless these are a system and a filter that can treat it."""
+    check_system(system)
+    if not isinstance(filter, Filter.__value__):
+        raise ModelError(
+            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
+        )
+    filter.check(system)

@@ -1,0 +1,185 @@
+"""Forward simulation of a system, in machine code."""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.observation_sampler import observation_sampler
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.parameters import flat_parameters
+from pymc_statespace_filters.system.record import (
+    check_inputs,
+    check_random_seed,
+    check_system,
+    check_t0,
+    steps_of,
+)
+
+
+@lru_cache(maxsize=256)
+def continuation(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, x, first, steps, inputs, t0) -> states (R, n), observations (R, p).
+
+    It goes on from the state x (n,) of step ``first`` and keeps what it meets at ``steps``, which
+    increase from there on.
+    """
+    machine, sampler = ensemble_machine(system), _sampler(system)
+    prepare, propagate, observe = machine.prepare, machine.propagate, sampler.function
+    dt, n, m, p = system.dt, system.n, machine.m, system.p
+
+    def go_on(rng, theta, x, first, steps, inputs, t0):
+        c = prepare(theta)
+        states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
+        now, k = x.copy().reshape(n, 1), first
+        for j in range(steps.size):
+            while k < steps[j]:
+                propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), now)
+                k += 1
+            states[j] = now[:, 0]
+            observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
+        return states, observations
+
+    return _kept(go_on, key_of("go on", machine.key, sampler.key))
+
+
+@lru_cache(maxsize=256)
+def observer(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, states, steps, inputs, t0) -> an observation (R, p) of each state.
+
+    ``states`` (R, n) are those at ``steps`` (R,).
+    """
+    machine, sampler = ensemble_machine(system), _sampler(system)
+    prepare, observe, dt, p = machine.prepare, sampler.function, system.dt, system.p
+
+    def look(rng, theta, states, steps, inputs, t0):
+        c, observations = prepare(theta), np.empty((steps.size, p))
+        for i in range(steps.size):
+            x, k = states[i].copy().reshape(-1, 1), steps[i]
+            observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
+        return observations
+
+    return _kept(look, key_of("look", machine.key, sampler.key))
+
+
+def _kept(function: Callable, key: str | None) -> Compiled:
+    """Compiled, from disk if any process did so before."""
+    compiled = jit(function)
+    return Compiled(compiled if key is None else kept(compiled, key), key)
+
+
+def _sampler(system: StateSpaceModel) -> Compiled:
+    if system.equations.observation is None and system.equations.observation_draw is None:
+        raise ModelError(
+            "the system has a density of observations (observation_logp) but nothing to draw "
+            "them from; simulating needs `observation` with `observation_noise` too"
+        )
+    return observation_sampler(system)
+
+
+@lru_cache(maxsize=256)
+def simulator(system: StateSpaceModel) -> Compiled:
+    """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
+    machine = ensemble_machine(system)
+    prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
+    sampler = _sampler(system)
+    observe, dt, n, m, p = sampler.function, system.dt, system.n, machine.m, system.p
+
+    def simulate(rng, theta, steps, inputs, t0):
+        c = prepare(theta)
+        n_steps = steps[-1] if steps.size else 0
+        states = np.empty((n_steps + 1, n))
+        observations = np.empty((steps.size, p))
+        x = np.empty((n, 1))
+        initialise(c, rng.standard_normal((n, 1)), x)
+        j = 0
+        for k in range(n_steps + 1):
+            states[k] = x[:, 0]
+            if j < steps.size and steps[j] == k:
+                observe(rng, c, inputs, k, t0 + k * dt, x, observations[j])
+                j += 1
+            if k < n_steps:
+                propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), x)
+        return states, observations
+
+    return _kept(simulate, key_of("simulate", machine.key, sampler.key))
+
+
+def simulate(
+    system: StateSpaceModel,
+    params: Mapping[str, Any],
+    *,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    t0: float = 0.0,
+    random_seed: Any = None,
+) -> xr.Dataset:
+    """Draw one path of the states and its observations.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+    params : mapping
+        A value for every parameter.
+    steps, times : array_like, shape (J,)
+        When observations are taken, as steps or as times; give one of them.
+    inputs : array_like, shape (rows, n_inputs)
+        Row k holds during step k.
+    t0 : float
+        Time of step 0.
+    random_seed : None, int or numpy.random.Generator
+
+    Returns
+    -------
+    xarray.Dataset
+        ``states`` (step, state) at every step from 0 to the last, ``observations``
+        (obs, observable), with the coordinates ``time`` and ``obs_time``.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.6]], dt=0.01),
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.08]],
+    ...     initial_mean=[1.0],
+    ...     initial_cov=[[0.5]],
+    ... )
+    >>> record = psf.simulate(system, {"a": 1.0}, steps=[0, 20, 40], random_seed=1)
+    >>> dict(record.sizes)
+    {'step': 41, 'state': 1, 'obs': 3, 'observable': 1}
+    """
+    check_system(system)
+    t0 = check_t0(t0)
+    at = steps_of(steps, times, system.dt, t0)
+    forces = check_inputs(inputs, system, at)
+    theta = flat_parameters(system, params)
+    if theta.ndim != 1:
+        raise ModelError(
+            f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}"
+        )
+    rng = check_random_seed(random_seed)
+    states, observations = simulator(system).function(rng, theta, at, forces, t0)
+    n_steps = np.arange(states.shape[0])
+    return xr.Dataset(
+        {
+            "states": (("step", "state"), states),
+            "observations": (("obs", "observable"), observations),
+        },
+        coords={
+            "step": n_steps,
+            "state": list(system.states),
+            "obs": at,
+            "observable": list(system.observables),
+            "time": ("step", t0 + n_steps * system.dt),
+            "obs_time": ("obs", t0 + at * system.dt),
+        },
+    )

@@ -1,0 +1,259 @@
+"""How model probabilities depend on what was put in: the correction's exponent, the priors' width.
+
+The thesis's certainty came in good part from its correction for the number of parameters (after
+Eq. 3.7); the rest depends on the priors. These curves show both.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.comparison.compare import (
+    DimensionCorrection,
+    compare_evidence,
+)
+from pymc_statespace_filters.evidence.comparison.probabilities import (
+    check_ci_prob,
+    prior_weights,
+    probabilities,
+)
+from pymc_statespace_filters.evidence.comparison.rivals import Given
+from pymc_statespace_filters.evidence.comparison.scaled_prior import (
+    UNCHANGED,
+    Reweighted,
+    StretchedPrior,
+)
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+
+EXPONENTS = np.linspace(0, 4, 41)
+WIDTHS = np.geomspace(0.25, 4, 17)
+NEEDED = ("log_evidence", "se", "n_parameters", "n_observations", "prior")
+
+Array = NDArray[np.float64]
+
+
+def prior_sensitivity(
+    evidences: Mapping[str, Given] | pd.DataFrame,
+    *,
+    exponents: ArrayLike | None = None,
+    models: Mapping[str, pm.Model] | None = None,
+    widths: ArrayLike | None = None,
+    var_names: str | Iterable[str] | None = None,
+    prior: Mapping[str, float] | None = None,
+    ci_prob: float = 0.95,
+    estimator: str | None = None,
+) -> xr.Dataset:
+    r"""Curves of the model probabilities over the correction's exponent and the priors' width.
+
+    The width of priors is varied by reweighting the draws, without new likelihoods. With the factor
+    w a prior p becomes :math:`p_w(\phi) = p(c + (\phi - c)/w)/w`, and the evidence
+    :math:`Z_w = Z\, E[p_w(\phi)/p(\phi)]`, the mean being over the posterior. The centre c is zero
+    where the support begins or ends at zero (scales, most Uniform priors of a stiffness), the end
+    of any other half-line, and PyMC's support point (the mean or the like) of the rest. A prior
+    that depends on other variables is stretched given them.
+
+    Parameters
+    ----------
+    evidences : mapping as for `compare_evidence`, or its table
+        For widths a mapping of DataTrees that hold the posterior draws beside the group
+        ``evidence``. From a table only its evidences and its column ``prior`` are used, not its
+        correction.
+    exponents : array_like of float, optional
+        alpha of `DimensionCorrection`, in one dimension; 0, no correction, to 4 by default.
+    models : mapping of str to pymc.Model, optional
+        The model of each DataTree, if the width is to be varied.
+    widths : array_like of float, optional
+        Positive factors w, in one dimension; a quarter to 4 by default.
+    var_names : str or iterable of str, optional
+        The free variables whose priors are stretched, in the models that have them; all by default.
+    prior, ci_prob, estimator
+        As for `compare_evidence`.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``prob``, ``prob_low`` and ``prob_high``, dims (model, exponent). With `models` also, of
+        dims (model, width) and without a correction, ``width_prob``, ``width_prob_low``,
+        ``width_prob_high``; ``width_log_evidence`` and its error ``width_se``, which adds that of
+        the reweighting to that of the evidence; and, as reasons, ``width_n_effective`` (what the
+        draws are worth there, in independent terms of relative variance one), ``width_pareto_k``
+        (of the weights' tail) and ``width_beyond`` (below).
+
+        NaN, and no guess, is what stands where the draws do not know the answer: if they are worth
+        less than 100, if Pareto's k is above 0.5 (the posterior is nearly as wide as the prior, and
+        a mean of such weights has no standard error), or if more than 2 per cent of the evidence
+        may lie beyond the bounds of an actual prior, where there are no draws. Of that share
+        ``width_beyond`` is an upper bound, from the draws in the outermost 5 per cent of a bounded
+        support, if likelihood and prior do not rise outwards from there. The probabilities of all
+        models are NaN where the evidence of one is.
+
+    Raises
+    ------
+    ModelError
+        If an argument is wrong; if a prior has no width that could be changed: it is improper, or
+        of a probability, an angle, a simplex or a covariance.
+    DataMismatchError
+        If the models were given different data, or the draws belong to another model.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> linear = psf.Evidence(-41.0, 0.02, "bridge", 2, 100, -35.0, "0c5f")
+    >>> cubic = psf.Evidence(-39.0, 0.02, "bridge", 3, 100, -31.0, "0c5f")
+    >>> curves = psf.prior_sensitivity({"linear": linear, "cubic": cubic}, exponents=[0, 1, 3])
+    >>> curves["prob"].sel(model="cubic").values.round(3)
+    array([0.881, 0.425, 0.007])
+
+    One mean, whose prior is stretched to twice its width; the exact log-evidence then is -5.27:
+
+    >>> import arviz as az
+    >>> import numpy as np
+    >>> import pymc as pm
+    >>> normals = np.random.default_rng(1).standard_normal((4, 1000))
+    >>> idata = az.from_dict({"posterior": {"mu": 4 / 13 + normals / np.sqrt(3.25)}})
+    >>> with pm.Model() as model:
+    ...     mu = pm.Normal("mu", 0, 2)
+    ...     _ = pm.Normal("y", mu, 1, observed=[0.3, -0.4, 1.1])
+    ...     _ = psf.chib_jeliazkov(idata, random_seed=2)
+    >>> curves = psf.prior_sensitivity({"mean": idata}, models={"mean": model}, widths=[1, 2])
+    >>> curves["width_log_evidence"].sel(model="mean").values.round(1)
+    array([-4.6, -5.3])
+    """
+    check_ci_prob(ci_prob)
+    table = _table(evidences, prior, estimator)
+    alphas, factors = _grid("exponents", exponents, EXPONENTS), _grid("widths", widths, WIDTHS)
+    if not (factors > 0).all():
+        raise ModelError(f"widths must be positive, got {widths!r}")
+    if models is None and not (widths is None and var_names is None):
+        raise ModelError("widths and var_names need models, the pm.Model of each DataTree")
+    drawn = None if models is None else _drawn(evidences, models, list(table.index), var_names)
+    found = _over_exponents(table, alphas, ci_prob)
+    if drawn is not None:
+        found = found.merge(_over_widths(table, drawn, factors, ci_prob))
+    return found.assign_attrs(ci_prob=ci_prob)
+
+
+def _over_exponents(table: pd.DataFrame, exponents: Array, ci_prob: float) -> xr.Dataset:
+    corrections = [DimensionCorrection(exponent) for exponent in exponents.tolist()]
+    added = [[c.log_prior(row) for c in corrections] for row in table.itertuples()]
+    log_evidence = table["log_evidence"].to_numpy()[:, np.newaxis] + np.array(added)
+    se = np.repeat(table["se"].to_numpy()[:, np.newaxis], len(exponents), axis=1)
+    return _curves("exponent", exponents, table, log_evidence, se, ci_prob)
+
+
+def _over_widths(
+    table: pd.DataFrame, drawn: Mapping[str, "_Drawn"], widths: Array, ci_prob: float
+) -> xr.Dataset:
+    found = [[drawn[name].reweighted(width) for width in widths.tolist()] for name in table.index]
+    known = np.array([[one.is_known for one in of_model] for of_model in found])
+    ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
+    log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
+    se = np.where(known, np.hypot(table["se"].to_numpy()[:, np.newaxis], error), np.nan)
+    curves = _curves("width", widths, table, log_evidence, se, ci_prob)
+    fields = {
+        "log_evidence": log_evidence,
+        "se": se,
+        "n_effective": n_effective,
+        "pareto_k": pareto_k,
+        "beyond": beyond,
+    }
+    curves = curves.assign({name: (("model", "width"), field) for name, field in fields.items()})
+    return curves.rename({name: f"width_{name}" for name in curves.data_vars})
+
+
+def _curves(
+    dim: str, points: Array, table: pd.DataFrame, log_evidence: Array, se: Array, ci_prob: float
+) -> xr.Dataset:
+    """Probabilities where the log-evidences, and their errors, are as given: (model, point)."""
+    log_weight = log_evidence + np.log(table["prior"].to_numpy())[:, np.newaxis]
+    of_points = [
+        probabilities(weights, errors, ci_prob)
+        for weights, errors in zip(log_weight.T, se.T, strict=True)
+    ]
+    prob, low, high = np.moveaxis(np.array(of_points), 0, -1)
+    dims = ("model", dim)
+    return xr.Dataset(
+        {"prob": (dims, prob), "prob_low": (dims, low), "prob_high": (dims, high)},
+        coords={"model": list(table.index), dim: points},
+    )
+
+
+def _grid(name: str, given: ArrayLike | None, default: Array) -> Array:
+    if given is None:
+        return default
+    try:
+        grid = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        grid = np.empty(0)
+    if grid.ndim != 1 or grid.size == 0 or not np.isfinite(grid).all():
+        raise ModelError(f"{name} must be finite numbers in one dimension, got {given!r}")
+    return grid
+
+
+def _table(
+    evidences: Mapping[str, Given] | pd.DataFrame,
+    prior: Mapping[str, float] | None,
+    estimator: str | None,
+) -> pd.DataFrame:
+    """The table of `compare_evidence`, with the models in the order in which they were given."""
+    if not isinstance(evidences, pd.DataFrame):
+        return compare_evidence(evidences, prior=prior, estimator=estimator).loc[list(evidences)]
+    if missing := [column for column in NEEDED if column not in evidences]:
+        raise ModelError(
+            f"evidences must be the table of compare_evidence; its columns {missing} are missing"
+        )
+    if estimator is not None:
+        raise ModelError(f"estimator was chosen when the table was made, got {estimator!r}")
+    if prior is None:
+        return evidences
+    return evidences.assign(prior=prior_weights(prior, list(evidences.index)))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Draws of a model, and its priors to be stretched (None: it has none of them)."""
+
+    posterior: xr.Dataset
+    priors: StretchedPrior | None
+
+    def reweighted(self, width: float) -> Reweighted:
+        if self.priors is None:
+            return UNCHANGED
+        return self.priors.reweighted(self.posterior, width)
+
+
+def _drawn(
+    evidences: Mapping[str, Given] | pd.DataFrame,
+    models: Mapping[str, pm.Model],
+    names: list[str],
+    var_names: str | Iterable[str] | None,
+) -> dict[str, _Drawn]:
+    if not (
+        isinstance(models, Mapping)
+        and set(models) == set(names)
+        and all(isinstance(model, pm.Model) for model in models.values())
+    ):
+        raise ModelError(
+            f"models must give a pm.Model to exactly the models {names}, got {models!r}"
+        )
+    given = {} if isinstance(evidences, pd.DataFrame) else evidences
+    idatas = {name: one for name, one in given.items() if isinstance(one, xr.DataTree)}
+    if without := [name for name in names if name not in idatas]:
+        raise ModelError(f"evidences must be DataTrees with draws for widths; not so {without}")
+    free = {name: [rv.name for rv in models[name].free_RVs] for name in names}
+    chosen = [var_names] if isinstance(var_names, str) else list(var_names or [])
+    if unknown := [one for one in chosen if not any(one in held for held in free.values())]:
+        raise ModelError(f"var_names has {unknown}, free variables of no model; they have {free}")
+    found = {}
+    for name in names:
+        unconstrained_draws(idatas[name], models[name])  # raises what is wrong with them
+        stretched = [one for one in free[name] if not chosen or one in chosen]
+        priors = StretchedPrior(models[name], stretched) if stretched else None
+        found[name] = _Drawn(idatas[name]["posterior"].to_dataset(), priors)
+    return found

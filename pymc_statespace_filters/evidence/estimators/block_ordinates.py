@@ -1,0 +1,215 @@
+r"""Chib and Jeliazkov's ordinate block by block (Chib and Jeliazkov 2001, section 2.2).
+
+The parameters fall into blocks, and the ordinate of the posterior at x* into conditional ones,
+
+.. math::
+
+    p(x^*|D) = \prod_b p(x_b^* | x_{<b}^*, D), \qquad p(x_b^* | x_{<b}^*, D) =
+        \frac{E_b[\alpha(x, x')\, q(x_b, x_b^*)]}{E_{b+1}[\alpha(x', x)]}.
+
+E_b is the mean over draws x of the conditional posterior of the blocks from b on, the earlier ones
+fixed at x*; x' is x with its block b put to x_b*. In E_{b+1} x' is such a draw of the blocks after
+b, and x is x' with a block b from q(x_b*, .). Draws of run 1 are those of the posterior; the later,
+reduced runs are this file's own. The last one has nothing left to move and is the point x*.
+
+Blocks are of whitened coordinates y, x = x* + L y with L L^T the covariance of the draws: there a
+Gaussian posterior has independent blocks of unit variance, for which q = N(0, I) serves as it is.
+The ordinate in x is that in y over det L.
+
+Each run serves two means, the denominator of one block and the numerator of the next: the error is
+that of the difference of the two terms, draw by draw.
+
+With a noisy likelihood a draw keeps the estimate by which its chain accepted, and a point that is
+proposed, x' in the numerators and x in the denominators, gets a fresh one. On (x, noise) the
+proposal is q times the law of the noise, and both sides of detailed balance, integrated over
+everything, are
+
+.. math::
+
+    \int\!\!\int \min(e^{f(x, u)}, e^{f(x', u')})\, q(x_b, x_b^*)\, g(u)\, g(u')\, dx\, du\, du',
+
+p(D | x_<b*) times the numerator and p(D | x_<=b*) times the denominator, so that the ratios are
+exact for the expected likelihood. In the last block e^{f(x')} is replaced by any one constant, as
+with a single block.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from pymc_statespace_filters.errors import DataMismatchError
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
+from pymc_statespace_filters.evidence.estimators.whitening import Whitened
+from pymc_statespace_filters.evidence.log_mean import error_of_chains, error_of_walkers, log_mean
+from pymc_statespace_filters.evidence.posterior import Posterior
+
+N_WALKERS = 64
+N_WARMUP = 30
+START_SCALE = 0.7  # narrower than the draws, so that no draw of the tails starts many walkers
+
+Array = NDArray[np.float64]
+Target = Callable[[Array], Array]  # log-densities (m,) of whitened points (m, k)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Draws in whitened coordinates, y (chain, draw, k), with the estimates that they keep."""
+
+    y: Array
+    log_density: Array  # (chain, draw)
+    n_moves: float = math.inf  # accepted by a walker on average
+
+    def moved_to(self, values: Array | float, block: slice) -> Array:
+        """The draws with other values in one block, flat (m, k)."""
+        moved = self.y.copy()
+        moved[..., block] = values
+        return moved.reshape(-1, moved.shape[-1])
+
+
+@dataclass(frozen=True)
+class BlockEstimate:
+    """A log-evidence and how far its means can be trusted."""
+
+    log_evidence: float
+    se: float
+    n_effective: float  # of the worst run
+    n_moves: float  # accepted by a walker of the worst reduced run, its warm-up included
+
+
+def estimate_in_blocks(
+    proposal: Proposal,
+    posterior: Posterior,
+    *,
+    n_blocks: int,
+    n_proposals: int,
+    rng: np.random.Generator,
+) -> BlockEstimate:
+    """Estimate the log-evidence with the point x* and the covariance of `proposal`.
+
+    Parameters
+    ----------
+    proposal : Proposal
+        Fitted to other draws than those of `posterior`.
+    n_blocks : int
+        Of neighbouring coordinates, as equal in size as can be; at most k.
+    n_proposals : int
+        Draws of every run, and fresh evaluations in every mean over one.
+    """
+    point, chol = proposal.point, proposal.chol
+    k = len(point)
+
+    def target(y: Array) -> Array:
+        return posterior.evaluate(point + y @ chol.T, rng)
+
+    run = _thinned(proposal, posterior, n_proposals)
+    centre = run.y.mean(axis=(0, 1))
+    log_ordinate = -float(np.log(np.diag(chol)).sum())
+    leaving: Array | float = 0.0
+    errors, n_moves = [], []
+    ends = np.linspace(0, k, n_blocks + 1).round().astype(int)
+    for start, stop in pairwise(ends):
+        block, is_last = slice(start, stop), stop == k
+
+        # Numerator: from the draws of this run to x_b*.
+        moved = run.moved_to(0.0, block)
+        fresh = np.full(len(moved), proposal.log_density) if is_last else target(moved)
+        gain = fresh.reshape(run.log_density.shape) - run.log_density
+        log_arriving = np.minimum(0.0, gain) + _log_normal(run.y[..., block])
+        numerator, arriving = _relative(log_arriving, "draws moved to the central point")
+        terms = arriving - leaving
+        errors.append(error_of_chains(terms) if start == 0 else error_of_walkers(terms))
+
+        # Denominator: away from x_b*, the later blocks from the next run.
+        if is_last:
+            constant = np.full((1, n_proposals), proposal.log_density)
+            run = Run(np.zeros((1, n_proposals, k)), constant)
+        else:
+            log_weights = (gain + _log_normal(run.y[..., block] / START_SCALE)).ravel()
+            chosen = rng.choice(len(moved), size=N_WALKERS, p=softmax(log_weights))
+            free = slice(stop, k)
+            run = _walk(target, moved[chosen], fresh[chosen], centre, free, n_proposals, rng)
+            n_moves.append(run.n_moves)
+        steps = rng.standard_normal(run.y[..., block].shape)
+        proposed = target(run.moved_to(steps, block)).reshape(run.log_density.shape)
+        log_leaving = np.minimum(0.0, proposed - run.log_density)
+        denominator, leaving = _relative(log_leaving, "proposals around the draws")
+        log_ordinate += numerator - denominator
+
+    errors.append(float(np.std(leaving)) / n_proposals**0.5)
+    return BlockEstimate(
+        log_evidence=proposal.log_density - log_ordinate,
+        se=math.hypot(*errors),
+        n_effective=max(errors) ** -2,
+        n_moves=min(n_moves, default=math.inf),
+    )
+
+
+def _thinned(proposal: Proposal, posterior: Posterior, most: int) -> Run:
+    """The draws of the posterior, evenly thinned to about `most`, in whitened coordinates."""
+    thinned = posterior.thinned(most)
+    flat = thinned.draws.reshape(-1, len(proposal.point))
+    y = Whitened(proposal.point, proposal.chol).whitened(flat)
+    return Run(y.reshape(thinned.draws.shape), thinned.log_density)
+
+
+def _walk(
+    target: Target,
+    y: Array,
+    log_density: Array,
+    centre: Array,
+    free: slice,
+    n_draws: int,
+    rng: np.random.Generator,
+) -> Run:
+    """Draw the free coordinates given the others by Metropolis walkers side by side.
+
+    A proposal turns a walker by a random angle towards a new normal draw around `centre`, which
+    leaves N(centre, I) as it is: far turns suit a posterior that is nearly Gaussian, small ones any
+    other.
+
+    Parameters
+    ----------
+    target : callable
+    y, log_density : ndarray (walker, k), (walker,)
+        Starts and their kept estimates, nearly draws already: those of the run before, resampled.
+    """
+    n_kept = -(-n_draws // len(y))
+    kept_y, kept_log_density, n_moves = [], [], 0.0
+    for step in range(N_WARMUP + n_kept):
+        angle = rng.uniform(0, np.pi / 2, size=(len(y), 1))
+        current = y[:, free] - centre[free]
+        turned = np.cos(angle) * current + np.sin(angle) * rng.standard_normal(current.shape)
+        proposed = y.copy()
+        proposed[:, free] = centre[free] + turned
+        proposed_log_density = target(proposed)
+        log_ratio = proposed_log_density - log_density
+        log_ratio += 0.5 * (turned**2 - current**2).sum(axis=1)
+        accept = -rng.exponential(size=len(y)) < log_ratio
+        y = np.where(accept[:, np.newaxis], proposed, y)
+        log_density = np.where(accept, proposed_log_density, log_density)
+        n_moves += accept.mean()
+        if step >= N_WARMUP:
+            kept_y.append(y)
+            kept_log_density.append(log_density)
+    return Run(np.stack(kept_y, axis=1), np.stack(kept_log_density, axis=1), float(n_moves))
+
+
+def _log_normal(y: Array) -> Array:
+    """Log-density of N(0, I) at y (..., k)."""
+    return -0.5 * (y**2).sum(axis=-1) - 0.5 * y.shape[-1] * np.log(2 * np.pi)
+
+
+def _relative(log_terms: Array, what: str) -> tuple[float, Array]:
+    """Log of the mean of positive terms, and the terms over their mean."""
+    value = log_mean(log_terms)
+    if np.isneginf(value):
+        raise DataMismatchError(
+            f"none of {log_terms.size} {what} has a density: idata belongs to another model or to "
+            "other data, or n_blocks=1 suits it better"
+        )
+    return value, np.exp(log_terms - value)

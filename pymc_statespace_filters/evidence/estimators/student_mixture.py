@@ -1,0 +1,144 @@
+"""Mixtures of multivariate Student-t laws, fitted to draws, as proposals of independent points.
+
+The tails are heavier than those of most posteriors, which is what a proposal is asked for. A
+mixture is fitted by expectation-maximisation with known degrees of freedom (Peel and McLachlan
+2000); each component also borrows a few draws from the whole, so that none can shrink to a point.
+The number of components is that which makes the weights of held-out draws vary least. A last
+component as wide as everything keeps the weights in the outskirts from being large (Hesterberg
+1995).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from pymc_statespace_filters.evidence.estimators.whitening import moments
+from pymc_statespace_filters.evidence.posterior import Posterior
+
+DEGREES_OF_FREEDOM = 5.0
+MOST_COMPONENTS = 10
+MIN_GAIN = 0.02  # in the log of the weights' second moment, for which a component is worth having
+PATIENCE = 2  # numbers of components tried after the best
+MOST_FITTED = 4000  # draws; more tell little about a proposal
+N_STEPS, MIN_STEP = 200, 1e-3  # of EM; in nats per draw
+WIDE_SHARE, WIDE_SCALE = 0.1, 1.5  # of the last component; in standard deviations of the draws
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StudentMixture:
+    """A mixture of J multivariate Student-t laws in k dimensions."""
+
+    weights: Array  # (J,)
+    means: Array  # (J, k)
+    chols: Array  # (J, k, k), lower factors of the scale matrices
+
+    def log_density(self, x: Array) -> Array:
+        """Log-density at points x (m, k), shape (m,)."""
+        return np.asarray(logsumexp(self.log_joint(x), axis=0))
+
+    def log_joint(self, x: Array) -> Array:
+        """Log-density of each component at x (m, k), weight included: shape (J, m)."""
+        nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+        log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
+        constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
+        tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
+        return (np.log(self.weights) - log_det)[:, None] + constant - tail
+
+    def squared_distances(self, x: Array) -> Array:
+        """Mahalanobis distances of x (m, k) from each component, squared: shape (J, m)."""
+        z = np.linalg.inv(self.chols) @ np.swapaxes(x - self.means[:, None], 1, 2)
+        return np.asarray((z**2).sum(axis=1))
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw independent points, shape (count, k)."""
+        component = rng.choice(len(self.weights), size=count, p=self.weights)
+        normals = rng.standard_normal((count, self.means.shape[-1]))
+        spread = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        moves = np.einsum("mij,mj->mi", self.chols[component], normals)
+        return self.means[component] + spread[:, None] * moves
+
+    def widened(self) -> "StudentMixture":
+        """The same with a component as wide as standardised draws, and wider."""
+        k = self.means.shape[-1]
+        return StudentMixture(
+            np.append((1 - WIDE_SHARE) * self.weights, WIDE_SHARE),
+            np.concatenate([self.means, np.zeros((1, k))]),
+            np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
+        )
+
+    def mapped(self, mean: Array, chol: Array) -> "StudentMixture":
+        """The law of mean + chol x."""
+        return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
+
+
+def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMixture:
+    """Fit to the draws the mixture that promises the most effective proposals.
+
+    Components are added to a fit of the first half of every chain as long as that lowers the second
+    moment of the weights w = p / q, seen by the second half: E_q[w^2] = E_p[w].
+
+    Raises
+    ------
+    ModelError
+        If the draws do not vary in every direction.
+    """
+    mean, chol = coordinates = moments(posterior.draws)
+    halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves()]
+    first, second = (coordinates.whitened(half.draws.reshape(-1, len(mean))) for half in halves)
+    best, n_best, least = scattered(first, 1, rng), 0, np.inf
+    for n_components in range(1, MOST_COMPONENTS + 1):
+        q = fitted_mixture(first, scattered(first, n_components, rng))
+        moment = logsumexp(halves[1].log_density.ravel() - q.log_density(second))
+        if moment < least - MIN_GAIN:
+            best, n_best, least = q, n_components, moment
+        elif n_components == n_best + PATIENCE:
+            break
+    # On from where the best was found, lest EM end elsewhere.
+    return fitted_mixture(np.concatenate([first, second]), best).widened().mapped(mean, chol)
+
+
+def scattered(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
+    """Place components at draws x (n, k) far from each other, as k-means++ does."""
+    chosen = [x[rng.integers(len(x))]]
+    while len(chosen) < n_components:
+        nearest = np.min([((x - point) ** 2).sum(axis=1) for point in chosen], axis=0)
+        if not nearest.any():
+            break  # fewer different draws than components
+        chosen.append(x[rng.choice(len(x), p=nearest / nearest.sum())])
+    scale = np.eye(x.shape[-1]) * len(chosen) ** (-1 / x.shape[-1])
+    return StudentMixture(
+        np.full(len(chosen), 1 / len(chosen)), np.stack(chosen), np.tile(scale, (len(chosen), 1, 1))
+    )
+
+
+def fitted_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
+    """Fit to standardised draws x (n, k) by expectation-maximisation."""
+    reached = -np.inf
+    for _ in range(N_STEPS):
+        log_joint = mixture.log_joint(x)
+        log_density = logsumexp(log_joint, axis=0)
+        if log_density.mean() < reached + MIN_STEP:
+            break
+        reached = log_density.mean()
+        mixture = _maximised(mixture, x, np.exp(log_joint - log_density))
+    return mixture
+
+
+def _maximised(mixture: StudentMixture, x: Array, members: Array) -> StudentMixture:
+    """One step of EM, given the shares (J, n) that the components have in each draw."""
+    nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+    # A draw far out in the tail of its component tells little about where that is.
+    told = members * (nu + k) / (nu + mixture.squared_distances(x))
+    sizes = members.sum(axis=1)
+    means = (told @ x) / told.sum(axis=1, keepdims=True)
+    centred = x - means[:, None]
+    scatter = np.swapaxes(centred, 1, 2) @ (told[..., None] * centred)
+    # Each component borrows k + 1 draws of the whole, whose covariance is the identity.
+    scales = (scatter + (k + 1) * np.eye(k)) / (sizes + k + 1)[:, None, None]
+    weights = (sizes + 1) / (sizes + 1).sum()
+    return StudentMixture(weights, means, np.linalg.cholesky(scales))

@@ -1,0 +1,1 @@
+"""What all filters that move members by noise share."""

@@ -1,0 +1,140 @@
+"""The normals of one evaluation: made from a seed where they are used, or stored beforehand.
+
+Stored normals are those that the seed would have given: first the start, then every step, then for
+every observation its simulated noise and what a resampling takes. Each has its place whatever the
+data and the parameters are, so that noise can be held, or moved a little, while these change.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import carray, types
+
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import COUNTS, Entry
+from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.numerics.philox import (
+    FILL_NORMALS,
+    INITIAL,
+    OBSERVATION,
+    PROCESS,
+    RESAMPLING,
+)
+
+_fill = FILL_NORMALS.external
+_NUMBER_BYTES = 8
+
+
+class NoiseSizes(NamedTuple):
+    """Rows of ``width`` normals at the start, a step and an observation; normals of a resampling.
+
+    A row has one normal for each member and is padded to whole blocks.
+    """
+
+    width: int
+    initial: int
+    process: int
+    observation: int
+    resampling: int
+
+
+class Noise(NamedTuple):
+    """Source of one evaluation's normals: ``stored``, or ``seed`` where nothing is stored.
+
+    Rows are those of our own members, which begin with ``first_block``. What is stored is of all
+    members: there, all must be our own.
+    """
+
+    seed: int
+    stored: np.ndarray
+    buffer: np.ndarray
+    sizes: NoiseSizes
+    n_steps: int
+    first_block: int
+
+
+@pasted
+def noise_of(seed, stored, sizes, n_steps, first_block):
+    """The source of normals for a record whose last observation is at step ``n_steps``."""
+    rows = max(sizes.initial, sizes.process, sizes.observation)
+    buffer = np.empty(0 if stored.size else max(rows * sizes.width, sizes.resampling))
+    return Noise(seed, stored, buffer, sizes, n_steps, first_block)
+
+
+@pasted
+def n_stored(sizes, n_steps, n_observations):
+    """How many normals an evaluation stores; those of one more observation begin there."""
+    of_states = (sizes.initial + n_steps * sizes.process) * sizes.width
+    return of_states + n_observations * (sizes.observation * sizes.width + sizes.resampling)
+
+
+@pasted
+def _normals(noise, purpose, step, place, n_rows, width):
+    # Signed: an unsigned address plus a signed number would be a float64.
+    if noise.stored.size > 0:
+        return np.int64(noise.stored.ctypes.data) + _NUMBER_BYTES * place
+    address = np.int64(noise.buffer.ctypes.data)
+    _fill(noise.seed, purpose, step, noise.first_block, address, n_rows, width)
+    return address
+
+
+@pasted
+def initial_normals(noise):
+    """Address of the normals of the start."""
+    sizes = noise.sizes
+    return _normals(noise, np.int64(INITIAL), np.int64(0), np.int64(0), sizes.initial, sizes.width)
+
+
+@pasted
+def process_normals(noise, k):
+    """Address of the normals of step k."""
+    sizes = noise.sizes
+    place = (sizes.initial + k * sizes.process) * sizes.width
+    return _normals(noise, np.int64(PROCESS), k, place, sizes.process, sizes.width)
+
+
+@pasted
+def observation_normals(noise, j, k):
+    """Address of the normals of the simulated observation j, at step k."""
+    sizes = noise.sizes
+    place = n_stored(sizes, noise.n_steps, j)
+    return _normals(noise, np.int64(OBSERVATION), k, place, sizes.observation, sizes.width)
+
+
+@pasted
+def resampling_normals(noise, j, k):
+    """Normals of a resampling after observation j, at step k, a vector; on every rank the same."""
+    sizes = noise.sizes
+    if noise.stored.size > 0:
+        place = n_stored(sizes, noise.n_steps, j) + sizes.observation * sizes.width
+        return noise.stored[place : place + sizes.resampling]
+    one, first, address = np.int64(1), np.int64(0), noise.buffer.ctypes.data
+    _fill(noise.seed, np.int64(RESAMPLING), k, first, address, one, sizes.resampling)
+    return noise.buffer[: sizes.resampling]
+
+
+def _store(seed, steps, n_observations, width, initial, process, observation, resampling, out):
+    one, first = np.int64(1), np.int64(0)
+    n_steps = carray(steps, (n_observations,))[n_observations - 1] if n_observations else 0
+    at = out
+    _fill(seed, np.int64(INITIAL), first, first, at, initial, width)
+    at += _NUMBER_BYTES * initial * width
+    for k in range(n_steps):
+        _fill(seed, np.int64(PROCESS), np.int64(k), first, at, process, width)
+        at += _NUMBER_BYTES * process * width
+    for j in range(n_observations):
+        k = carray(steps, (n_observations,))[j]
+        _fill(seed, np.int64(OBSERVATION), k, first, at, observation, width)
+        at += _NUMBER_BYTES * observation * width
+        _fill(seed, np.int64(RESAMPLING), k, first, at, one, resampling)
+        at += _NUMBER_BYTES * resampling
+
+
+STORE_NORMALS = Entry(
+    _store,
+    (types.int64, COUNTS, *(types.intp,) * 7),
+    "store_normals",
+    digest("store_normals"),
+    needs=(FILL_NORMALS,),
+)
+"""Write the normals of a whole evaluation, `n_stored` of them, to an address."""

@@ -1,0 +1,52 @@
+"""Which members of an ensemble are this process's own, and how it learns of the others.
+
+Members belong to ranks in whole blocks of 64. What is summed over members is summed block by block,
+and then over the blocks in their order, so that a sum is the same to the bit however many ranks
+there are. Where all members are one process's own, nothing is exchanged.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.entry_point import call_address
+from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+
+MEMBERS, BLOCKS = BLOCK, 1
+"""Columns of a block: an array has a column for each member, or one for each block.
+
+With one column a block, an array may also be any list whose columns are dealt out evenly.
+"""
+
+
+class Share(NamedTuple):
+    """A rank, the number of ranks, and the address of their exchange, 0 where there is one rank.
+
+    An exchange takes the address of an array, its rows, its columns, and the columns of a block.
+    """
+
+    rank: int
+    n_ranks: int
+    exchange: int
+
+
+ALONE = (0, 1, 0)
+"""A share of all members."""
+
+
+@pasted
+def part(share, n_columns, per_block):
+    """First and last (exclusive) of the columns that are our own."""
+    n_blocks = -(-n_columns // per_block)
+    first = per_block * (n_blocks * share.rank // share.n_ranks)
+    last = per_block * (n_blocks * (share.rank + 1) // share.n_ranks)
+    return np.int64(min(first, n_columns)), np.int64(min(last, n_columns))
+
+
+@pasted
+def complete(share, array, per_block):
+    """Fill the columns of a contiguous array (rows, columns) that are not our own."""
+    if share.exchange != 0:
+        rows, columns = np.int64(array.shape[0]), np.int64(array.shape[1])
+        call_address(share.exchange, (array, rows, columns, np.int64(per_block)))

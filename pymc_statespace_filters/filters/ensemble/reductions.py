@@ -1,0 +1,177 @@
+"""Sums over the members of all ranks, block by block.
+
+A sum is a row of an array with a column for each block of 64 members. Every rank writes the columns
+of its own blocks, one exchange completes several rows, and every rank adds up all of them. The sum
+over one block is made by the same instructions whoever makes it, so that the result is the same to
+the bit on any number of ranks.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted, reducing, strict
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.filters.ensemble.partition import (
+    BLOCKS,
+    MEMBERS,
+    Share,
+    complete,
+    part,
+)
+
+HALVES = (32, 16, 8, 4, 2, 1)
+"""The halves of a block, then of its first half, and so on."""
+
+
+class Own(NamedTuple):
+    """Our own members among those of all ranks, and scratch of sums over members.
+
+    There are ``size`` of them, padded to whole blocks ``width``, from member ``first`` and block
+    ``first_block`` on. ``sums`` is (rows, blocks of all members), ``lanes`` has a number for each
+    member of a block.
+    """
+
+    share: Share
+    n_members: int
+    first: int
+    size: int
+    width: int
+    first_block: int
+    sums: np.ndarray
+    lanes: np.ndarray
+
+
+@pasted
+def own_members(share, n_members, n_rows):
+    """Our own of all members, with room for so many rows of sums."""
+    first, last = part(share, n_members, MEMBERS)
+    width = BLOCK * -(-(last - first) // BLOCK)
+    sums = np.empty((n_rows, -(-n_members // BLOCK)))
+    lanes = np.empty(BLOCK)
+    return Own(share, n_members, first, last - first, width, first // BLOCK, sums, lanes)
+
+
+@pasted
+def exchange(own, n_rows):
+    """Complete the first rows of sums."""
+    complete(own.share, own.sums[:n_rows], BLOCKS)
+
+
+@reducing
+def total(own, row):
+    """Add up a completed row."""
+    sums, result = own.sums[row], 0.0
+    for block in range(sums.size):
+        result += sums[block]
+    return result
+
+
+def _by_blocks(term):
+    """The function (given, n, out) that writes the sum of ``term(given, i)`` of each block.
+
+    In an order that is written down, and without leave to rearrange: what the compiler makes of a
+    block must not depend on how many follow it.
+    """
+
+    @strict
+    def write_sums(given, n, out):
+        lanes = np.empty(BLOCK)
+        for first in range(0, n, BLOCK):
+            count = min(BLOCK, n - first)
+            for i in range(count):
+                lanes[i] = term(given, first + i)
+            for i in range(count, BLOCK):
+                lanes[i] = 0.0
+            for half in HALVES:
+                for i in range(half):
+                    lanes[i] += lanes[half + i]
+            out[first // BLOCK] = lanes[0]
+
+    return write_sums
+
+
+@_by_blocks
+@strict
+def _values(values, i):
+    return values[i]
+
+
+@_by_blocks
+@strict
+def _squares(values, i):
+    return values[i] * values[i]
+
+
+@_by_blocks
+@strict
+def _spread(w, i):
+    return w[i] * (1.0 - w[i])
+
+
+@_by_blocks
+@strict
+def _weighted(given, i):
+    w, x = given
+    term = w[i] * x[i]
+    return term if w[i] > 0.0 else 0.0
+
+
+@_by_blocks
+@strict
+def _products(given, i):
+    w, x, x_mean, y, y_mean = given
+    term = w[i] * (x[i] - x_mean) * (y[i] - y_mean)
+    return term if w[i] > 0.0 else 0.0
+
+
+@pasted
+def _own_blocks(own, row):
+    return own.sums[row, own.first_block :]
+
+
+@compiled
+def sum_blocks(values, out):
+    """Sum of every block of a vector."""
+    _values(values, values.size, out)
+
+
+@compiled
+def sum_values(values, own, row):
+    """Row of the sums of a vector, of numbers or flags."""
+    _values(values, values.size, _own_blocks(own, row))
+
+
+@compiled
+def sum_squares(values, own, row):
+    """Row of the sums of the squares of a vector."""
+    _squares(values, values.size, _own_blocks(own, row))
+
+
+@compiled
+def sum_spread(w, own, row):
+    """Row of the sums of w (1 - w), all positive: in all 1 - sum w^2, if w is normalised."""
+    _spread(w, w.size, _own_blocks(own, row))
+
+
+@compiled
+def sum_members(w, X, own, row):
+    """Rows of sum_i w_i X_ai for each row of X; members of zero weight may be NaN."""
+    for a in range(X.shape[0]):
+        _weighted((w, X[a]), w.size, _own_blocks(own, row + a))
+
+
+@compiled
+def sum_products(w, X, x_mean, Y, y_mean, own, row):
+    """Rows of sum_i w_i (X_ai - mean) (Y_bi - mean), b fastest; zero weight as above."""
+    for a in range(X.shape[0]):
+        for b in range(Y.shape[0]):
+            out = _own_blocks(own, row + a * Y.shape[0] + b)
+            _products((w, X[a], x_mean[a], Y[b], y_mean[b]), w.size, out)
+
+
+@pasted
+def means(own, row, weight, out):
+    """Means from completed rows of `sum_members`, of so much weight in all."""
+    for a in range(out.size):
+        out[a] = total(own, row + a) / weight

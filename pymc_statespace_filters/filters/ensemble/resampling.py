@@ -1,0 +1,214 @@
+"""Resampling: draw N ancestors in proportion to the weights (thesis, section 4.4.1), in O(N).
+
+Every scheme is a set of N increasing points in (0, 1) and a walk along the cumulative weights. In
+"sorted" the points are the systematic ones and the walk goes from neighbour to neighbour
+(`_order`), so that normals and particles that move little are resampled almost alike, and stand in
+that order afterwards (Deligiannidis, Doucet and Pitt 2018; Gerber and Chopin 2015).
+
+Differences from the source: the thesis copies particle n when v_n <= u < v_{n+1}, an interval that
+belongs to particle n + 1; here it is v_{n-1} <= u < v_n with v_0 = 0. It also draws N + 1 times;
+here N.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK, exponential, padded, uniform
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
+    MOST_STATES,
+    OrderWork,
+    order_particles,
+    order_workspace,
+)
+from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, complete
+from pymc_statespace_filters.filters.ensemble.reductions import sum_blocks
+
+
+@compiled
+def systematic(z, points):
+    """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is not used."""
+    n = points.size - 1
+    u = uniform(z[0], z[1])
+    for i in range(n):
+        points[i] = (i + u) / n
+
+
+@compiled
+def multinomial(z, points):
+    """N sorted uniforms: partial sums of N + 1 exponentials over their total."""
+    n = points.size - 1
+    half = z.size // 2
+    for i in range(n + 1):
+        points[i] = exponential(z[i], z[half + i])
+    for i in range(1, n + 1):
+        points[i] += points[i - 1]
+    for i in range(n):
+        points[i] /= points[n]
+
+
+POINTS = {"systematic": systematic, "multinomial": multinomial, "sorted": systematic}
+SCHEMES = tuple(POINTS)
+_MULTINOMIAL, _SORTED = SCHEMES.index("multinomial"), SCHEMES.index("sorted")
+
+
+class Resampling(NamedTuple):
+    """When and how to resample, and scratch for it.
+
+    ``everyone`` holds weights and states of the particles of all ranks, (1 + n, N); ``cumulative``
+    the cumulative weights at the end of each block.
+    """
+
+    threshold: float
+    multinomial: bool
+    in_order: bool
+    always: bool
+    points: np.ndarray
+    ancestors: np.ndarray
+    everyone: np.ndarray
+    cumulative: np.ndarray
+    order_work: OrderWork
+    w_ordered: np.ndarray
+
+
+@pasted
+def resampler(fraction, scheme, n_states, own):
+    """Resample below this fraction of the particles, by the scheme of this number."""
+    N, in_order = own.n_members, scheme == _SORTED
+    n_ordered = N if in_order else 0
+    return Resampling(
+        fraction * N, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
+        np.empty(N + 1), np.empty(own.size, np.int64),
+        np.empty((1 + n_states, N)), np.empty(own.sums.shape[1]),
+        order_workspace(n_states, n_ordered), np.empty(n_ordered),
+    )  # fmt: skip
+
+
+@pasted
+def resample_if_few(resampling, n_effective, z, log_w, w, X, own):
+    """Draw new particles of equal weight if the effective number is below the threshold.
+
+    ``z`` are the normals that a resampling takes. Returns whether it was done; ``ancestors`` tell
+    then who became whom.
+    """
+    if not (resampling.always or n_effective < resampling.threshold):
+        return False
+    points, ancestors, everyone = resampling.points, resampling.ancestors, resampling.everyone
+    if resampling.multinomial:
+        multinomial(z, points)
+    else:
+        systematic(z, points)
+    gather_particles(w, X, own, everyone)
+    w_all, X_all, own_points = everyone[0], everyone[1:], points[own.first :]
+    if resampling.in_order:
+        order = order_particles(w_all, X_all, resampling.order_work)
+        w_ordered = resampling.w_ordered
+        choose_in_order(w_all, order, own_points, w_ordered, resampling.cumulative, ancestors)
+    else:
+        choose_ancestors(w_all, own_points, resampling.cumulative, ancestors)
+    copy_ancestors(X_all, ancestors, X)
+    for i in range(log_w.size):
+        log_w[i] = -math.log(own.n_members)
+    return True
+
+
+def smooth_resampling(filter: Any, n_states: int) -> Any:
+    """Give a particle filter's version whose estimate moves little when its normals do.
+
+    Whether to resample is a jump of its own, which is avoided by resampling at every observation
+    where the order of the particles is exact. Along a curve through several dimensions it is not,
+    and resampling less often is better.
+    """
+    always = {"resample_below": 1.0} if n_states == 1 else {}
+    return replace(filter, resampling="sorted", **always)
+
+
+def n_normals(scheme: str, n_particles: int) -> int:
+    """Normals that a scheme takes, a whole number of blocks."""
+    return 2 * padded(n_particles + 1) if scheme == "multinomial" else padded(2)
+
+
+def check_sortable(scheme: str, n_states: int) -> None:
+    """Raise if the scheme orders particles and cannot order those of so many states."""
+    if scheme == "sorted" and n_states > MOST_STATES:
+        raise ModelError(
+            f"resampling='sorted' orders particles of at most {MOST_STATES} states, this system "
+            f"has {n_states}; take resampling='systematic'"
+        )
+
+
+@compiled
+def gather_particles(w, X, own, everyone):
+    """Weights and states of the particles of all ranks, (1 + n, N)."""
+    own_columns = everyone[:, own.first : own.first + own.size]
+    for i in range(w.size):
+        own_columns[0, i] = w[i]
+    for a in range(X.shape[0]):
+        for i in range(w.size):
+            own_columns[1 + a, i] = X[a, i]
+    complete(own.share, everyone, MEMBERS)
+
+
+@compiled
+def choose_ancestors(w, points, cumulative, ancestors):
+    """Ancestor of each point: the n with v_{n-1} <= u < v_n, v the cumulative weights (Eq. 4.44).
+
+    Within a block of 64 they are added up from the end of the block before, which is written to
+    ``cumulative``: so points need not be walked to from the very first particle.
+
+    A particle of zero weight has an empty interval. The end is the last particle that has weight,
+    whatever rounding makes of the last cumulative sum.
+    """
+    sum_blocks(w, cumulative)
+    last_block = cumulative.size - 1
+    for block in range(last_block):
+        cumulative[block + 1] += cumulative[block]
+    total = cumulative[last_block]
+    while last_block > 0 and cumulative[last_block - 1] == total:
+        last_block -= 1
+    block, end, n, last, v = -1, -1.0, 0, 0, 0.0
+    for i in range(ancestors.size):
+        u = points[i] * total
+        if u >= end:
+            block += 1
+            while block < last_block and u >= cumulative[block]:
+                block += 1
+            end = cumulative[block] if block < last_block else np.inf
+            n, last = BLOCK * block, _last_of_weight(w, BLOCK * block)
+            v = w[n] + (cumulative[block - 1] if block > 0 else 0.0)
+        while n < last and u >= v:
+            n += 1
+            v += w[n]
+        ancestors[i] = n
+
+
+@pasted
+def _last_of_weight(w, first):
+    """The last particle of a block that has weight; the first, if none has."""
+    last = min(first + BLOCK, w.size) - 1
+    while last > first and not w[last] > 0.0:
+        last -= 1
+    return last
+
+
+@compiled
+def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
+    """Ancestor of each point on a walk along the particles in this order."""
+    for i in range(order.size):
+        w_ordered[i] = w[order[i]]
+    choose_ancestors(w_ordered, points, cumulative, ancestors)
+    for i in range(ancestors.size):
+        ancestors[i] = order[ancestors[i]]
+
+
+@compiled
+def copy_ancestors(X_all, ancestors, X):
+    """Make the columns of X (states, particles) those of their ancestors in X_all."""
+    for a in range(X.shape[0]):
+        old, row = X_all[a], X[a]
+        for i in range(row.size):
+            row[i] = old[ancestors[i]]

@@ -1,0 +1,127 @@
+"""Weights of particles, kept as logarithms.
+
+Sums of the weights of all ranks go by way of `_sums`: the weights of a block are first taken
+relative to the largest of that block, and blocks are then compared, so that one exchange is enough.
+"""
+
+import math
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted, reducing
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
+from pymc_statespace_filters.filters.ensemble.reductions import HALVES, sum_squares, sum_values
+
+
+@compiled
+def normalise(log_w, w):
+    """Make w and log_w the normalised weights; return the log of their former sum.
+
+    NaN and +inf are weights of zero. If every weight is zero the result is -inf and the weights are
+    useless.
+    """
+    largest = -np.inf
+    for i in range(log_w.size):
+        if not log_w[i] < np.inf:
+            log_w[i] = -np.inf
+        if log_w[i] > largest:
+            largest = log_w[i]
+    if largest == -np.inf:
+        return -np.inf
+    total = 0.0
+    for i in range(w.size):
+        above = log_w[i] - largest
+        w[i] = exp(above) if above > EXP_LOWEST else 0.0
+        total += w[i]
+    log_total = largest + math.log(total)
+    for i in range(w.size):
+        w[i] /= total
+        log_w[i] -= log_total
+    return log_total
+
+
+@reducing
+def effective_number(w):
+    """1 / sum w^2 of normalised weights (thesis, Eq. 4.43)."""
+    total = 0.0
+    for i in range(w.size):
+        total += w[i] * w[i]
+    return 1.0 / total
+
+
+@compiled
+def weigh(log_w, w, own, row):
+    """Leave in w the weights relative to the largest of their block, and three rows of sums.
+
+    The rows, for `total_weight`: the log of the largest, and the sums of w and of w^2. NaN and
+    +inf are weights of zero, and become so in log_w.
+    """
+    n_whole, out = w.size // BLOCK, own.sums[row, own.first_block :]
+    for block in range(n_whole):  # a loop of fixed length becomes straight vector code
+        out[block] = _weigh_block(log_w, w, BLOCK * block, BLOCK, own.lanes)
+    if BLOCK * n_whole < w.size:
+        first = BLOCK * n_whole
+        out[n_whole] = _weigh_block(log_w, w, first, w.size - first, own.lanes)
+    sum_values(w, own, row + 1)
+    sum_squares(w, own, row + 2)
+
+
+@pasted
+def _weigh_block(log_w, w, first, n, lanes):
+    """Return the largest of n weights, and leave them relative to it."""
+    log_block, w_block = log_w[first : first + n], w[first : first + n]
+    for i in range(n, BLOCK):
+        lanes[i] = -np.inf
+    for i in range(n):
+        value = log_block[i] if log_block[i] < np.inf else -np.inf
+        log_block[i] = lanes[i] = value
+    for half in HALVES:
+        for i in range(half):
+            lanes[i] = lanes[half + i] if lanes[half + i] > lanes[i] else lanes[i]
+    largest = lanes[0]
+    for i in range(n):
+        w_block[i] = _relative(log_block[i], largest)
+    return largest
+
+
+@pasted
+def _relative(log_w, largest):
+    above = log_w - largest
+    return exp(above) if above > EXP_LOWEST else 0.0
+
+
+@compiled
+def total_weight(own, row):
+    """Log of the sum of all weights, and their effective number (thesis, Eq. 4.43).
+
+    From three completed rows of `weigh`; -inf and 0 if every weight is zero. What a block's weights
+    are to be multiplied by, so that all are normalised, is left in the first of them.
+    """
+    scales, sums, squares = own.sums[row], own.sums[row + 1], own.sums[row + 2]
+    largest = -np.inf
+    for block in range(scales.size):
+        if scales[block] > largest:
+            largest = scales[block]
+    if largest == -np.inf:
+        return -np.inf, 0.0
+    all_weight, all_squares = 0.0, 0.0
+    for block in range(scales.size):
+        scale = _relative(scales[block], largest)
+        scales[block] = scale
+        all_weight += scale * sums[block]
+        all_squares += scale * scale * squares[block]
+    for block in range(scales.size):
+        scales[block] /= all_weight
+    return largest + math.log(all_weight), all_weight * all_weight / all_squares
+
+
+@compiled
+def normalise_own(log_total, log_w, w, own, row):
+    """Make w and log_w normalised weights after `total_weight`, which found ``log_total``."""
+    for first in range(0, w.size, BLOCK):
+        scale = own.sums[row, own.first_block + first // BLOCK]
+        for i in range(first, min(first + BLOCK, w.size)):
+            w[i] *= scale
+    for i in range(w.size):
+        log_w[i] -= log_total

@@ -1,0 +1,1 @@
+"""The recursion, derivative, batch and smoother of the extended Kalman filter."""

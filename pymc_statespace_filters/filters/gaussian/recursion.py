@@ -1,0 +1,172 @@
+"""A deterministic filter as machine code: one vector ``s`` carried along a record.
+
+The filter is three functions of that vector, given as graphs. Its likelihood is one pass; where a
+derivative is wanted too, the pass leaves a tape of the states that it met, see `_reverse`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    Compiled,
+    Graph,
+    VectorFunction,
+    jit,
+)
+from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.lowering.ensemble import covariance_check
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.filters.missing import is_missing
+from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """The functions of a filter for one system; the first ``system.n`` entries of s are the mean.
+
+    * ``start(c) -> s`` at step 0; ``c`` are the parameters.
+    * ``predict(c, inputs, k, t, s) -> s`` from step k to k + 1.
+    * ``update(c, inputs, k, t, d, s) -> (s, term)`` with log p(d_j | d_1 .. d_{j-1}).
+    """
+
+    system: StateSpaceModel
+    start: VectorFunction
+    predict: VectorFunction
+    update: VectorFunction
+
+    @property
+    def size(self) -> int:
+        """The length of s."""
+        return self.predict.graph.inputs["s"].type.shape[0]
+
+    def parts(self) -> dict[str, VectorFunction]:
+        """The functions of the forward pass; parameters are read once, before its loop."""
+        theta = self.start.graph.inputs["theta"]
+        return {
+            "parameters": VectorFunction("c", Graph({"theta": theta}, [theta])),
+            "start": self.start,
+            "predict": self.predict,
+            "update": self.update,
+        }
+
+
+@dataclass(frozen=True)
+class _Tape:
+    """What the forward pass does with the states it meets."""
+
+    new: Any
+    save: Any
+    result: Any
+
+
+def _no_tape() -> _Tape:
+    return _Tape(
+        jit(lambda steps: None),
+        jit(lambda tape, row, s: None),
+        jit(lambda terms, health, tape, row, s: (terms, health)),
+    )
+
+
+def _tape(size: int) -> _Tape:
+    """A row for the state before each prediction and each update; none if the filter fails."""
+
+    def new(steps):
+        n_steps = steps[-1] if steps.size else 0
+        return np.empty((n_steps + steps.size, size))
+
+    def save(tape, row, s):
+        for i in range(size):
+            tape[row, i] = s[i]
+
+    def result(terms, health, tape, row, s):
+        return terms, health, tape[: row if health[1] == NONE else 0]
+
+    return _Tape(jit(new), jit(save), jit(result))
+
+
+def _tape_to_the_end(size: int) -> _Tape:
+    """The same with the last state as a last row; from a failing observation on rows are NaN."""
+    save = _tape(size).save
+
+    def new(steps):
+        n_steps = steps[-1] if steps.size else 0
+        return np.full((n_steps + steps.size + 1, size), np.nan)
+
+    def result(terms, health, tape, row, s):
+        if health[1] == NONE:
+            save(tape, row, s)
+        elif row > 0:
+            tape[row - 1] = np.nan
+        return terms, health, tape
+
+    return _Tape(jit(new), save, jit(result))
+
+
+def compile_value(recursion: Recursion) -> Compiled:
+    """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
+    return _compile_forward(recursion, "value", _no_tape())
+
+
+def compile_taped(recursion: Recursion) -> Compiled:
+    """The same function, with the tape as a third result."""
+    return _compile_forward(recursion, "taped", _tape(recursion.size))
+
+
+def compile_taped_to_the_end(recursion: Recursion) -> Compiled:
+    """The same with a tape that holds the last state too, and is there if the filter fails."""
+    return _compile_forward(recursion, "taped to the end", _tape_to_the_end(recursion.size))
+
+
+def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
+    parts = vector_functions(recursion.parts())
+    parameters, start, predict, update = (part.function for part in parts.values())
+    valid = covariance_check(recursion.system)
+    has_valid_covariances = valid.function
+    dt, n = recursion.system.dt, recursion.system.n
+    new, save, result = tape.new, tape.save, tape.result
+
+    def forward(theta, steps, observed, inputs, t0, seed):
+        terms = np.full(steps.size, -np.inf)
+        health = np.array([np.inf, float(NONE), -1.0])
+        states = new(steps)
+        if not has_valid_covariances(theta):
+            health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
+            return result(terms, health, states, 0, np.empty(0))
+        c = parameters(theta)
+        s = start(c)
+        k, row = 0, 0
+        for j in range(steps.size):
+            while k < steps[j]:
+                save(states, row, s)
+                s = predict(c, inputs, k, t0 + k * dt, s)
+                k += 1
+                row += 1
+            save(states, row, s)
+            row += 1
+            if is_missing(observed, j):
+                terms[j] = 0.0
+                continue
+            finite = np.isfinite(s[0])
+            for i in range(n):
+                finite &= np.isfinite(s[i])
+            s, terms[j] = update(c, inputs, k, t0 + k * dt, observed[j], s)
+            if not np.isfinite(terms[j]):
+                terms[j:] = -np.inf
+                health[1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
+                health[2] = j
+                break
+        return result(terms, health, states, row, s)
+
+    return compiled_of(forward, what, parts | {"valid": valid}, recursion)
+
+
+def compiled_of(
+    function: Any, what: str, parts: Mapping[str, Compiled], recursion: Recursion
+) -> Compiled:
+    """Compile a function that is made of parts of a recursion."""
+    what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
+    return Compiled(jit(function), key_of(what, *(part.key for part in parts.values())))

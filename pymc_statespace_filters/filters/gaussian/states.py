@@ -1,0 +1,229 @@
+"""The states that a Gaussian filter knows of, as machine code: one pass, and for all data one back.
+
+A pass leaves two tapes, each a row per state: ``before`` every observation, ``after`` every step's
+observation, or the step where there is none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytensor.tensor as pt
+
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    Compiled,
+    Graph,
+    VectorFunction,
+    jit,
+)
+from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.lowering.ensemble import (
+    covariance_check,
+    semidefinite_cholesky,
+)
+from pymc_statespace_filters.compiler.lowering.symbols import call
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
+from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
+from pymc_statespace_filters.filters.gaussian.recursion import Recursion, compiled_of
+from pymc_statespace_filters.filters.missing import is_missing
+from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+# Streams of `STATES`: that of the record's steps, a column for each, and that of the start.
+_ALONG, _AT_START = 0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class StatesPass:
+    """What the states of all moments begin with: compiled once for a system."""
+
+    smoother: BrysonFrazier
+    noise: Compiled
+    forwards: Compiled
+
+
+def states_pass(recursion: Recursion) -> StatesPass:
+    """The pass forwards of a filter."""
+    smoother = BrysonFrazier(recursion)
+    return StatesPass(smoother, _noise(recursion.system), _forwards(smoother))
+
+
+def compile_states(begin: StatesPass, moment: str) -> Compiled:
+    """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
+    recursion = begin.smoother.recursion
+    if moment == "smoothed":
+        read_states = _read_backwards(begin.smoother)
+    else:
+        read_states = _read_forwards(recursion.system.n, predicted=moment == "predicted")
+    parts = {"noise": begin.noise, "forwards": begin.forwards, "read": read_states}
+    noise, forwards, read = (part.function for part in parts.values())
+    n = recursion.system.n
+
+    def states(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+        mean = np.full((rows.size, n), np.nan)
+        sd, drawn = mean.copy(), mean.copy()
+        n_effective = np.full(rows.size, np.nan)
+        n_steps = steps[-1] if steps.size else np.int64(0)
+        X, Z = noise(theta, n_steps, draw_seed)
+        before, after, end, health = forwards(theta, steps, observed, inputs, t0, X, Z)
+        record = (theta, steps, observed, inputs, t0, Z)
+        n_rows = read(record, before, after, end, rows, mean, sd, drawn)
+        n_effective[:n_rows] = np.inf
+        return mean, sd, drawn, n_effective, health
+
+    return compiled_of(states, f"states {moment}", parts, recursion)
+
+
+def _forwards(smoother: BrysonFrazier) -> Compiled:
+    """The filter and a simulated error of it along a record; ``end`` is the first step lost."""
+    system, size = smoother.recursion.system, smoother.size
+    parts = vector_functions(smoother.forwards())
+    parameters, start, predict, update = (part.function for part in parts.values())
+    valid = covariance_check(system)
+    has_valid_covariances, dt, n = valid.function, system.dt, system.n
+
+    def forwards(theta, steps, observed, inputs, t0, X, Z):
+        n_steps = steps[-1] if steps.size else np.int64(0)
+        before, after = np.empty((steps.size, size)), np.empty((n_steps + 1, size))
+        health = np.array([np.inf, float(NONE), -1.0])
+        if not has_valid_covariances(theta):
+            health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
+            return before, after, 0, health
+        c = parameters(theta)
+        s = start(c, X, 0)
+        k = 0
+        for j in range(steps.size):
+            while k < steps[j]:
+                for i in range(size):
+                    after[k, i] = s[i]
+                s = predict(c, inputs, k, t0 + k * dt, s, Z, k)
+                k += 1
+            finite = True
+            for i in range(size):
+                before[j, i] = s[i]
+                finite &= i >= n or np.isfinite(s[i])
+            if is_missing(observed, j):
+                continue
+            s, term = update(c, inputs, k, t0 + k * dt, observed[j], s, Z, k)
+            if not np.isfinite(term):
+                health[1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
+                health[2] = j
+                return before, after, k, health
+        for i in range(size):
+            after[k, i] = s[i]
+        return before, after, n_steps + 1, health
+
+    key = key_of(f"forwards {dt!r} {n}", valid.key, *(part.key for part in parts.values()))
+    return Compiled(jit(forwards), key)
+
+
+def _read_forwards(n: int, *, predicted: bool) -> Compiled:
+    """Write what the filter knew at the rows, and return how many have a state."""
+    size = n + n * (n + 1) // 2
+
+    def read(record, before, after, end, rows, mean, sd, drawn):
+        steps = record[1]
+        j = 0
+        for r in range(rows.size):
+            k = rows[r]
+            if k >= end:
+                return r
+            s = after[k]
+            while j < steps.size and steps[j] < k:
+                j += 1
+            if predicted and j < steps.size and steps[j] == k:
+                s = before[j]
+            for i in range(n):
+                mean[r, i] = s[i]
+                sd[r, i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
+                drawn[r, i] = s[i] + s[size + i]
+        return rows.size
+
+    return Compiled(jit(read), key_of(f"read forwards {n} {predicted}"))
+
+
+def _read_backwards(smoother: BrysonFrazier) -> Compiled:
+    """Write what all data say of the rows; nothing where the filter failed."""
+    system = smoother.recursion.system
+    parts = vector_functions(smoother.backwards())
+    parameters, end_of, unpredict, unupdate, smooth = (part.function for part in parts.values())
+    dt, n = system.dt, system.n
+
+    def read(record, before, after, end, rows, mean, sd, drawn):
+        theta, steps, observed, inputs, t0, Z = record
+        n_steps = after.shape[0] - 1
+        if end <= n_steps:
+            return 0
+        c = parameters(theta)
+        s_bar = end_of(c)
+        j, r = steps.size - 1, rows.size - 1
+        informed = False  # where nothing later was seen, zero stays zero whatever comes there
+        for k in range(n_steps, -1, -1):
+            if r < 0:
+                break
+            if informed:
+                s_bar = unpredict(c, inputs, k, t0 + k * dt, after, k, s_bar)
+            if rows[r] == k:
+                m, variances, x = smooth(c, after, k, s_bar)
+                for i in range(n):
+                    mean[r, i], drawn[r, i] = m[i], x[i]
+                    sd[r, i] = np.sqrt(max(variances[i], 0.0))
+                r -= 1
+            if j >= 0 and steps[j] == k:
+                if not is_missing(observed, j):
+                    s_bar = unupdate(c, inputs, k, t0 + k * dt, observed[j], before, j, Z, k, s_bar)
+                    informed = True
+                j -= 1
+        return rows.size
+
+    key = key_of(f"read backwards {dt!r} {n}", *(part.key for part in parts.values()))
+    return Compiled(jit(read), key)
+
+
+def _noise(system: StateSpaceModel) -> Compiled:
+    """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (m + p, steps).
+
+    The first m rows of Z have the covariance of q. The roots are those of the user's covariances,
+    which may be singular, and were found to be covariances at theta.
+    """
+    equations, n, m = system.equations, system.n, system.m
+    is_white = equations.process_noise is None
+    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
+    covs = [call(equations.initial_cov, system, {"theta": theta})]
+    if not is_white:
+        covs.append(call(equations.process_noise, system, {"theta": theta}))
+    graph = Graph({"theta": theta}, [pt.concatenate([cov.ravel() for cov in covs])])
+    flat = vector_functions({"covariances": VectorFunction("c", graph)})["covariances"]
+    covariances, n_rows = flat.function, m + system.p
+    FILL_NORMALS.compile()
+    fill, purpose = FILL_NORMALS.external, np.int64(STATES)
+
+    def noise(theta, n_steps, draw_seed):
+        width = BLOCK * (n_steps // BLOCK + 1)  # a column for each step, and some to spare
+        X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
+        fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
+        fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
+        values = covariances(theta)
+        colour(values, 0, n, X)
+        if not is_white:
+            colour(values, n * n, m, Z)
+        return X, Z
+
+    key = key_of(f"noise of states {n} {m} {n_rows}", flat.key, FILL_NORMALS.key)
+    return Compiled(jit(noise), key)
+
+
+@jit
+def colour(values, first, size, Z):
+    """Give the first ``size`` rows of standard normals the covariance found in ``values``."""
+    root = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            root[i, j] = values[first + i * size + j]
+    semidefinite_cholesky(root)
+    for i in range(size - 1, -1, -1):  # from below: a row is made of itself and those above
+        for member in range(Z.shape[1]):
+            total = 0.0
+            for j in range(i + 1):
+                total += root[i, j] * Z[j, member]
+            Z[i, member] = total

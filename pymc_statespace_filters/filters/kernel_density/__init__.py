@@ -1,0 +1,1 @@
+"""Kernel densities of weighted particles, exact and gridded."""

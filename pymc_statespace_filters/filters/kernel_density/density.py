@@ -1,0 +1,169 @@
+"""Gaussian kernel density of weighted particles, in logs (thesis, Eqs. 4.36-4.39).
+
+The density at a target v is sum_l w_l |H|^-1 K(H^-1 (x_l - v)), where H is the lower Cholesky
+factor of the weighted covariance times N_eff^{-1/(n+4)}. Members and targets are whitened by H
+first, so that the sums see plain distances. In one and two directions they go over a lattice
+(`_lattice_sum`), O(N), for targets far outside the cloud too (`_tilted_sum`); in more directions,
+for few members and for single targets in the tails they are exact (`_kernel_sum`), O(N) a target.
+
+A direction in which the members do not spread at all (a state known exactly, or a copy of another)
+is left out: all members and all targets lie in the same subspace, and the density is the one on it,
+n its dimension.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.small_cholesky import (
+    LOG_TWO_PI,
+    semidefinite_cholesky,
+)
+from pymc_statespace_filters.filters.ensemble.kalman_update import count_true
+from pymc_statespace_filters.filters.ensemble.reductions import total
+from pymc_statespace_filters.filters.kernel_density.direct_sum import (
+    compact,
+    kernel_sum_workspace,
+    log_kernel_sum,
+)
+from pymc_statespace_filters.filters.kernel_density.gridded_sum import lattice_workspace
+from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
+from pymc_statespace_filters.filters.kernel_density.shifted_sum import (
+    log_lattice_sums,
+    tilted_workspace,
+)
+
+_SQRT_HALF = math.sqrt(0.5)
+_KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a value known exactly
+_LINE_FROM, _PLANE_FROM = 64, 256  # members from which a lattice is at least twice as fast
+
+
+@pasted
+def _by_lattice(n_active, n_members):
+    least = _LINE_FROM if n_active == 1 else _PLANE_FROM
+    return 1 <= n_active <= 2 and n_members >= least
+
+
+def density_method(n_active, n_members):
+    """How the densities of n_members particles that spread in n_active directions are summed."""
+    return "lattice" if _by_lattice.py_func(n_active, n_members) else "exact"
+
+
+class Kernel(NamedTuple):
+    """Where the members of a density are and how far they spread: their mean and their bandwidth.
+
+    ``H`` (n_free, n_free) is the lower Cholesky factor of Eqs. 4.38 and 4.39, of the directions in
+    which they spread at all, which ``active`` tells. ``mean`` (n,) is that of all states.
+    """
+
+    mean: np.ndarray
+    H: np.ndarray
+    active: np.ndarray
+
+
+@pasted
+def kernel_workspace(n, n_free):
+    """A kernel to be filled by ``scott_bandwidth``."""
+    return Kernel(np.empty(n), np.empty((n_free, n_free)), np.empty(n_free, np.bool_))
+
+
+@compiled
+def density_workspace(own, n):
+    """Scratch of ``log_kernel_density`` for n directions.
+
+    The members and their weights, the targets and the logs of the sums at them, of all ranks.
+    """
+    n_ranks, width = own.share.n_ranks, BLOCK * own.sums.shape[1]
+    sources = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
+    targets = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
+    exact, lattice = kernel_sum_workspace(width), lattice_workspace(n_ranks, width)
+    return sources, targets, (exact, lattice, tilted_workspace(n_ranks, n, width))
+
+
+@compiled
+def scott_bandwidth(own, row, spread, n_effective, free, kernel):
+    """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39); the mean is given.
+
+    From completed rows of ``sum_products`` of all states, to be divided by ``spread``. Returns
+    False if the moments are not finite.
+    """
+    x_mean, H, active = kernel
+    floor = np.empty(free.size)
+    for a in range(free.size):
+        floor[a] = (_KNOWN * x_mean[free[a]]) ** 2
+        for b in range(free.size):
+            H[a, b] = total(own, row + free[a] * x_mean.size + free[b]) / spread
+    if not semidefinite_cholesky(H, floor, active):
+        return False
+    scott = n_effective ** (-1.0 / (count_true(active) + 4))
+    for a in range(free.size):
+        for b in range(a + 1):
+            H[a, b] *= scott
+    return True
+
+
+@compiled
+def _whiten(kernel, free, X, first, out):
+    """Leave H^-1 (X - mean) / sqrt(2) of the active directions in rows of ``out``, from 1 on.
+
+    X becomes the columns from ``first`` on. Returns how many rows. Why the mean: far from zero
+    x / h would be rounded to more than the distances between particles bear.
+    """
+    x_mean, H, active = kernel
+    n_rows, last = 0, first + X.shape[1]
+    for a in range(active.size):
+        if not active[a]:
+            continue
+        x, x_0 = X[free[a]], x_mean[free[a]]
+        y = out[n_rows + 1, first:last]
+        scale, before = 1.0 / H[a, a], 1
+        for i in range(x.size):
+            y[i] = (_SQRT_HALF * scale) * (x[i] - x_0)
+        for b in range(a):
+            if active[b]:
+                share, z = scale * H[a, b], out[before, first:last]
+                for i in range(x.size):
+                    y[i] -= share * z[i]
+                before += 1
+        n_rows += 1
+    return n_rows
+
+
+@pasted
+def _sum_exactly(share, sources, targets, n_dims, first, logs, work):
+    """Logs of the sums at a rank's own targets, which begin at the column ``first``."""
+    complete_points(share, sources, n_dims)
+    y, v = sources.rows[1:], targets.rows[1:]
+    _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
+    for i in range(logs.size):
+        logs[i] = log_kernel_sum(y, n_dims, n_blocks, v, first + i, work)
+
+
+@compiled
+def log_kernel_density(own, w, X, V, free, kernel, work, out):
+    """Log-density at the columns of V of the particles X with normalised weights w.
+
+    All are a rank's own; the density is that of the particles of all ranks. Members of zero weight
+    are left out, and may be NaN. A target that is not finite gets -inf.
+    """
+    sources, targets, sums = work
+    first, last = own.first, own.first + own.size
+    own_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
+    for i in range(w.size):
+        own_w[i] = w[i]
+    n_dims = _whiten(kernel, free, X, first, sources.rows)
+    _whiten(kernel, free, V, first, targets.rows)
+    if not (
+        _by_lattice(n_dims, own.n_members)
+        and log_lattice_sums(own.share, sources, targets, n_dims, sums)
+    ):
+        _sum_exactly(own.share, sources, targets, n_dims, first, logs, sums[0])
+    log_kernel = 0.0
+    for a in range(free.size):
+        if kernel.active[a]:
+            log_kernel -= math.log(kernel.H[a, a]) + 0.5 * LOG_TWO_PI
+    for i in range(out.size):
+        out[i] = logs[i] + log_kernel

@@ -1,0 +1,81 @@
+"""Sum of weighted Gaussian kernels at one target, exact, in logs, O(N).
+
+Two passes over the members, in blocks of 64: their exponents and the largest of these, then the sum
+of exponentials relative to it. So a target many bandwidths away from every member still has its
+finite logarithm.
+"""
+
+import math
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+from pymc_statespace_filters.filters.ensemble.reductions import HALVES
+
+
+@compiled
+def kernel_sum_workspace(width):
+    """Scratch of ``compact`` and ``log_kernel_sum``."""
+    return np.empty(width), np.empty(width), np.empty(BLOCK)
+
+
+@compiled
+def compact(w, sources, n_dims, work):
+    """Move the members of positive weight to the front; return their number and their blocks."""
+    log_w, _, _ = work
+    n_sources = 0
+    for i in range(w.size):
+        if w[i] > 0.0:
+            for a in range(n_dims):
+                sources[a, n_sources] = sources[a, i]
+            log_w[n_sources] = math.log(w[i])
+            n_sources += 1
+    n_blocks = -(-n_sources // BLOCK)
+    for i in range(n_sources, n_blocks * BLOCK):
+        for a in range(n_dims):
+            sources[a, i] = 0.0
+        log_w[i] = -np.inf
+    return n_sources, n_blocks
+
+
+@pasted
+def _exponents(sources, log_w, n_dims, first, targets, target, e):
+    """e_l = log w_l - |y_l - v|^2 / 2, coordinates over sqrt(2), for a block of members."""
+    for i in range(BLOCK):
+        e[i] = log_w[first + i]
+    for a in range(n_dims):
+        y, v = sources[a, first : first + BLOCK], targets[a, target]
+        for i in range(BLOCK):
+            e[i] -= (y[i] - v) * (y[i] - v)
+
+
+@compiled
+def log_kernel_sum(sources, n_dims, n_blocks, targets, target, work):
+    """log sum_l w_l exp(-|y_l - v|^2); -inf for a target that is not finite."""
+    log_w, exponents, lane = work
+    for i in range(BLOCK):
+        lane[i] = -np.inf
+    for block in range(n_blocks):
+        first = block * BLOCK
+        e = exponents[first : first + BLOCK]
+        _exponents(sources, log_w, n_dims, first, targets, target, e)
+        for i in range(BLOCK):
+            lane[i] = e[i] if e[i] > lane[i] else lane[i]
+    for half in HALVES:
+        for i in range(half):
+            lane[i] = lane[half + i] if lane[half + i] > lane[i] else lane[i]
+    largest = lane[0]
+    if not largest > -np.inf:
+        return -np.inf
+    for i in range(BLOCK):
+        lane[i] = 0.0
+    for block in range(n_blocks):
+        e = exponents[block * BLOCK : (block + 1) * BLOCK]
+        for i in range(BLOCK):
+            lane[i] += exp(e[i] - largest)
+    for half in HALVES:
+        for i in range(half):
+            lane[i] += lane[half + i]
+    return largest + math.log(lane[0])

@@ -1,0 +1,166 @@
+"""Lattice sums where the targets are: over the cloud of members, or far outside, O(N).
+
+For any shift t of the targets
+
+    w_l exp(-|y_l - v|^2) = [w_l exp(2 t.y_l)] exp(-|y_l - (v - t)|^2) exp(t.(t - 2 v)),
+
+so sums at far targets are sums at near ones, with other weights. The shift moves the mean of the
+targets onto the mean of the members that matter there, each in proportion to its term of the sum.
+First all targets are tried as they are, then, if many are left, these are shifted. What is still
+left is summed exactly, by all ranks together: the tails may be those of one rank's members alone.
+"""
+
+import math
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.numerics.restricted_domain import exp, log
+from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, MEMBERS, complete, part
+from pymc_statespace_filters.filters.kernel_density.direct_sum import compact, log_kernel_sum
+from pymc_statespace_filters.filters.kernel_density.gridded_sum import FLOOR, lattice_sums
+from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
+
+_LOG_FLOOR = math.log(FLOOR)
+_FEW = 64  # exact sums that cost less than another lattice; both grow with the number of members
+
+
+@compiled
+def tilted_workspace(n_ranks, n, width):
+    """Scratch of ``log_lattice_sums``.
+
+    Missed targets and their number on each rank; these targets shifted, and the shift; exact sums.
+    """
+    missed, counts = np.empty(width, np.int64), np.empty((1, n_ranks))
+    return missed, counts, np.empty((1 + n, width)), np.empty(n), np.empty((1, width))
+
+
+@pasted
+def _take_logs(share, targets):
+    """Replace a rank's own sums by their logs; return how many are below the floor."""
+    begin, end = part(share, targets.size, MEMBERS)
+    sums, n_missed = targets.rows[0, begin:end], 0
+    for i in range(sums.size):
+        sums[i] = log(sums[i])
+        n_missed += not sums[i] > _LOG_FLOOR
+    return n_missed
+
+
+@pasted
+def _total(share, counts, count):
+    counts[0, share.rank] = count
+    complete(share, counts, BLOCKS)
+    total = 0.0
+    for rank in range(counts.size):
+        total += counts[0, rank]
+    return np.int64(total)
+
+
+@compiled
+def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, shift):
+    """The shift for the targets ``missed``; False if none of them is finite."""
+    n_sources, n_blocks = members
+    for a in range(n_dims):
+        total, count = 0.0, 0
+        for i in missed:
+            if np.isfinite(targets[a, i]):
+                total += targets[a, i]
+                count += 1
+        if count == 0:
+            return False
+        shifted[a, 0] = total / count
+    log_total = log_kernel_sum(sources, n_dims, n_blocks, shifted, np.int64(0), sum_work)
+    exponents = sum_work[1]
+    for a in range(n_dims):
+        member_mean = 0.0
+        for i in range(n_sources):
+            member_mean += exp(min(exponents[i] - log_total, 0.0)) * sources[a, i]
+        shift[a] = shifted[a, 0] - member_mean
+    return np.isfinite(log_total)
+
+
+@pasted
+def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
+    """Leave w_l exp(2 t.y_l), normalised, in ``weights``; return the log of their sum."""
+    largest = -np.inf
+    for i in range(n_sources):
+        weights[i] = log_w[i]
+        for a in range(n_dims):
+            weights[i] += 2.0 * shift[a] * sources[a, i]
+        largest = max(largest, weights[i])
+    total = 0.0
+    for i in range(n_sources):
+        weights[i] = exp(weights[i] - largest)
+        total += weights[i]
+    for i in range(n_sources):
+        weights[i] /= total
+    return largest + math.log(total)
+
+
+@pasted
+def _sum_shifted(share, members, sources, targets, n_missed, n_dims, works):
+    """Sums at shifted targets; returns how many targets are still missed."""
+    sum_work, lattice_work, (missed, _, shifted, shift, _) = works
+    y, v, some = sources.rows[1:], targets.rows[1:], missed[:n_missed]
+    if not _choose_shift(y, n_dims, members, v, some, sum_work, shifted[1:], shift):
+        return n_missed
+    log_total = _tilt(y, n_dims, members[0], sum_work[0], shift, sources.rows[0])
+    for a in range(n_dims):
+        for k in range(n_missed):
+            shifted[1 + a, k] = v[a, some[k]] - shift[a]
+    tilted, at = Points(sources.rows, members[0], True), Points(shifted, n_missed, True)
+    if not lattice_sums(share, tilted, at, n_dims, lattice_work):
+        return n_missed
+    _take_logs(share, at)
+    complete(share, shifted[:1, :n_missed], MEMBERS)
+    n_left = 0
+    for k in range(n_missed):
+        i, log_sum = some[k], shifted[0, k]
+        value = log_total + log_sum
+        for a in range(n_dims):
+            value += shift[a] * (shift[a] - 2.0 * v[a, i])
+        targets.rows[0, i] = value
+        if not log_sum > _LOG_FLOOR:
+            missed[n_left] = i
+            n_left += 1
+    return n_left
+
+
+@pasted
+def _sum_tails(share, sources, targets, n_dims, works):
+    """Sums at the targets that a lattice over the cloud has missed; all ranks know all of them."""
+    sum_work, _, (missed, _, _, _, exact) = works
+    complete_points(share, sources, n_dims)
+    complete_points(share, targets, n_dims)
+    logs, y, v = targets.rows[0], sources.rows[1:], targets.rows[1:]
+    n_missed = 0
+    for i in range(targets.size):
+        if not logs[i] > _LOG_FLOOR:
+            missed[n_missed] = i
+            n_missed += 1
+    members = compact(sources.rows[0, : sources.size], y, n_dims, sum_work)
+    if n_missed > _FEW:
+        n_missed = _sum_shifted(share, members, sources, targets, n_missed, n_dims, works)
+    if n_missed == 0:
+        return
+    begin, end = part(share, n_missed, BLOCKS)
+    for k in range(begin, end):
+        exact[0, k] = log_kernel_sum(y, n_dims, members[1], v, missed[k], sum_work)
+    complete(share, exact[:, :n_missed], BLOCKS)
+    for k in range(n_missed):
+        logs[missed[k]] = exact[0, k]
+
+
+@pasted
+def log_lattice_sums(share, sources, targets, n_dims, works):
+    """log sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
+
+    ``sources`` and ``targets`` are `Points`; the sums go to the latter. Returns False if the
+    lattice would be too large.
+    """
+    _, lattice_work, (_, counts, _, _, _) = works
+    if not lattice_sums(share, sources, targets, n_dims, lattice_work):
+        return False
+    if _total(share, counts, _take_logs(share, targets)) > 0:
+        _sum_tails(share, sources, targets, n_dims, works)
+    return True

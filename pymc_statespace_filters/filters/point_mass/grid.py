@@ -1,0 +1,258 @@
+"""Densities of one variable on a uniform lattice, moved by Gaussian steps.
+
+Point ``i`` of a lattice is ``(low + i) * spacing``; what is kept there are masses: density times
+spacing. All integrals are trapezoidal sums. For smooth integrands that vanish at both ends their
+error falls faster than any power of the spacing: it is what the integrand's spectrum holds beyond
+2 pi / spacing.
+"""
+
+import math
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import internal, pasted, reducing
+from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+
+MAX_POINTS = 8192
+"""A lattice of more points is a failure; named in `_failures`."""
+
+_MAX_PAIRS = 2**20  # of a source and a point that it reaches: 8 MB of kernel
+
+_ONE_OVER_ROOT_TWO_PI = 1.0 / math.sqrt(2.0 * math.pi)
+_LARGEST_INDEX = 2.0**50
+_BLOCK = 8  # the points that a source reaches are a multiple of this: no remainder in vector loops
+
+
+@pasted
+def lattice(low, n, spacing):
+    """The points, as the members of an ensemble: (1, n)."""
+    X = np.empty((1, n))
+    for i in range(n):
+        X[0, i] = (low + i) * spacing
+    return X
+
+
+@internal
+def reached(mean, sd, mass, spacing, reach):
+    """The lattice of all points within ``reach`` deviations of some mean: (low, number).
+
+    Sources without mass, or that are not finite, do not count. The number is 0 if none is left, and
+    more than `MAX_POINTS` stands for any such number.
+    """
+    lowest, highest, width = np.inf, -np.inf, 0.0
+    for i in range(mass.size):
+        if mass[i] > 0.0 and np.isfinite(mean[i]) and np.isfinite(sd[i]):
+            lowest = min(lowest, mean[i] - reach * sd[i])
+            highest = max(highest, mean[i] + reach * sd[i])
+            width += 2.0 * reach * sd[i]
+    if lowest > highest:
+        return np.int64(0), np.int64(0)
+    lowest, highest = lowest / spacing, highest / spacing
+    too_many = highest - lowest > MAX_POINTS or width > _MAX_PAIRS * spacing
+    if too_many or not max(-lowest, highest) < _LARGEST_INDEX:
+        return np.int64(0), np.int64(MAX_POINTS + 1)
+    low = np.int64(math.floor(lowest))
+    return low, np.int64(math.ceil(highest)) - low + 1 + _BLOCK
+
+
+@pasted
+def _add_gaussian(first, spacing, mean, sd, mass, out):
+    """Add what N(mean, sd^2) of this mass puts on the points of ``out``, from ``first`` on."""
+    scale = spacing / sd
+    height = mass * scale * _ONE_OVER_ROOT_TWO_PI
+    start = (first * spacing - mean) / sd
+    for b in range(out.size):
+        z = start + b * scale
+        out[b] += height * exp(-0.5 * z * z)
+
+
+@internal
+def _target(mean, sd, spacing, reach):
+    """Numbers of the first point, and of the one after the last, that a source reaches."""
+    if not (np.isfinite(mean) and np.isfinite(sd)):
+        return 0.0, 0.0  # what has gone to infinity has no mass
+    first = math.ceil((mean - reach * sd) / spacing)
+    blocks = math.ceil((mean + reach * sd - first * spacing) / (_BLOCK * spacing))
+    return first, first + _BLOCK * max(blocks, 1.0)
+
+
+@internal
+def spread(low, n, spacing, mean, sd, mass, reach):
+    """Masses on a lattice of the mixture sum_i mass_i N(mean_i, sd_i^2), cut at ``reach``."""
+    out = np.zeros(n)
+    for i in range(mass.size):
+        first, last = _target(mean[i], sd[i], spacing, reach)
+        first, last = max(first, float(low)), min(last, float(low + n))
+        if mass[i] > 0.0 and first < last:
+            target = out[np.int64(first) - low : np.int64(last) - low]
+            _add_gaussian(first, spacing, mean[i], sd[i], mass[i], target)
+    return out
+
+
+@pasted
+def kernel(spacing, mean, sd, reach):
+    """Where every source sends its mass, row after row: (first targets, ends of rows, masses)."""
+    n = mean.size
+    first, end = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
+    for i in range(n):
+        start, stop = _target(mean[i], sd[i], spacing, reach)
+        if max(-start, stop) < _LARGEST_INDEX and stop - start <= MAX_POINTS:
+            first[i] = np.int64(start)
+            end[i + 1] = np.int64(stop - start)
+        end[i + 1] += end[i]
+    masses = np.zeros(end[n])
+    for i in range(n):
+        _add_gaussian(float(first[i]), spacing, mean[i], sd[i], 1.0, masses[end[i] : end[i + 1]])
+    return first, end, masses
+
+
+@pasted
+def move(first, end, masses, mass, low, n):
+    """The same as `spread`, with the rows of a kernel made before."""
+    out = np.zeros(n)
+    for i in range(mass.size):
+        if mass[i] > 0.0 and end[i] < end[i + 1]:
+            row = masses[end[i] : end[i + 1]]
+            target = out[first[i] - low : first[i] - low + row.size]
+            share = mass[i]
+            for b in range(row.size):
+                target[b] += share * row[b]
+    return out
+
+
+@reducing
+def _mean_over_gaussian(first, spacing, mean, sd, values):
+    """What `_add_gaussian` would add of a unit mass, times ``values``, summed."""
+    scale = spacing / sd
+    start = (first * spacing - mean) / sd
+    result = 0.0
+    for b in range(values.size):
+        z = start + b * scale
+        result += exp(-0.5 * z * z) * values[b]
+    return scale * _ONE_OVER_ROOT_TWO_PI * result
+
+
+@internal
+def gather(low, spacing, values, mean, sd, reach):
+    """Mean of ``values``, on a lattice, over N(mean_i, sd_i^2): the transpose of `spread`."""
+    out = np.zeros(mean.size)
+    for i in range(mean.size):
+        first, last = _target(mean[i], sd[i], spacing, reach)
+        first, last = max(first, float(low)), min(last, float(low + values.size))
+        if first < last:
+            target = values[np.int64(first) - low : np.int64(last) - low]
+            out[i] = _mean_over_gaussian(first, spacing, mean[i], sd[i], target)
+    return out
+
+
+@reducing
+def gather_rows(first, end, masses, low, values, n):
+    """The same as `gather`, with the first ``n`` rows of a kernel made before."""
+    out = np.empty(n)
+    for i in range(n):
+        start = max(first[i], low)
+        size = min(first[i] + end[i + 1] - end[i], low + values.size) - start
+        at, target = end[i] + start - first[i], start - low
+        result = 0.0
+        for b in range(size):
+            result += masses[at + b] * values[target + b]
+        out[i] = result
+    return out
+
+
+@internal
+def significant(mass, share):
+    """The range [first, last) outside of which masses are below a share of the largest."""
+    largest = 0.0
+    for value in mass:
+        largest = max(largest, value)
+    first, last = np.int64(0), np.int64(mass.size)
+    while first < last and not mass[first] > share * largest:
+        first += 1
+    while last > first and not mass[last - 1] > share * largest:
+        last -= 1
+    return first, last
+
+
+@pasted
+def aliasing(mean, sd, source_spacing, spacing):
+    """Share of each source's mass that the trapezoidal rule may misplace in one step.
+
+    As a function of the source, the mass that arrives at a point is a density at least as wide as
+    the noise, sd, times a Gaussian of sd over the slope of the mean. Their product's spectrum at
+    2 pi / spacing is the error. Infinite where there is no noise.
+    """
+    n = mean.size
+    shares = np.zeros(n)
+    for i in range(n):
+        if not (np.isfinite(mean[i]) and np.isfinite(sd[i])):
+            continue
+        before, after = max(i - 1, 0), min(i + 1, n - 1)
+        slope = (mean[after] - mean[before]) / (source_spacing * (after - before)) if n > 1 else 1.0
+        noise = sd[i] / spacing
+        if noise > 0.0 and np.isfinite(slope):
+            width = noise * noise / (1.0 + slope * slope)
+            shares[i] = (1.0 + 1.0 / noise) * math.exp(-2.0 * math.pi**2 * width)
+        else:
+            shares[i] = np.inf if noise == 0.0 else 1.0 + 1.0 / noise
+    return shares
+
+
+@reducing
+def total(mass, shares):
+    """Sum of mass * share, in which a share without mass, infinite too, does not count."""
+    result = 0.0
+    for i in range(mass.size):
+        result += mass[i] * shares[i] if mass[i] > 0.0 else 0.0
+    return result
+
+
+@pasted
+def weigh(mass, log_density):
+    """Log of sum_i mass_i exp(log_density_i), and the terms over the largest; NaN, inf are zero."""
+    terms = np.empty(mass.size)
+    largest = -np.inf
+    for i in range(mass.size):
+        value = math.log(mass[i]) + log_density[i] if mass[i] > 0.0 else -np.inf
+        terms[i] = value if value < np.inf else -np.inf
+        largest = max(largest, terms[i])
+    if largest == -np.inf:
+        return largest, terms
+    whole = 0.0
+    for i in range(mass.size):
+        terms[i] = math.exp(terms[i] - largest)
+        whole += terms[i]
+    return largest + math.log(whole), terms
+
+
+@pasted
+def highest(log_density):
+    """The largest value that is not infinite or NaN."""
+    largest = -np.inf
+    for value in log_density:
+        if value > largest and value < np.inf:
+            largest = value
+    return largest
+
+
+@pasted
+def normalise(mass):
+    """Make the sum one, in place."""
+    whole = 0.0
+    for value in mass:
+        whole += value
+    for i in range(mass.size):
+        mass[i] /= whole
+
+
+@pasted
+def coarseness(mass):
+    """How much the sums of every third point disagree: the spectrum at 2 pi / (3 spacing).
+
+    A bound on the error of the sum of all points, and one that no position of a peak between the
+    points can hide from.
+    """
+    a, b, c = 0.0, 0.0, 0.0
+    for value in mass:
+        a, b, c = b, c, a + value
+    return math.sqrt(0.5 * ((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2)) / (a + b + c)

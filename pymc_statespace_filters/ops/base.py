@@ -1,0 +1,204 @@
+"""What every operation on a record has in common: its inputs, their checks, and its machine code.
+
+All are pure: parameters, data and the noise seed are inputs, and equal inputs give equal outputs.
+Nothing that matters is closed over, so that neither merging of equal nodes nor the cache of
+machine code on disk can mix two data sets up.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.gradient import grad_not_implemented
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.op import Op
+from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
+
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.private_linkage import closed
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+HEALTH_SIZE = 3
+
+RECORD_INPUTS = (
+    ("theta", "float64", 1),
+    ("steps", "int64", 1),
+    ("observed", "float64", 2),
+    ("inputs", "float64", 2),
+    ("t0", "float64", 0),
+    ("seed", "int64", 0),
+)
+
+
+class RecordOp(Op):
+    """An operation on parameters and a record, made of a system and a filter."""
+
+    __props__ = ("system", "filter")
+    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
+    checks_record: ClassVar[bool] = True
+    # How an input is written in the call of the kernel, where not as a number or a copy.
+    handed_as: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
+        self.system = system
+        self.filter = filter
+
+    def __str__(self) -> str:
+        # The default would print every equation of the system.
+        return f"{type(self).__name__}{{{self.filter}}}"
+
+    def compile(self) -> Compiled:
+        """The machine code, a function of the inputs."""
+        raise NotImplementedError
+
+    def results(self) -> list[Variable]:
+        """Fresh variables for the outputs."""
+        raise NotImplementedError
+
+    def make_node(self, *inputs: Any) -> Apply:
+        """Apply to symbols or numbers; the names and types are in `input_types`."""
+        return Apply(self, _typed(inputs, self.input_types), self.results())
+
+    def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
+        """Evaluate in PyTensor's modes without numba: by the same machine code."""
+        values = evaluator(self)(*inputs)
+        for cell, value in zip(output_storage, values, strict=True):
+            cell[0] = value
+
+
+def _typed(inputs: Sequence[Any], types: Sequence[tuple[str, str, int]]) -> list[Variable]:
+    return [
+        pt.as_tensor(value, dtype=dtype, ndim=ndim)
+        if not isinstance(value, Variable)
+        else _checked(value, name, dtype, ndim)
+        for value, (name, dtype, ndim) in zip(inputs, types, strict=True)
+    ]
+
+
+def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
+    if value.type.ndim != ndim:
+        raise TypeError(f"{name} must have {ndim} dimensions, got {value.type}")
+    return value if value.type.dtype == dtype else pt.cast(value, dtype)
+
+
+@cache
+def evaluator(op: RecordOp) -> Any:
+    """A compiled Python function of the operation's inputs; its machine code is cached on disk.
+
+    It is the machine code itself. The object around it keeps the arguments of a call in cells that
+    all callers share, and another thread's arguments would get in between.
+    """
+    inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in op.input_types]
+    function = pytensor.function(
+        inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
+    )
+    machine_code = closed(function.vm.jit_fn)
+    dtypes = [dtype for _, dtype, _ in op.input_types]
+
+    def evaluate(*values: Any) -> tuple:
+        return machine_code(*map(np.asarray, values, dtypes))
+
+    return evaluate
+
+
+def check_record(system: StateSpaceModel) -> Any:
+    """A compiled check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
+    return _check_of_inputs(system.n_inputs, int(system.observation_uses_inputs))
+
+
+# Made once for all systems of one shape: a fresh one would be compiled by the next call.
+@cache
+def _check_of_inputs(n_inputs: int, last_row: int) -> Any:
+    @jit
+    def check(steps, inputs):
+        for j in range(steps.size):
+            if steps[j] < 0 or (j > 0 and steps[j] <= steps[j - 1]):
+                raise ModelError("steps must not be negative and must increase strictly")
+        if n_inputs and inputs.shape[1] != n_inputs:
+            raise ModelError("inputs must have one column for each input of the system")
+        if n_inputs and steps.size and inputs.shape[0] < steps[-1] + last_row:
+            raise ModelError("inputs has too few rows: row k holds during step k")
+
+    return check
+
+
+@cache
+def check_observed(p: int) -> Any:
+    """A compiled check that a record has the shape that the kernels read."""
+
+    @jit
+    def check(steps, observed):
+        if observed.shape[0] != steps.size or observed.shape[1] != p:
+            raise ModelError("observed must have a row for each step, a column for each observable")
+
+    return check
+
+
+def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
+    """What the machine code of this file is made of, on top of a compiled function."""
+    checked = (system.p, system.n_inputs, system.observation_uses_inputs)
+    return key_of(f"checked for {checked}", compiled.key)
+
+
+@cache
+def kernel(op: RecordOp) -> Compiled:
+    """The machine code of an operation, compiled once."""
+    return op.compile()
+
+
+class ThetaDerivative(RecordOp):
+    """An operation whose result is a cotangent of theta."""
+
+    def results(self) -> list[Variable]:
+        """The derivative by theta."""
+        return [pt.dvector()]
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """The shape of theta."""
+        return [input_shapes[0]]
+
+
+def by_theta_alone(op: Op, inputs: Sequence[Variable], theta_bar: Variable) -> list[Variable]:
+    """Cotangents of all inputs, of which theta's is known and the record has none."""
+    data_bars = [
+        grad_not_implemented(op, i, variable, "only parameters have a gradient")
+        for i, variable in enumerate(inputs[1:], start=1)
+    ]
+    return [theta_bar, *data_bars]
+
+
+@register_funcify_and_cache_key(RecordOp)
+def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
+    """Check the record, then call the kernel.
+
+    Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
+    combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
+    The function is written out for each operation; one that looped over its inputs would cost time
+    in every call and seconds of compilation.
+    """
+    compiled = kernel(op)
+    names = [name for name, _, _ in op.input_types]
+    handed = [
+        op.handed_as.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
+        for name, _, ndim in op.input_types
+    ]
+    checks = ["check(steps, inputs)", "check_observed(steps, observed)"] * op.checks_record
+    lines = [*checks, f"return run({', '.join(handed)})"]
+    source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
+    namespace = {
+        "__name__": __name__,
+        "np": np,
+        "run": compiled.function,
+        "check": check_record(op.system),
+        "check_observed": check_observed(op.system.p),
+        "no_normals": np.empty(0),
+    }
+    exec(compile(source, f"<call of {op}>", "exec"), namespace)
+    key = cache_key(op.system, compiled)
+    return numba_njit(namespace["call"]), None if key is None else key_of(source, key)

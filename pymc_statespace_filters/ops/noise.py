@@ -1,0 +1,41 @@
+"""The log-likelihood of an estimating filter as a function of its normals instead of their seed.
+
+Reading a normal is many times cheaper than making it. Whoever evaluates again and again on the same
+noise (common random numbers), or moves it a little at a time, makes the normals once.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+
+from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+
+
+class StoredNoise(RecordOp):
+    """The normals that a noisy filter uses with a seed: ``steps`` (J,), ``seed`` -> a vector."""
+
+    input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
+    checks_record = False
+
+    def compile(self) -> Compiled:
+        """The filter's own layout of its normals."""
+        return self.filter.stored_noise(self.system)  # type: ignore[union-attr]
+
+    def results(self) -> list[Variable]:
+        """One vector."""
+        return [pt.dvector()]
+
+
+class LogLikelihoodOfNoise(LogLikelihood):
+    """`LogLikelihood` with the vector of `StoredNoise` in place of the seed; the same numbers."""
+
+    input_types = (*RECORD_INPUTS[:5], ("normals", "float64", 1))
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),(z)->(j),(h)"
+    # Not copied: they are many.
+    handed_as: ClassVar[Mapping[str, str]] = {
+        "normals": "(np.int64(0), np.ascontiguousarray(normals))"
+    }

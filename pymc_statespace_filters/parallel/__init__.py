@@ -1,0 +1,1 @@
+"""Processes and processors: MPI, communicators, cores, signals."""

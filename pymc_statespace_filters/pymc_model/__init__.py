@@ -1,0 +1,1 @@
+"""A system and its record in a PyMC model."""

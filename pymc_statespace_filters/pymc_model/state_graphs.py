@@ -1,0 +1,70 @@
+"""What the states along a record are, as graphs of a model's variables."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import pymc as pm
+from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
+from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.ops.states import States
+from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+class StateSpaceVariable(NamedTuple):
+    """One variable of a model: its equations, its filter, and the symbols of its record.
+
+    Attributes
+    ----------
+    name : str
+    system : StateSpaceModel
+    filter : Filter
+    dims : tuple of str
+        Names of its dimensions, time and observable.
+    theta, steps, inputs, t0, seed : TensorVariable
+        As a likelihood takes them; theta and inputs may depend on the free variables.
+    observed : TensorVariable
+        The data.
+    """
+
+    name: str
+    system: StateSpaceModel
+    filter: Filter
+    dims: tuple[str, str]
+    theta: TensorVariable
+    steps: TensorVariable
+    inputs: TensorVariable
+    t0: TensorVariable
+    seed: TensorVariable
+    observed: TensorVariable
+
+
+def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
+    """The StateSpace variables that have data."""
+    found = []
+    for name, node in state_space_nodes(model).items():
+        rv = node.outputs[1]
+        if rv in model.observed_RVs:
+            theta, steps, inputs, t0, seed = node.inputs[-5:]
+            dims = model.named_vars_to_dims[name]
+            record = (theta, steps, inputs, t0, seed, model.rvs_to_values[rv])
+            found.append(StateSpaceVariable(name, node.op.system, node.op.filter, dims, *record))
+    return found
+
+
+def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpaceVariable:
+    """The same record read by another filter."""
+    check_kinds(variable.system, filter)
+    return variable._replace(filter=filter)
+
+
+def states_of(
+    variable: StateSpaceVariable, moment: str, rows: Variable, draw_seed: Variable
+) -> Sequence[TensorVariable]:
+    """Mean, sd and a draw of the state at steps `rows`, effective number, health."""
+    record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
+    operation = States(variable.system, variable.filter, moment)
+    return operation(variable.theta, *record, rows, draw_seed, return_list=True)

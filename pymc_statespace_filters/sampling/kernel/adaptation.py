@@ -1,0 +1,260 @@
+"""Adaptation of a Gaussian random walk: what the proposal covariance learns from the chain.
+
+Two schemes:
+
+``"chain"``, the thesis's burn-in (Eqs. 3.27-3.29 and Fig. 4)
+    The warm-up is a succession of blocks of ``adapt_every`` iterations, each proposing with
+    ``(2.38^2 / d) COV`` of what came before it, plus a small multiple of the identity. A block that
+    accepts next to nothing tells nothing about the covariance: the scale shrinks instead.
+``"continuous"``, adaptive Metropolis (Haario, Saksman and Tamminen 2001)
+    The same covariance renewed at every iteration, once a first block has shown that the chain
+    moves.
+
+The state is a few small arrays, views of one vector. Machine code changes them in place with
+`learn`. Adaptation must stop before draws are kept: whoever drives it simply stops calling.
+
+Differences from the sources
+    * "What came before" is the last block for the first two blocks and from then on the latest half
+      to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance does
+      not rest on one block alone, which is poor once d is more than a few.
+    * A covariance from few accepted moves is blended with the covariance in use before, which
+      counts as d/5 moves. So a direction not explored yet keeps a proposal of sensible size.
+    * The scale shrinks in degrees: to a fifth where a block moves next to nowhere, to a half where
+      the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted. Between
+      the two lies the acceptance at which pseudo-marginal chains work best.
+    * After several stalls in a row the first covariance is back: with a noisy likelihood a chain
+      can sit on a lucky estimate, which no shrinking mends, and must still be able to leave.
+    * Before the first block that moves, a quarter of a block without a single acceptance already
+      shrinks the scale: a starting covariance is a guess.
+
+References
+----------
+H. Haario, E. Saksman and J. Tamminen (2001). An adaptive Metropolis algorithm. Bernoulli 7,
+223-242.
+H. Haario, M. Laine, A. Mira and E. Saksman (2006). DRAM: efficient adaptive MCMC. Statistics and
+Computing 16, 339-354.
+A. Gelman, G. Roberts and W. Gilks (1996). Efficient Metropolis jumping rules. Bayesian Statistics
+5, 599-607.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pymc_statespace_filters.sampling.kernel.adaptation_state import (
+    FIRST,
+    MOVED,
+    N_BLOCKS,
+    N_STALLS,
+    SCALE,
+    AdaptationState,
+    Moments,
+    N,
+)
+
+# Share of a block's iterations that must move at all, by any stage, to teach a covariance.
+LEAST_MOVED = 0.02
+# Below the first, the first stage's share of acceptances halves the scale; above the second, the
+# scale is 1 again.
+LOW_ACCEPTANCE, FAIR_ACCEPTANCE = 0.05, 0.10
+# Factors of the proposals' standard deviation when next to nothing moved, and when little did.
+STALLED, SHRINK = 0.2, 0.5
+# Stalls in a row that shrink the proposals; the next one starts anew.
+MOST_STALLS = 6
+# Weight of the covariance in use before, in accepted moves for each dimension.
+PRIOR_MOVES = 0.2
+# The multiple of the identity, relative to the mean variance.
+JITTER = 1e-8
+
+# For functions that compiled functions alone call: what Python needs takes as long to compile.
+_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+class AdaptationSettings(NamedTuple):
+    """What does not change while a chain runs.
+
+    Attributes
+    ----------
+    adapt_every : int
+        Iterations in a block.
+    """
+
+    adapt_every: int
+
+
+@_internal
+def learn(
+    settings: AdaptationSettings,
+    continuous: bool,
+    state: AdaptationState,
+    position: np.ndarray,
+    stage: int,
+) -> None:
+    """Take in one iteration of warm-up, under the scheme ``"continuous"`` or ``"chain"``, in place.
+
+    Parameters
+    ----------
+    settings : AdaptationSettings
+    continuous : bool
+    state : AdaptationState
+    position : ndarray, shape (d,)
+        Where the chain stands after the iteration.
+    stage : int
+        The stage whose proposal was accepted, 0 if none was.
+    """
+    block = state.block.counts
+    _include(state.block, 1.0, position)
+    block[MOVED] += 1.0 if stage > 0 else 0.0
+    block[FIRST] += 1.0 if stage == 1 else 0.0
+    if _has_stalled(settings, state.numbers, block):
+        _forget_block(state)
+    elif block[N] >= settings.adapt_every:
+        _close_block(state)
+        _learn_covariance(state)
+    elif continuous and state.numbers[N_BLOCKS] > 0.0:
+        _learn_covariance(state)
+
+
+# The helpers below are written as loops, which compile several times faster than array expressions.
+
+
+@_internal
+def _copy_of_moments(moments: Moments) -> Moments:
+    return Moments(moments.counts.copy(), moments.mean.copy(), moments.scatter.copy())
+
+
+@_internal
+def _scale_into(target: np.ndarray, matrix: np.ndarray, factor: float) -> None:
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            target[i, j] = matrix[i, j] * factor
+
+
+@_internal
+def _include(moments: Moments, n: float, mean: np.ndarray) -> None:
+    """Count in a piece that does not scatter (Chan, Golub and LeVeque)."""
+    before, old = moments.counts[N], moments.mean
+    total = max(1.0, before + n)
+    for i in range(mean.size):
+        apart = mean[i] - old[i]
+        for j in range(mean.size):
+            moments.scatter[i, j] += apart * (mean[j] - old[j]) * before * n / total
+    for i in range(mean.size):
+        old[i] += (mean[i] - old[i]) * n / total
+    moments.counts[N] = before + n
+
+
+@_internal
+def _merge(moments: Moments, other: Moments) -> None:
+    """Make moments those of two pieces together."""
+    dim = other.mean.size
+    for i in range(dim):
+        for j in range(dim):
+            moments.scatter[i, j] += other.scatter[i, j]
+    _include(moments, other.counts[N], other.mean)
+    moments.counts[MOVED] += other.counts[MOVED]
+    moments.counts[FIRST] += other.counts[FIRST]
+
+
+@_internal
+def _clear(moments: Moments) -> None:
+    for i in range(3):
+        moments.counts[i] = 0.0
+    for i in range(moments.mean.size):
+        moments.mean[i] = 0.0
+        for j in range(moments.mean.size):
+            moments.scatter[i, j] = 0.0
+
+
+@_internal
+def _has_stalled(settings: AdaptationSettings, numbers: np.ndarray, block: np.ndarray) -> bool:
+    if numbers[N_BLOCKS] == 0.0 and block[MOVED] == 0.0 and 4 * block[N] >= settings.adapt_every:
+        return True
+    full = block[N] >= settings.adapt_every
+    return full and block[MOVED] < LEAST_MOVED * block[N]
+
+
+@_internal
+def _forget_block(state: AdaptationState) -> None:
+    """Forget the stalled block, propose closer by; after too many stalls forget everything."""
+    numbers = state.numbers
+    _clear(state.block)
+    if numbers[N_STALLS] < MOST_STALLS:
+        numbers[N_STALLS] += 1.0
+        _scale_into(state.cov, state.cov, STALLED**2)
+        _scale_into(state.chol, state.chol, STALLED)
+    else:
+        numbers[SCALE], numbers[N_BLOCKS], numbers[N_STALLS] = 1.0, 0.0, 0.0
+        _scale_into(state.cov, state.first_cov, 1.0)
+        _scale_into(state.chol, _cholesky(state.first_cov), 1.0)
+        _clear(state.recent)
+        _clear(state.older)
+    _scale_into(state.base, state.cov, 1.0)
+
+
+@_internal
+def _close_block(state: AdaptationState) -> None:
+    """File a complete block and let its acceptance move the scale."""
+    numbers, block = state.numbers, state.block.counts
+    if block[FIRST] < LOW_ACCEPTANCE * block[N]:
+        numbers[SCALE] *= SHRINK
+    elif block[FIRST] > FAIR_ACCEPTANCE * block[N]:
+        numbers[SCALE] = 1.0
+    numbers[N_BLOCKS] += 1.0
+    numbers[N_STALLS] = 0.0
+    _scale_into(state.base, state.cov, 1.0)
+    _merge(state.recent, state.block)
+    _clear(state.block)
+    n_blocks = int(numbers[N_BLOCKS])
+    if n_blocks & (n_blocks - 1) == 0:
+        _replace(state.older, state.recent)
+        _clear(state.recent)
+
+
+@_internal
+def _replace(moments: Moments, other: Moments) -> None:
+    for i in range(3):
+        moments.counts[i] = other.counts[i]
+    for i in range(other.mean.size):
+        moments.mean[i] = other.mean[i]
+    _scale_into(moments.scatter, other.scatter, 1.0)
+
+
+@_internal
+def _learn_covariance(state: AdaptationState) -> None:
+    """Proposal covariance, thesis Eqs. 3.28-3.29, blended with the one in use before."""
+    moments = _copy_of_moments(state.older)
+    _merge(moments, state.recent)
+    if state.block.counts[N] > 0.0:
+        _merge(moments, state.block)
+    n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
+    dim = base.shape[0]
+    weight = moved / (moved + PRIOR_MOVES * dim)
+    learnt = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
+    cov, mean_variance = np.empty((dim, dim)), 0.0
+    for i in range(dim):
+        for j in range(i + 1):
+            cov[i, j] = learnt * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
+            cov[j, i] = cov[i, j]
+        mean_variance += cov[i, i] / dim
+    for i in range(dim):
+        cov[i, i] += JITTER * mean_variance
+    chol = _cholesky(cov)
+    if 0.0 < chol[dim - 1, dim - 1] < np.inf:  # else the draws have overflowed (or NaN)
+        _scale_into(state.cov, cov, 1.0)
+        _scale_into(state.chol, chol, 1.0)
+
+
+@_internal
+def _cholesky(cov: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor, NaN on and after the first column that has none."""
+    dim = cov.shape[0]
+    chol = np.zeros((dim, dim))
+    for j in range(dim):
+        for i in range(j, dim):
+            rest = cov[i, j]
+            for k in range(j):
+                rest -= chol[i, k] * chol[j, k]
+            chol[i, j] = np.sqrt(rest) if i == j else rest / chol[j, j]
+    return chol

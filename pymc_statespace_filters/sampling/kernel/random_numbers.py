@@ -1,0 +1,51 @@
+"""Random numbers of a chain, drawn for many iterations at a time.
+
+One call of a generator costs microseconds whether it returns one number or a thousand. A block of
+numbers is a function of the chain's key and the block's index, so that a chain can be taken up
+again anywhere and does not depend on who runs it.
+"""
+
+import numpy as np
+
+from pymc_statespace_filters.sampling.kernel.state import Random
+
+BLOCK = 256
+
+
+def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> Random:
+    """Draw the random numbers of iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``.
+
+    Parameters
+    ----------
+    key : ndarray of uint64, shape (2,)
+        Belongs to the chain.
+    index : int
+    n_stages, dim, n_noisy : int
+        Most stages of an iteration, dimension d, noisy variables.
+
+    Returns
+    -------
+    Random
+    """
+    # Each index begins 2^128 numbers after the one before it.
+    rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
+    return Random(
+        rng.standard_normal((BLOCK, n_stages, dim)),
+        -rng.standard_exponential((BLOCK, n_stages + 1)),
+        draw_seeds(rng, (BLOCK, n_stages, n_noisy)),
+    )
+
+
+def draw_key(rng: np.random.Generator) -> np.ndarray:
+    """Draw the key of a chain."""
+    return rng.integers(0, np.iinfo(np.uint64).max, size=2, dtype=np.uint64, endpoint=True)
+
+
+def side_generator(key: np.ndarray) -> np.random.Generator:
+    """Make a generator of the chain's key whose numbers are in none of its blocks."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 1]))
+
+
+def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Draw seeds of noise, non-negative int64 of the given shape."""
+    return rng.integers(0, np.iinfo(np.int64).max, size=shape, dtype=np.int64)

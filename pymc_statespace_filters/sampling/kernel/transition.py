@@ -1,0 +1,239 @@
+"""A chain in machine code: propose, evaluate, accept, adapt, note down, again and again.
+
+The step method of PyMC makes one iteration at a time with it, ``sample_dram`` as many as there are.
+
+With a noisy likelihood every proposal of every stage has noise of its own, and the estimate of the
+current point stays as it is. The densities of the noise then cancel in Eq. 3.32, so that the chain
+is exact for prior times expected likelihood, whatever the number of stages.
+
+With a screen the whole delayed-rejection move runs on a cheap density, and only its end point is
+put to the expensive one, once, with fresh noise (see `surrogate_transition`).
+
+References
+----------
+C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
+computations. Annals of Statistics 37, 697-725.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.compiler.native.pytensor_function import make_call
+from pymc_statespace_filters.sampling.kernel.adaptation import AdaptationSettings, learn
+from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
+from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
+from pymc_statespace_filters.sampling.kernel.state import (
+    ACCEPTANCE,
+    DONE,
+    FAILURE,
+    HEALTH_SIZE,
+    LOG_DENSITY,
+    LOG_SCREEN,
+    N_EFFECTIVE,
+    N_EVALUATIONS,
+    N_FAILED,
+    N_SCREEN_FAILED,
+    N_SCREENED,
+    NOT_A_NUMBER,
+    PAUSE,
+    RAISED,
+    SCALING,
+    STAGE,
+    Evaluation,
+)
+from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acceptance
+
+
+class _Move(NamedTuple):
+    """Outcome of delayed rejection; the new point, if any, is in the density's own arrays."""
+
+    stage: int
+    value: Evaluation
+    acceptance: float
+    n_evaluations: int
+    n_failed: int
+    failure: int
+
+
+_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# For a function with one caller, which else would be optimised twice.
+_pasted = njit(error_model="numpy", nogil=True, inline="always")
+
+
+@_internal
+def _copy(source, target):
+    # An assignment of slices would compile several seconds of messages about their shapes.
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+_SOURCES = (
+    "transition.py",
+    "state.py",
+    "adaptation.py",
+    "delayed_rejection.py",
+    "surrogate.py",
+)
+_SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
+
+
+def _kept(function):
+    """Compile for Python, once for all processes."""
+    key = digest(function.__name__, _SOURCE)
+    return kept(njit(function, error_model="numpy", nogil=True), key)
+
+
+@_kept
+def evaluate(density):
+    """Evaluate at the density's own position and seeds.
+
+    The log-density is never NaN nor plus infinity: an evaluation that failed is minus infinity with
+    the code of its reason.
+    """
+    if not make_call(density.call):
+        return Evaluation(-np.inf, RAISED, 0.0)
+    out, n_effective = density.call.out, np.inf
+    for i in range(density.n_healths):
+        at = 2 + HEALTH_SIZE * i
+        n_effective = min(n_effective, out[at])
+        if out[at + 1] != 0.0:
+            return Evaluation(-np.inf, int(out[at + 1]), n_effective)
+    if not out[1] < np.inf:
+        return Evaluation(-np.inf, NOT_A_NUMBER, n_effective)
+    return Evaluation(out[1], 0, n_effective)
+
+
+@_internal
+def _delayed_rejection(density, log_density, position, chol, settings, random, k):
+    """Propose stage by stage until one is accepted or all are spent (thesis, Eqs. 3.30-3.32)."""
+    dim = position.size
+    log_pi = np.empty(settings.n_stages + 1)
+    log_pi[0] = log_density
+    offsets = np.zeros((settings.n_stages + 1, dim))
+    acceptance, scale, n_failed, failure = 0.0, 1.0, 0, 0
+    value = Evaluation(log_density, 0, np.inf)
+    for stage in range(1, settings.n_stages + 1):
+        for i in range(dim):
+            offsets[stage, i] = random.normals[k, stage - 1, i] * scale
+        for i in range(dim):
+            moved = position[i]
+            for j in range(i + 1):
+                moved += chol[i, j] * offsets[stage, j]
+            density.position[i] = moved
+        _copy(random.seeds[k, stage - 1], density.seeds)
+        value = evaluate(density)
+        if value.failure != 0:
+            n_failed, failure = n_failed + 1, value.failure
+            if failure == RAISED:
+                break
+        log_pi[stage] = value.log_density
+        log_alpha = gaussian_log_acceptance(log_pi, offsets, settings.stage_scale, stage)
+        if stage == 1:
+            acceptance = np.exp(log_alpha)
+        if random.log_uniforms[k, stage - 1] < log_alpha:
+            return _Move(stage, value, acceptance, stage, n_failed, failure)
+        scale *= settings.stage_scale
+    return _Move(0, value, acceptance, settings.n_stages, n_failed, failure)
+
+
+@_internal
+def _stand(state, density, value, log_screen):
+    """Move to where a density was evaluated, and keep the estimate."""
+    _copy(density.position, state.position)
+    _copy(density.seeds, state.seeds)
+    state.numbers[LOG_DENSITY] = value.log_density
+    state.numbers[N_EFFECTIVE] = value.n_effective
+    state.numbers[LOG_SCREEN] = log_screen
+    first = density.call.out.size - state.carried.size
+    _copy(density.call.out[first:], state.carried)
+
+
+@_pasted
+def _move(settings, target, state, chol, random, k, counts):
+    """One iteration without a screen; the probability of accepting its first proposal."""
+    log_density = state.numbers[LOG_DENSITY]
+    move = _delayed_rejection(target, log_density, state.position, chol, settings, random, k)
+    if move.stage > 0:
+        _stand(state, target, move.value, 0.0)
+    counts[STAGE], counts[N_EVALUATIONS] = move.stage, move.n_evaluations
+    counts[N_FAILED], counts[FAILURE] = move.n_failed, move.failure
+    counts[N_SCREENED], counts[N_SCREEN_FAILED] = 0, 0
+    return move.acceptance
+
+
+@_pasted
+def _screened_move(settings, target, screen, state, chol, random, k, counts):
+    """One iteration whose moves a screen makes; the probability of accepting what it proposed."""
+    log_screen = state.numbers[LOG_SCREEN]
+    move = _delayed_rejection(screen, log_screen, state.position, chol, settings, random, k)
+    counts[STAGE], counts[N_EVALUATIONS] = 0, 0
+    counts[N_FAILED], counts[FAILURE] = 0, RAISED if move.failure == RAISED else 0
+    counts[N_SCREENED], counts[N_SCREEN_FAILED] = move.n_evaluations, move.n_failed
+    if move.stage == 0:
+        return 0.0
+    _copy(screen.position, target.position)
+    _copy(random.seeds[k, 0], target.seeds)
+    value = evaluate(target)
+    counts[N_EVALUATIONS], counts[FAILURE] = 1, value.failure
+    if value.failure != 0:
+        counts[N_FAILED] = 1
+        return 0.0
+    log_alpha = log_surrogate_acceptance(
+        state.numbers[LOG_DENSITY], value.log_density, log_screen, move.value.log_density
+    )
+    if random.log_uniforms[k, settings.n_stages] < log_alpha:
+        _stand(state, target, value, move.value.log_density)
+        counts[STAGE] = move.stage
+    return np.exp(log_alpha)
+
+
+@_internal
+def _scaling(chol):
+    """Geometric mean of the standard deviations along the axes of the proposal."""
+    total = 0.0
+    for i in range(chol.shape[0]):
+        total += np.log(chol[i, i])
+    return np.exp(total / chol.shape[0])
+
+
+@_kept
+def advance(settings, target, screen, state, random, first, draws, row, n, talk):
+    """Make up to n iterations, with random numbers from ``first``, noted down from ``row``.
+
+    It returns how many it made, and leaves the state where the last one ended: fewer than n if
+    somebody asked for a pause, or if the model raised.
+    """
+    learnt = unpack(state.adaptation, state.position.size)
+    adaptation = AdaptationSettings(settings.adapt_every)
+    scaling = _scaling(learnt.chol)
+    done = 0
+    while done < n and talk[PAUSE] == 0:
+        at, k = row + done, first + done
+        counts, numbers = draws.counts[at], draws.numbers[at]
+        if settings.screened:
+            acceptance = _screened_move(
+                settings, target, screen, state, learnt.chol, random, k, counts
+            )
+        else:
+            acceptance = _move(settings, target, state, learnt.chol, random, k, counts)
+        if counts[FAILURE] == RAISED:
+            break
+        _copy(state.position, draws.positions[at])
+        _copy(state.seeds, draws.seeds[at])
+        numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]
+        numbers[N_EFFECTIVE] = state.numbers[N_EFFECTIVE]
+        numbers[ACCEPTANCE], numbers[SCALING] = acceptance, scaling
+        if at < draws.covs.shape[0]:
+            for i in range(state.position.size):
+                _copy(learnt.cov[i], draws.covs[at, i])
+        if settings.adapts:
+            learn(adaptation, settings.continuous, learnt, state.position, counts[STAGE])
+            scaling = _scaling(learnt.chol)
+        done += 1
+        talk[DONE] += 1
+    return done

@@ -1,0 +1,1 @@
+"""From draws to a DataTree, statistics and warnings."""

@@ -1,0 +1,191 @@
+"""Whole chains as the DataTree that ``pm.sample`` returns.
+
+PyMC's own converter makes the tree, so that groups, dimensions, coordinates, data and attributes
+follow its conventions. It is handed traces filled in bulk, instead of draw by draw.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from pymc.backends.arviz import dict_to_dataset
+from pymc.backends.base import IBaseTrace, MultiTrace
+from pymc.model import Model
+from xarray import DataTree
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.output.deterministics import Quantities
+from pymc_statespace_filters.sampling.target.variables import HeldVariables
+
+# Groups with draws, and those with statistics of them.
+SAMPLE_STATS = {"sample_stats", "warmup_sample_stats"}
+SAMPLED = {"posterior", "warmup_posterior"} | SAMPLE_STATS
+
+
+class ChainDraws(NamedTuple):
+    """A whole chain.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n, d)
+        After each iteration, on the unconstrained space.
+    stats : dict of str to ndarray, shape (n, ...)
+        By their names in ``sample_stats``. What is the same after every iteration may come as a
+        view without a stride, as `numpy.broadcast_to` gives: it stays one.
+    """
+
+    positions: np.ndarray
+    stats: dict[str, np.ndarray]
+
+    def between(self, begin: int, end: int) -> "ChainDraws":
+        """Cut out the iterations from ``begin`` to before ``end``."""
+        cut = slice(begin, end)
+        return ChainDraws(
+            self.positions[cut], {name: values[cut] for name, values in self.stats.items()}
+        )
+
+
+def to_datatree(
+    model: Model,
+    held: HeldVariables,
+    chains: list[ChainDraws],
+    *,
+    tune: int,
+    keep_warmup: bool,
+    sampling_time: float,
+    attrs: Mapping[str, Any] | None = None,
+) -> DataTree:
+    """Turn whole chains into what ``pm.sample`` returns.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    held : HeldVariables
+        All value variables of the model, in the order of the positions.
+    chains : list of ChainDraws
+        Warm-up and draws; they are taken out of the list, so that memory holds them no longer than
+        it must. Where chains were interrupted at different iterations, those are kept, and cut to
+        one length, that give the most draws together.
+    tune : int
+        Iterations of warm-up, at the beginning of each chain; all of a chain that has no more.
+    keep_warmup : bool
+        Whether the warm-up is kept, in groups of its own.
+    sampling_time : float
+        In seconds.
+    attrs : mapping of str to any, optional
+        Attributes of the groups with draws and statistics, beside PyMC's.
+
+    Returns
+    -------
+    xarray.DataTree
+        Without a group ``posterior`` if no chain went beyond its warm-up.
+
+    Raises
+    ------
+    ModelError
+        If no iteration is to be kept.
+    """
+    skipped = 0 if keep_warmup else tune
+    lengths = [len(chain.positions) for chain in chains]
+    longest, length = _most_iterations([length - skipped for length in lengths])
+    if length <= 0:
+        raise ModelError(
+            f"the chains ended after {', '.join(map(str, lengths))} iterations, of which {tune} "
+            "are warm-up: there is nothing to return"
+        )
+    kept = [chains[i].between(skipped, skipped + length) for i in longest]
+    chains.clear()
+    fixed = [name for name in kept[0].stats if all(_is_fixed(c.stats[name]) for c in kept)]
+    quantities = Quantities(model, held)
+    fixed_stats = {name: np.stack([chain.stats[name][0] for chain in kept]) for name in fixed}
+
+    def tree_of(chain: ChainDraws) -> DataTree:
+        varying = {name: values for name, values in chain.stats.items() if name not in fixed}
+        trace = MultiTrace([_ChainTrace(0, quantities(chain.positions), varying)])
+        # There is no public way: PyMC's own driver sets these.
+        trace.report._n_tune = min(tune, skipped + length)
+        trace.report._n_draws = skipped + length - trace.report._n_tune
+        trace.report._t_sampling = sampling_time
+        return pm.to_inference_data(trace, model=model, save_warmup=keep_warmup)
+
+    # One by one: PyMC's converter takes a multiple of the memory of what it converts.
+    trees = [tree_of(kept.pop(0)) for _ in longest]
+    tree = trees[0]
+    for group in SAMPLED.intersection(tree.children):
+        parts = [of_chain[group].to_dataset() for of_chain in trees]
+        for of_chain in trees:
+            del of_chain[group]
+        whole = xr.concat(parts, "chain", combine_attrs="override")
+        tree[group] = DataTree(whole.assign_coords(chain=np.arange(len(parts))))
+        tree[group].attrs.update(attrs or {})
+    for name, values in fixed_stats.items():
+        _add_fixed(tree, name, values)
+    return tree
+
+
+class _ChainTrace(IBaseTrace):
+    """A whole chain, as PyMC's converter wants to see it.
+
+    Parameters
+    ----------
+    chain : int
+    values : dict of str to ndarray, shape (n, ...)
+        Of the variables.
+    stats : dict of str to ndarray, shape (n, ...)
+    """
+
+    def __init__(self, chain: int, values: dict[str, np.ndarray], stats: dict[str, np.ndarray]):
+        self.chain = chain
+        self.varnames = list(values)
+        self.sampler_vars = [{name: array.dtype for name, array in stats.items()}]
+        self._values, self._stats = values, stats
+
+    def __len__(self) -> int:
+        return len(next(iter((self._values | self._stats).values()), ()))
+
+    def get_values(self, varname: str, burn: int = 0, thin: int = 1) -> np.ndarray:
+        """Values of a variable."""
+        return self._values[varname][burn::thin]
+
+    def get_sampler_stats(
+        self, stat_name: str, sampler_idx: int | None = None, burn: int = 0, thin: int = 1
+    ) -> np.ndarray:
+        """Values of a statistic; there is one sampler."""
+        return self._stats[stat_name][burn::thin]
+
+    def _slice(self, idx: slice) -> "_ChainTrace":
+        values, stats = (
+            {name: array[idx] for name, array in arrays.items()}
+            for arrays in (self._values, self._stats)
+        )
+        return _ChainTrace(self.chain, values, stats)
+
+    def point(self, idx: int) -> dict[str, np.ndarray]:
+        """Values of all variables after an iteration."""
+        return {name: array[idx] for name, array in self._values.items()}
+
+
+def _most_iterations(lengths: Sequence[int]) -> tuple[list[int], int]:
+    """Choose chains, and one length for them, so that the most iterations remain.
+
+    The choice that ``pm.sample`` makes among interrupted chains.
+    """
+    by_length = sorted(range(len(lengths)), key=lambda i: -lengths[i])
+    together = [(rank + 1) * lengths[i] for rank, i in enumerate(by_length)]
+    last = int(np.argmax(together))
+    return sorted(by_length[: last + 1]), lengths[by_length[last]]
+
+
+def _is_fixed(values: np.ndarray) -> bool:
+    return values.ndim > 1 and values.strides[0] == 0
+
+
+def _add_fixed(tree: DataTree, name: str, values: np.ndarray) -> None:
+    """Add a statistic that is the same for all draws of a chain, stored once a chain."""
+    for group in SAMPLE_STATS.intersection(tree.children):
+        n_draws = tree[group].sizes["draw"]
+        shape = (len(values), n_draws, *values.shape[1:])
+        repeated = np.broadcast_to(values[:, None], shape)
+        tree[group].update(dict_to_dataset({name: repeated}))

@@ -1,0 +1,251 @@
+"""The named quantities of a PyMC model at many positions: constrained values and Deterministics.
+
+Whole chains have many positions, and most models compute little of them: transforms back to the
+user's scale, ratios, sums. NumPy computes such quantities for thousands of positions at once, with
+nothing to compile, in nanoseconds for each. The rest (loops and likelihoods within Deterministics,
+triangular matrices) comes from one compiled function of the position, called for each.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Protocol
+
+import numpy as np
+from pymc.model import Model
+from pymc.pytensorf import compile as compile_pymc
+from pymc.pytensorf import join_nonshared_inputs
+from pymc.util import get_default_varnames
+from pytensor.compile.mode import Mode
+from pytensor.compile.ops import ViewOp
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.replace import vectorize_graph
+from pytensor.graph.rewriting.basic import in2out, node_rewriter
+from pytensor.graph.rewriting.db import RewriteDatabaseQuery
+from pytensor.graph.traversal import ancestors
+from pytensor.scalar.basic import AND, OR, Invert, ScalarType, Switch
+from pytensor.tensor.basic import (
+    Alloc,
+    Join,
+    MakeVector,
+    ScalarFromTensor,
+    TensorFromScalar,
+    constant,
+)
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.elemwise import CAReduce, DimShuffle, Elemwise
+from pytensor.tensor.extra_ops import CumOp
+from pytensor.tensor.shape import Shape
+from pytensor.tensor.subtensor import Subtensor
+from pytensor.tensor.type import TensorType, tensor
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.sampling.target.variables import HeldVariables
+
+# Positions in a block: its intermediate results stay in the processor's cache.
+BLOCK = 4096
+
+# Operations that NumPy does for a block in one call, besides its ufuncs.
+OF_BLOCKS = (
+    Alloc,
+    CAReduce,
+    CumOp,
+    DimShuffle,
+    Join,
+    MakeVector,
+    ScalarFromTensor,
+    Shape,
+    Subtensor,
+    TensorFromScalar,
+    ViewOp,
+)
+
+# Operations on truth values of which NumPy makes what machine code makes.
+OF_TRUTH_VALUES = (AND, OR, Invert, Switch)
+
+
+@node_rewriter([Elemwise])
+def _two_at_a_time(fgraph: FunctionGraph, node: Apply) -> list[Variable] | None:
+    """Make sums and products of two: of more, NumPy has no ufunc."""
+    op, spec = node.op, node.op.nfunc_spec
+    if spec is None or spec[1] != 2 or len(node.inputs) == 2:
+        return None
+    # Of the result's type from the start: two small integers may make one that is too large.
+    start = constant(op.scalar_op.identity, dtype=node.outputs[0].dtype)
+    return [reduce(op, node.inputs, start)]
+
+
+# All of PyTensor's usual rewrites for stable numbers, without those for compiled loops.
+BY_NUMPY = Mode(
+    "py", RewriteDatabaseQuery(include=("fast_run",), exclude=("fusion", "inplace"))
+).register((in2out(_two_at_a_time), 100.0))
+
+
+class _Evaluator(Protocol):
+    """Some of the quantities: positions, shape (n, d), to arrays of shape (n, ...)."""
+
+    names: list[str]
+
+    def __call__(self, positions: np.ndarray) -> list[np.ndarray]: ...
+
+
+class Quantities:
+    """What a trace holds of a position, for all positions of a chain at a call.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    held : HeldVariables
+        All value variables of the model.
+
+    Attributes
+    ----------
+    names : list of str
+        In the order in which ``pm.sample`` has them.
+    """
+
+    def __init__(self, model: Model, held: HeldVariables):
+        wanted = get_default_varnames(model.unobserved_value_vars, include_transformed=False)
+        self.names = [variable.name for variable in wanted]
+        in_blocks = _InBlocks([v for v in wanted if _is_of_blocks(v)], held)
+        rest = [v for v in wanted if v.name not in in_blocks.names]
+        self._evaluators: list[_Evaluator] = [in_blocks]
+        if rest:
+            self._evaluators.append(_OneByOne(rest, held))
+
+    def __call__(self, positions: np.ndarray) -> dict[str, np.ndarray]:
+        """Evaluate.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (n, d)
+            One that repeats the one before, as after a rejection, costs nothing.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n, ...)
+        """
+        moved = np.ones(len(positions), dtype=np.bool_)
+        moved[1:] = (positions[1:] != positions[:-1]).any(axis=1)
+        distinct, place = positions[moved], np.cumsum(moved) - 1
+        values = {}
+        for evaluate in self._evaluators:
+            for name, array in zip(evaluate.names, evaluate(distinct), strict=True):
+                values[name] = array[place]
+        return {name: values[name] for name in self.names}
+
+
+class _InBlocks:
+    """Quantities by NumPy, thousands of positions at once; it leaves out what NumPy cannot.
+
+    Mind that NumPy's functions may differ from those of machine code in the last bit.
+    """
+
+    def __init__(self, wanted: Sequence[TensorVariable], held: HeldVariables):
+        point = held.split(np.zeros(held.dim))
+        self._shapes = [point[v.name].shape for v in held.variables]
+        self._ends = np.cumsum([point[v.name].size for v in held.variables])[:-1]
+        blocks = [
+            tensor(dtype=v.dtype, shape=(None, *shape))
+            for v, shape in zip(held.variables, self._shapes, strict=True)
+        ]
+        graphs = _without_views(
+            vectorize_graph(list(wanted), dict(zip(held.variables, blocks, strict=True)))
+        )
+        kept = [(v, graph) for v, graph in zip(wanted, graphs, strict=True) if _is_of_blocks(graph)]
+        self.names = [v.name for v, _ in kept]
+        self._dtypes = [block.dtype for block in blocks]
+        # A constant has no axis for the positions.
+        self._has_axis = [graph.ndim > v.ndim for v, graph in kept]
+        self._function = compile_pymc(
+            blocks,
+            [graph for _, graph in kept],
+            mode=BY_NUMPY,
+            on_unused_input="ignore",
+            trust_input=True,
+        )
+
+    def __call__(self, positions: np.ndarray) -> list[np.ndarray]:
+        results: list[np.ndarray] = []
+        for begin in range(0, len(positions), BLOCK):
+            block = positions[begin : begin + BLOCK]
+            with np.errstate(all="ignore"):  # infinities and NaN are values, as in machine code
+                values = self._function(*self._split(block))
+            if not results:
+                results = [
+                    np.empty((len(positions), *np.shape(value)[has_axis:]), value.dtype)
+                    for value, has_axis in zip(values, self._has_axis, strict=True)
+                ]
+            for result, value in zip(results, values, strict=True):
+                result[begin : begin + BLOCK] = value
+        return results
+
+    def _split(self, block: np.ndarray) -> list[np.ndarray]:
+        parts = np.split(block, self._ends, axis=1)
+        return [
+            part.reshape(len(block), *shape).astype(dtype, copy=False)
+            for part, shape, dtype in zip(parts, self._shapes, self._dtypes, strict=True)
+        ]
+
+
+class _OneByOne:
+    """Quantities by machine code, a call for each position."""
+
+    def __init__(self, wanted: Sequence[Variable], held: HeldVariables):
+        self.names = [v.name for v in wanted]
+        point = held.split(np.zeros(held.dim))
+        outputs, joined = join_nonshared_inputs(point, list(wanted), held.variables)
+        self._dtypes = [output.dtype for output in outputs]
+        self._function = compile_pymc([joined], outputs, on_unused_input="ignore", trust_input=True)
+        self._dtype = joined.dtype
+
+    def __call__(self, positions: np.ndarray) -> list[np.ndarray]:
+        call = self._machine_code()
+        positions = positions.astype(self._dtype, copy=False)
+        results = [
+            np.empty((len(positions), *np.shape(value)), dtype)
+            for value, dtype in zip(call(positions[0]), self._dtypes, strict=True)
+        ]
+        for i, position in enumerate(positions):
+            for result, value in zip(results, call(position), strict=True):
+                result[i] = value
+        return results
+
+    def _machine_code(self) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
+        """Leave out what PyTensor does around its machine code, as long as that is nothing."""
+        function = self._function
+        renewed = len(function.maker.fgraph.outputs) > len(self.names)  # as generators are
+        if renewed or not hasattr(function.vm, "jit_fn"):  # the latter in a mode without numba
+            return function
+        machine_code = function.vm.jit_fn
+        data = [cell.storage[0] for cell in function.input_storage[1:]]
+        return lambda position: machine_code(position, *data)
+
+
+def _is_of_blocks(graph: Variable) -> bool:
+    """Whether NumPy does all that is behind a quantity in few calls for a block."""
+    return all(
+        isinstance(v.type, TensorType | ScalarType) and (v.owner is None or _is_of_block(v.owner))
+        for v in ancestors([graph])
+    )
+
+
+def _is_of_block(node: Apply) -> bool:
+    op = node.op
+    if isinstance(op, Elemwise):
+        # NumPy's sum of two truth values is a truth value, machine code may count.
+        is_counting = any(v.dtype == "bool" for v in node.inputs)
+        # Without a ufunc of NumPy's or SciPy's, PyTensor would go from number to number.
+        return op.nfunc_spec is not None and (
+            isinstance(op.scalar_op, OF_TRUTH_VALUES) or not is_counting
+        )
+    return isinstance(op, OF_BLOCKS)
+
+
+def _without_views(graphs: list[Variable]) -> list[Variable]:
+    """Take out the views by which PyMC names Deterministics: batched, they are loops in Python."""
+    graph = FunctionGraph(outputs=graphs, clone=False)
+    for node in graph.toposort():
+        if isinstance(node.op, Blockwise) and isinstance(node.op.core_op, ViewOp):
+            graph.replace(node.outputs[0], node.inputs[0])
+    return list(graph.outputs)

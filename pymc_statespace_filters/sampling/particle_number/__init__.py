@@ -1,0 +1,1 @@
+"""How many particles a record needs."""

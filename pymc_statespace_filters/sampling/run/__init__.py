@@ -1,0 +1,1 @@
+"""Many chains: in threads, over ranks."""

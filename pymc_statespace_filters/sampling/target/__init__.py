@@ -1,0 +1,1 @@
+"""The log-density that a chain evaluates."""

@@ -1,0 +1,29 @@
+"""How states are laid into a DataTree."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import xarray as xr
+
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+
+
+def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
+    """By variable of a model, the name of its dimension of states: a name has one list of them."""
+    # Observables come first: their dimension may have that name in the model.
+    lists = [v.system.observables for v in variables if "state" in v.dims]
+    lists += [v.system.states for v in variables]
+    return {
+        v.name: "state" if v.system.states == lists[0] else f"{v.name}_state" for v in variables
+    }
+
+
+def with_group(
+    idata: xr.DataTree, name: str, group: xr.Dataset, attrs: Mapping[str, Any], extend: bool
+) -> xr.DataTree:
+    """Put a group into `idata`, in place of one of that name, or into a DataTree of its own."""
+    group = group.assign_attrs(attrs)
+    if not extend:
+        return xr.DataTree.from_dict({name: group})
+    idata[name] = xr.DataTree(group)
+    return idata

@@ -1,0 +1,1 @@
+"""What a user writes: equations, forces, integrators, records, parameters; checked here."""

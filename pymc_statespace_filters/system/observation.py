@@ -1,0 +1,207 @@
+"""How a state is seen: a function with noise, PyMC distributions, or a log-density."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pymc as pm
+import pytensor.tensor as pt
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Variable
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.traversal import graph_inputs
+from pytensor.tensor.random.type import RandomType
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.equations import (
+    Equation,
+    as_matrix,
+    as_symbol,
+    as_vector,
+    constant_covariance,
+    read_equation,
+)
+from pymc_statespace_filters.system.graph_digest import freeze
+
+Values = Mapping[str, TensorVariable]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The traced observation: symbols for its noise and its datum, and graphs of them."""
+
+    noise: TensorVariable
+    datum: TensorVariable
+    observation: TensorVariable | None = None
+    covariance: TensorVariable | None = None
+    logp: TensorVariable | None = None
+    draw: TensorVariable | None = None
+    additive: bool = False
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether Kalman updates have a meaning: an observation function with Gaussian noise."""
+        return self.logp is None
+
+    def freeze_draw(self, symbols: Sequence[Variable]) -> FrozenFunctionGraph | None:
+        """The simulation of a datum, with its random generators as further inputs."""
+        if self.draw is None:
+            return None
+        generators = [
+            v
+            for v in graph_inputs([self.draw])
+            if isinstance(v, SharedVariable) and isinstance(v.type, RandomType)
+        ]
+        return freeze([*symbols, *generators], [self.draw])
+
+
+def read_observation(
+    observation: Callable | None,
+    observation_noise: Any,
+    observation_dist: Callable | None,
+    observation_logp: Callable | None,
+) -> "_GaussianObservation | _DensityObservation":
+    """Check which of the three forms was given; exactly one density must result."""
+    if observation_dist is not None and (observation is not None or observation_logp is not None):
+        raise ModelError(
+            "observation_dist replaces observation and observation_logp; give it alone"
+        )
+    if observation_dist is None and observation_logp is None:
+        if observation is None:
+            raise ModelError("give observation, observation_dist or observation_logp")
+        if observation_noise is None:
+            raise ModelError("observation needs observation_noise, the covariance of its noise")
+        return _GaussianObservation(observation, observation_noise)
+    return _DensityObservation(observation, observation_noise, observation_dist, observation_logp)
+
+
+class _GaussianObservation:
+    def __init__(self, observation: Callable, covariance: Any) -> None:
+        self.observation = read_equation("observation", observation, "xeut")
+        self.covariance = (
+            read_equation("observation_noise", covariance, "")
+            if callable(covariance)
+            else covariance
+        )
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        functions = (self.observation, self.covariance)
+        return tuple(f for f in functions if isinstance(f, Equation))
+
+    def trace(self, values: Values, n_observables: int | None) -> Observation:
+        additive = "e" not in self.observation.symbols
+        p = r = None
+        if additive:
+            seen = as_vector("observation", self.observation(values), n_observables)
+            p = r = seen.type.shape[0]
+        cov = self._trace_covariance(values, r, definite=additive)
+        noise = pt.tensor("e", shape=(cov.type.shape[0],), dtype="float64")
+        if additive:
+            seen = seen + noise
+        else:
+            with_noise = {**values, "e": noise}
+            seen = as_vector("observation", self.observation(with_noise), n_observables)
+            p = seen.type.shape[0]
+        if p == 0:
+            raise ModelError("observation returns nothing: at least one observable is needed")
+        datum = pt.tensor("d", shape=(p,), dtype="float64")
+        return Observation(noise, datum, seen, cov, additive=additive)
+
+    def _trace_covariance(
+        self, values: Values, size: int | None, *, definite: bool
+    ) -> TensorVariable:
+        if isinstance(self.covariance, Equation):
+            return as_matrix("observation_noise", self.covariance(values), size, size)
+        role = "observation_noise"
+        return pt.as_tensor(constant_covariance(role, self.covariance, size, definite=definite))
+
+
+class _DensityObservation:
+    """Distributions, or a log-density with (for simulation only) an observation function."""
+
+    def __init__(
+        self,
+        observation: Callable | None,
+        observation_noise: Any,
+        dist: Callable | None,
+        logp: Callable | None,
+    ) -> None:
+        if observation is None and observation_noise is not None:
+            raise ModelError(
+                "observation_noise has no observation to belong to: a density brings its own noise"
+            )
+        if observation is not None and observation_noise is None:
+            raise ModelError("observation needs observation_noise, the covariance of its noise")
+        self.simulated = (
+            None if observation is None else _GaussianObservation(observation, observation_noise)
+        )
+        self.dist = None if dist is None else read_equation("observation_dist", dist, "xut")
+        self.logp = None
+        if logp is not None:
+            self.logp = read_equation("observation_logp", logp, ("d", *"xut"))
+            if "d" not in self.logp.symbols:
+                raise ModelError("observation_logp must ask for d, the observation")
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        own = tuple(f for f in (self.dist, self.logp) if f is not None)
+        return own if self.simulated is None else own + self.simulated.equations
+
+    def trace(self, values: Values, n_observables: int | None) -> Observation:
+        if self.dist is not None:
+            return _trace_distributions(self.dist, values, n_observables)
+        assert self.logp is not None
+        if self.simulated is not None:
+            seen = self.simulated.trace(values, n_observables)
+            noise, datum = seen.noise, seen.datum
+        else:
+            seen = None
+            noise = pt.tensor("e", shape=(0,), dtype="float64")
+            datum = pt.tensor("d", shape=(n_observables or 1,), dtype="float64")
+        logp = as_symbol("observation_logp", self.logp({**values, "d": datum}))
+        if logp.type.ndim != 0:
+            raise ModelError(
+                f"observation_logp must return one number, got {logp.type.ndim} dimensions"
+            )
+        return Observation(
+            noise, datum, seen and seen.observation, seen and seen.covariance, logp=logp
+        )
+
+
+def _trace_distributions(dist: Equation, values: Values, n_observables: int | None) -> Observation:
+    returned = dist(values)
+    variables = list(returned) if isinstance(returned, list | tuple) else [returned]
+    if n_observables is not None and len(variables) != n_observables:
+        raise ModelError(
+            f"observation_dist returns {len(variables)} distributions "
+            f"for {n_observables} observables"
+        )
+    datum = pt.tensor("d", shape=(len(variables),), dtype="float64")
+    terms = [_log_density(variable, datum[i]) for i, variable in enumerate(variables)]
+    return Observation(
+        noise=pt.tensor("e", shape=(0,), dtype="float64"),
+        datum=datum,
+        # A partly missing row counts as missing.
+        logp=pt.switch(pt.any(pt.isnan(datum)), 0.0, pt.sum(pt.stack(terms))),
+        draw=pt.stack([pt.cast(variable, "float64") for variable in variables]),
+    )
+
+
+def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
+    if not isinstance(variable, TensorVariable) or variable.type.ndim != 0:
+        raise ModelError(
+            "observation_dist must return one scalar PyMC distribution per observable "
+            f"([pm.Poisson.dist(mu=...)]), got {variable!r}"
+        )
+    if variable.owner is None:
+        raise ModelError(f"observation_dist returns {variable}, which is not a distribution")
+    try:
+        if "int" in variable.type.dtype:
+            # A count that is not whole has no probability.
+            whole = pm.logp(variable, pt.cast(pt.round(value), variable.type.dtype))
+            return pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
+        return pm.logp(variable, value)
+    except NotImplementedError as error:
+        raise ModelError(f"observation_dist: {variable} has no log-density: {error}") from error

@@ -1,0 +1,113 @@
+"""Entries: called by name and by address, and compiled once."""
+
+from functools import partial
+from types import FunctionType
+
+import numpy as np
+from numba import carray, njit, types
+from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.native import entry_point as entries
+from pymc_statespace_filters.compiler.native.entry_point import (
+    NUMBERS,
+    Entry,
+    address_of,
+    call_address,
+    kept,
+)
+from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
+
+
+def scale(x, n, factor):
+    values = carray(x, (n,))
+    for i in range(n):
+        values[i] *= factor
+
+
+SCALE = Entry(scale, (NUMBERS, types.intp, types.float64), "scale", None)
+by_name, symbol = SCALE.external, SCALE.symbol
+
+
+@njit
+def twice(x):
+    by_name(x.ctypes.data, x.size, 2.0)
+    return x
+
+
+@njit
+def thrice(address, x):
+    call_address(address, (x.ctypes.data, x.size, 3.0))
+    return x
+
+
+@njit
+def of_a_temporary(address, n):
+    out = np.ones(2 * n)
+    call_address(address, (out[n:], n, 3.0))
+    return out
+
+
+@njit
+def address():
+    return address_of(symbol)
+
+
+def test_is_called_by_name_and_by_address():
+    SCALE.compile()
+    assert twice(np.arange(3.0)).tolist() == [0, 2, 4]
+    assert thrice(address(), np.arange(3.0)).tolist() == [0, 3, 6]
+    assert njit(lambda: address_of(""))() == 0
+
+
+def test_an_array_is_handed_over_by_its_address():
+    SCALE.compile()
+    assert of_a_temporary(address(), 2).tolist() == [1, 1, 3, 3]
+
+
+def test_a_second_entry_under_the_same_key_is_the_first():
+    one, two = (Entry(scale, (NUMBERS, types.intp, types.float64), "s", "key") for _ in range(2))
+    assert one.symbol == two.symbol
+    unnamed = Entry(scale, (NUMBERS, types.intp, types.float64), "s", None)
+    assert unnamed.symbol != Entry(scale, (), "s", None).symbol
+
+
+def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
+    evaluate = partial(
+        psf.log_likelihood, params={"a": 0.6}, observed=FORCED_DATA, steps=STEPS, inputs=FORCE
+    )
+    evaluate(forced(), psf.BootstrapPF(10))
+    before = set(entries._compiled)
+    evaluate(forced(), psf.BootstrapPF(20, resampling="multinomial"))
+    assert set(entries._compiled) == before
+    evaluate(forced(initial_mean=[0.25]), psf.BootstrapPF(10))
+    new = set(entries._compiled) - before
+    assert new
+    assert not any("bootstrap" in symbol or "fill_normals" in symbol for symbol in new)
+
+
+def test_the_point_mass_filter_is_compiled_once_for_all_systems_and_tolerances():
+    evaluate = partial(
+        psf.log_likelihood, params={"a": 0.6}, observed=FORCED_DATA, steps=STEPS, inputs=FORCE
+    )
+    evaluate(forced(), psf.GridFilter())
+    before = set(entries._compiled)
+    evaluate(forced(), psf.GridFilter(tolerance=1e-6))
+    assert set(entries._compiled) == before
+    evaluate(forced(initial_mean=[0.35]), psf.GridFilter())
+    new = set(entries._compiled) - before
+    assert new
+    assert not any("point_mass" in symbol for symbol in new)
+
+
+def test_code_is_kept_for_its_module():
+    """Kept code is loaded through its module: a file that moved must be compiled anew."""
+
+    def function(x):
+        return x + 1.0
+
+    keys = []
+    for module in ("here", "there"):
+        moved = FunctionType(function.__code__, {"__name__": module})
+        keys.append(CACHED_SRC_FUNCTIONS[kept(njit(moved), "key").py_func])
+    assert keys[0] != keys[1]

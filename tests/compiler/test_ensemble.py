@@ -1,0 +1,112 @@
+"""What a system gives to the filters, against the functions that the user wrote."""
+
+import numpy as np
+import pytensor.tensor as pt
+import pytest
+from scipy import stats
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.codegen import functions as lowering
+from pymc_statespace_filters.compiler.lowering.ensemble import (
+    ensemble_machine,
+    semidefinite_cholesky,
+)
+
+N = 5
+INPUTS = np.array([[0.3], [0.7], [-0.2]])
+THETA = np.array([0.5, 0.2, 1.3])  # a, s, r
+
+
+def drift(x, u, t, a):
+    return [x[1], -a * x[0] + u[0] * pt.cos(t)]
+
+
+def pendulum(observed_with_e):
+    if observed_with_e:
+        seen = lambda x, e, u, r: [x[0] * (1 + e[0]) + u[0], x[1] + r * e[1]]  # noqa: E731
+    else:
+        seen = lambda x, u, r: [x[0] + u[0], r * x[1]]  # noqa: E731
+    return psf.StateSpaceModel(
+        transition=psf.EulerMaruyama(drift, lambda s: [[0.0], [s]], dt=0.1),
+        observation=seen,
+        observation_noise=[[0.4, 0.1], [0.1, 0.3]],
+        initial_mean=lambda a: [a, 0.0],
+        initial_cov=[[0.5, 0.0], [0.0, 0.0]],
+        inputs=["force"],
+    )
+
+
+@pytest.fixture(params=[True, False], ids=["scalars", "arrays"])
+def machine_of(request, monkeypatch):
+    if not request.param:
+        monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 0)
+    ensemble_machine.cache_clear()
+    yield ensemble_machine
+    ensemble_machine.cache_clear()
+
+
+def states():
+    return np.random.default_rng(3).normal(size=(2, N))
+
+
+def test_members_move_and_are_seen_as_written(machine_of):
+    machine, rng = machine_of(pendulum(False)), np.random.default_rng(1)
+    c, Z, X = machine.prepare(THETA), rng.normal(size=(2, 64)), np.empty((2, N))
+    a, s, r = THETA
+
+    machine.initialise(c, Z, X)
+    np.testing.assert_allclose(X, [a + np.sqrt(0.5) * Z[0, :N], np.zeros(N)], rtol=1e-12)
+
+    X = states()
+    force = INPUTS[1, 0] * np.cos(0.25)
+    expected = [
+        X[0] + 0.1 * X[1],
+        X[1] + 0.1 * (-a * X[0] + force) + np.sqrt(0.1) * s * Z[0, :N],
+    ]
+    moved = X.copy()
+    machine.propagate(c, INPUTS, 1, 0.25, Z[:1], moved)
+    np.testing.assert_allclose(moved, expected, rtol=1e-12)
+
+    D, root = np.empty((2, N)), np.linalg.cholesky([[0.4, 0.1], [0.1, 0.3]])
+    machine.observe(c, INPUTS, 2, 0.0, Z, X, D)
+    seen = np.array([X[0] + INPUTS[2, 0], r * X[1]])
+    np.testing.assert_allclose(D, seen + root @ Z[:, :N], rtol=1e-12)
+
+    out, d = np.empty(N), np.array([0.2, -0.4])
+    machine.log_density(c, INPUTS, 2, 0.0, d, X, out)
+    true = stats.multivariate_normal([0, 0], [[0.4, 0.1], [0.1, 0.3]]).logpdf((d[:, None] - seen).T)
+    np.testing.assert_allclose(out, true, rtol=1e-12)
+    machine.log_density(c, INPUTS, 2, 0.0, np.array([np.nan, -0.4]), X, out)
+    np.testing.assert_allclose(out, stats.norm(seen[1], np.sqrt(0.3)).logpdf(-0.4), rtol=1e-12)
+
+
+def test_general_noise_has_the_covariance_d_gamma_d():
+    machine = ensemble_machine(pendulum(True))
+    c, X, r = machine.prepare(THETA), states(), THETA[2]
+    out, d = np.empty(N), np.array([0.2, -0.4])
+    machine.log_density(c, INPUTS, 0, 0.0, d, X, out)
+    gamma = np.array([[0.4, 0.1], [0.1, 0.3]])
+    for i in range(N):
+        D = np.diag([X[0, i], r])
+        mean = [X[0, i] + INPUTS[0, 0], X[1, i]]
+        true = stats.multivariate_normal(mean, D @ gamma @ D.T).logpdf(d)
+        assert out[i] == pytest.approx(true, rel=1e-12)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2, 3])
+def test_square_root_of_a_singular_covariance(rank):
+    factors = np.random.default_rng(rank).normal(size=(3, rank))
+    cov = factors @ factors.T
+    root = cov.copy()
+    semidefinite_cholesky(root)
+    np.testing.assert_allclose(root @ root.T, cov, atol=1e-12)
+    assert (np.triu(root, 1) == 0).all()
+
+
+@pytest.mark.parametrize(
+    "cov", [[[-1.0]], [[-np.inf]], [[np.inf]], [[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]]
+)
+def test_square_root_of_what_is_no_covariance_is_nan(cov):
+    root = np.array(cov)
+    semidefinite_cholesky(root)
+    assert np.isnan(root).all()

@@ -1,0 +1,86 @@
+"""Code in scalars gives the numbers of PyTensor's own functions, whatever a user writes."""
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.compile.mode import Mode
+
+from pymc_statespace_filters.compiler.codegen import functions as lowering
+from pymc_statespace_filters.compiler.codegen.expressions import Arena
+from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
+from pymc_statespace_filters.system.equations import as_vector
+from tests.compiler import programs
+
+POINTS = np.array([[0.3, -0.7, 1.4], [-1.3, 0.0, 2.0]])
+INTERPRETED = Mode(linker="py", optimizer=None)
+
+
+def traced(group):
+    """One graph with an output for each program: it compiles much faster than a graph for each."""
+    x = pt.tensor("x", shape=(3,), dtype="float64")
+    return x, [as_vector(name, program(x)) for name, program in group.items()]
+
+
+def lowered(x, outputs):
+    function = VectorFunction("c", Graph({"theta": x}, outputs), [False] * len(outputs))
+    compiled = vector_functions({"f": function})["f"].function
+    return compiled if len(outputs) > 1 else lambda point: (compiled(point),)
+
+
+def assert_same(group, x, outputs, rtol):
+    """The programs' outputs at x, lowered, are those of PyTensor's own functions."""
+    references = [pytensor.function([x], y, mode=INTERPRETED) for y in outputs]
+    function = lowered(x, outputs)
+    for point in POINTS:
+        for name, reference, value in zip(group, references, function(point), strict=True):
+            with np.errstate(all="ignore"):
+                expected = reference(point)
+            np.testing.assert_allclose(value, expected, rtol=rtol, atol=1e-15, err_msg=name)
+
+
+@pytest.mark.parametrize("group", ["MOVING", "ARITHMETIC", "LOGIC", "ALGEBRA", "NESTED"])
+def test_unrolled_code_equals_pytensor(group, monkeypatch):
+    monkeypatch.setattr(lowering, "MAX_OUTPUT_ELEMENTS", 1000)
+    x, outputs = traced(getattr(programs, group))
+    # Whatever has no scalar form raises here, where array code would step in.
+    monkeypatch.setattr(lowering, "array_vector_function", None)
+    assert_same(getattr(programs, group), x, outputs, rtol=1e-13)
+
+
+def test_what_does_not_unroll_runs_on_arrays():
+    x, outputs = traced(programs.ARRAYS_ONLY)
+    for output in outputs:
+        with pytest.raises(NotUnrollableError):
+            lowering.unrolled(Graph({"theta": x}, [output]))
+    assert_same(programs.ARRAYS_ONLY, x, outputs, rtol=1e-12)
+
+
+def test_a_value_that_is_not_finite_never_turns_into_a_finite_one():
+    names = ("elementary", "whole powers", "sums", "clip")
+    group = {name: programs.ARITHMETIC[name] for name in names}
+    group["cholesky"] = programs.ALGEBRA["cholesky"]
+    group["switch"] = programs.LOGIC["switch"]
+    x, outputs = traced(group)
+    references = [pytensor.function([x], y, mode=INTERPRETED) for y in outputs]
+    function = lowered(x, outputs)
+    for poison in (np.nan, np.inf, -np.inf):
+        point = np.array([poison, 1.0, -2.0])
+        for name, reference, value in zip(group, references, function(point), strict=True):
+            with np.errstate(all="ignore"):
+                unknown = np.isnan(reference(point))
+            assert not np.isfinite(np.asarray(value)[unknown]).any(), name
+
+
+def test_a_large_graph_is_not_written_out():
+    x = pt.tensor("x", shape=(3,), dtype="float64")
+    y = x
+    for _ in range(20):
+        y = pt.sin(y) + x
+    arena = Arena()
+    values = np.empty(3, dtype=object)
+    values[:] = [arena.input(f"x.{i}") for i in range(3)]
+    with pytest.raises(NotUnrollableError, match="more than 50"):
+        unroll(arena, [x], [values], [y], 50)

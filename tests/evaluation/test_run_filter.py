@@ -1,0 +1,172 @@
+"""A filter at fixed parameters: the run of the likelihood itself, with the states that it knew."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.states import States
+from tests.references.linear_states import linear_states
+from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+
+POINT = {"a": 0.7}
+MEMBERS = {
+    "enkf": psf.EnKF(60),
+    "bootstrap": psf.BootstrapPF(60, resample_below=1.0),
+    "pf_enkf": psf.PFEnKF(60),
+}
+ROWS = {"observations": STEPS, "steps": np.arange(7)}
+
+
+def run(filter, **changes):
+    return psf.run_filter(PAIR, filter, POINT, PAIR_DATA, **{"steps": STEPS} | changes)
+
+
+def exact(rows):
+    return linear_states(
+        [[0.7, 0.2], [0.0, 0.8]], np.diag([1.0, 0.5]), np.eye(2), [[0.5, 0.1], [0.1, 0.4]],
+        [0.0, 0.3], np.diag([1.0, 2.0]),
+        steps=STEPS, observed=PAIR_DATA, rows=rows, moment="filtered",
+    )  # fmt: skip
+
+
+def exact_cov(rows):
+    return np.einsum("iaib->iab", exact(rows).cov)
+
+
+@pytest.mark.parametrize("at", ROWS)
+@pytest.mark.parametrize("filter", [psf.EKF(), *MEMBERS.values()], ids=["ekf", *MEMBERS])
+def test_it_is_the_very_run_of_the_likelihood(filter, at):
+    terms = psf.log_likelihood(PAIR, filter, POINT, PAIR_DATA, steps=STEPS, seed=5)
+    np.testing.assert_array_equal(run(filter, seed=5, at=at)["log_likelihood"], terms)
+
+
+@pytest.mark.parametrize("at", ROWS)
+def test_ekf_has_the_exact_law_of_a_linear_system(at):
+    found = run(psf.EKF(), at=at)
+    np.testing.assert_allclose(found["mean"], exact(ROWS[at]).mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found["cov"], exact_cov(ROWS[at]), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found["sd"], exact(ROWS[at]).sd, rtol=1e-9)
+    assert "particles" not in found
+
+
+@pytest.mark.parametrize("at", ROWS)
+@pytest.mark.parametrize("name", MEMBERS)
+def test_moments_are_those_of_the_weighted_particles_and_of_filtered_states(name, at):
+    found = run(MEMBERS[name], seed=3, at=at)
+    x, w = found["particles"].values, found["weights"].values
+    np.testing.assert_allclose(w.sum(axis=1), 1.0, rtol=1e-12)
+    mean = np.einsum("ti,tia->ta", w, x)
+    np.testing.assert_allclose(found["mean"], mean, rtol=1e-10, atol=1e-12)
+    covs = [np.cov(x[t].T, aweights=w[t]) for t in range(len(x))]
+    np.testing.assert_allclose(found["cov"], covs, rtol=1e-9, atol=1e-12)
+    evaluate = evaluator(States(PAIR, MEMBERS[name], "filtered"))
+    theta, no_inputs = np.array([0.7, 0.2]), np.zeros((0, 0))
+    states = evaluate(theta, STEPS, PAIR_DATA, no_inputs, 0.0, 3, ROWS[at], 0)
+    np.testing.assert_allclose(found["mean"], states[0], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(found["sd"], states[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "filter", [psf.EnKF(40_000), psf.BootstrapPF(40_000), psf.PFEnKF(20_000)], ids=repr
+)
+def test_many_particles_have_the_exact_law(filter):
+    # Five standard errors of a mean over some 10 000 effective particles. Kernels make the cloud of
+    # PFEnKF a little too narrow, here by 3 % at most.
+    found = run(filter, at="steps")
+    truth = exact(ROWS["steps"])
+    assert (np.abs(found["mean"] - truth.mean) < 0.05 * truth.sd).all()
+    np.testing.assert_allclose(found["cov"], exact_cov(ROWS["steps"]), rtol=0.1, atol=0.05)
+
+
+def test_weights_are_those_from_before_resampling():
+    found = run(MEMBERS["bootstrap"], at="steps")
+    # At step 0 the particles are draws of the prior, and weighted by the density of what was seen.
+    noise, seen = np.array([[0.5, 0.1], [0.1, 0.4]]), PAIR_DATA[0]
+    residual = seen - found["particles"].values[0]
+    density = np.exp(-0.5 * np.einsum("ia,ab,ib->i", residual, np.linalg.inv(noise), residual))
+    np.testing.assert_allclose(found["weights"][0], density / density.sum(), rtol=1e-9)
+    np.testing.assert_allclose(found["weights"][1], 1 / 60, rtol=1e-12)  # resampled since
+
+
+def test_grid_filter_and_ekf_agree_on_a_linear_system():
+    def of(filter):
+        return psf.run_filter(
+            FORCED, filter, POINT, FORCED_DATA, steps=STEPS, inputs=FORCE, at="steps"
+        )
+
+    ekf, grid = of(psf.EKF()), of(psf.GridFilter())
+    for name in ("log_likelihood", "mean", "sd", "cov"):
+        np.testing.assert_allclose(grid[name], ekf[name], atol=1e-6)
+    terms = psf.log_likelihood(
+        FORCED, psf.GridFilter(), POINT, FORCED_DATA, steps=STEPS, inputs=FORCE
+    )
+    np.testing.assert_array_equal(grid["log_likelihood"], terms)
+
+
+def test_coordinates_are_times():
+    found = run(psf.EnKF(60), steps=None, times=2.0 + STEPS, t0=2.0, at="steps")
+    assert found["time"].values.tolist() == [2, 3, 4, 5, 6, 7, 8]
+    assert found["obs_time"].values.tolist() == (2.0 + STEPS).tolist()
+    assert found["cov"].dims == ("time", "state", "state_bis")
+    assert found["state"].values.tolist() == list(PAIR.states)
+    assert found.attrs["filter"] == repr(psf.EnKF(60))
+
+
+@pytest.mark.parametrize(
+    "filter", [psf.EKF(), psf.BootstrapPF(50), psf.EnKF(50), psf.GridFilter()], ids=repr
+)
+def test_a_failure_leaves_what_was_known_before_it(filter):
+    impossible = [0.1, 1e200, 0.3, 0.9]  # its square is infinite
+    with pytest.warns(psf.FilterWarning, match="-inf"):
+        found = psf.run_filter(
+            FORCED, filter, POINT, impossible, steps=STEPS, inputs=FORCE, at="steps"
+        )
+    assert found["log_likelihood"].values[1:].tolist() == [-np.inf] * 3
+    np.testing.assert_allclose(
+        found["log_likelihood"][0], norm.logpdf(0.1, 0.0, np.sqrt(1.5)), atol=0.2
+    )
+    for name in found.data_vars.keys() - {"log_likelihood"}:
+        assert np.isfinite(found[name][:2]).all()  # the second observation is at step 2
+        assert np.isnan(found[name][2:]).all()
+
+
+def test_where_no_particle_is_finite_the_state_is_unknown():
+    # Steps of a steep cubic drift explode, long before the observation that fails.
+    steep = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0] - 10.0 * x[0] ** 3 + q[0]],
+        process_noise=[[1.0]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.1]],
+        initial_mean=[1.0],
+        initial_cov=[[0.1]],
+    )
+    with pytest.warns(psf.FilterWarning, match="infinite or NaN"):
+        found = psf.run_filter(
+            steep, psf.BootstrapPF(50), {}, [1.0, 1.0], steps=[0, 30], at="steps"
+        )
+    assert not np.isfinite(found["particles"][29]).any()
+    assert (found["weights"][29] == 0.0).all()
+    assert np.isnan(found["mean"][29:]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"at": "always"}, r"at must be one of \['observations', 'steps'\], got 'always'"),
+        ({"seed": [1, 2]}, r"takes one seed, got an array of \(2,\)"),
+        ({"seed": 0.5}, "seed must be an integer, got 0.5"),
+        ({"steps": STEPS[:3]}, r"observed must have shape \(3, 2\)"),
+        ({"params": {"a": [0.1, 0.2]}}, r"one value per parameter, got arrays of \(2,\)"),
+        ({"params": {}}, "a"),
+        ({"filter": "ekf"}, "filter must be a filter"),
+        ({"filter": psf.GridFilter()}, "GridFilter treats systems of one state"),
+        ({"inputs": [1.0]}, "names none"),
+    ],
+)
+def test_refusals(changes, message):
+    arguments = {"filter": psf.EKF(), "params": POINT, "steps": STEPS} | changes
+    filter, params = arguments.pop("filter"), arguments.pop("params")
+    with pytest.raises(psf.ModelError, match=message):
+        psf.run_filter(PAIR, filter, params, PAIR_DATA, **arguments)

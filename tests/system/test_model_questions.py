@@ -1,0 +1,81 @@
+"""What samplers and evidence ask of a model: seeds, dependence, health, exactness."""
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.inspection import exactness, health_outputs, noise_seeds
+from tests.small_systems import PAIR, PAIR_DATA, STEPS
+
+ENKF = psf.EnKF(20)
+
+
+def pair_variable(name, filter=psf.EKF(), **changes):  # noqa: B008 (settings are frozen)
+    return psf.StateSpace(name, PAIR, filter, steps=STEPS, observed=PAIR_DATA, **changes)
+
+
+def test_noise_seeds_are_those_of_estimates_alone():
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 1)
+        pair_variable("exact")
+        pair_variable("noisy", filter=ENKF, seed=2**40 + 3)
+        pair_variable("unbiased", filter=psf.BootstrapPF(20))
+    seeds = noise_seeds(model)
+    assert list(seeds) == ["noisy", "unbiased"]
+    assert seeds["noisy"] is model["noisy_seed"]
+    assert "exact_seed" not in model.named_vars
+    assert seeds["noisy"].type == pytensor.shared(np.array(0, dtype="int64")).type
+    assert seeds["noisy"].get_value() == 2**40 + 3
+
+
+@pytest.mark.parametrize(
+    ("filter", "exact"),
+    [(psf.EKF(), True), (psf.BootstrapPF(20), True), (ENKF, False), (psf.PFEnKF(20), False)],
+)
+def test_exactness(filter, exact):
+    with pm.Model() as model:
+        pair_variable("d", filter=filter, params={"a": 0.6})
+    assert exactness(model) is exact
+    with model:
+        pair_variable("e", filter=ENKF, params={"a": 0.6})
+    assert not exactness(model)
+
+
+@pytest.mark.parametrize("exact", [psf.EKF(), psf.BootstrapPF(20)], ids=["EKF", "PF"])
+def test_a_filter_that_approximates_the_system_is_not_exact(exact):
+    """The EKF is exact for linear systems, the bootstrap filter where the density is."""
+
+    def system(power, observation):
+        return psf.StateSpaceModel(
+            lambda x, q: [x[0] ** power + q[0]],
+            observation,
+            process_noise=[[1.0]],
+            observation_noise=[[1.0]],
+            initial_mean=[0.0],
+            initial_cov=[[1.0]],
+        )
+
+    additive, general = (lambda x: [x[0]]), (lambda x, e: [x[0] + x[0] * e[0]])
+    assert exact.is_exact_for(system(1, additive))
+    assert exact.is_exact_for(system(3, additive)) is isinstance(exact, psf.BootstrapPF)
+    assert not exact.is_exact_for(system(1, general))
+
+
+def test_health_comes_out_of_the_same_evaluation():
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 1)
+        pair_variable("first")
+        pair_variable("second", params={"b": 1.0})
+    logp = model.logp()
+    health = health_outputs([logp])
+    assert len(health) == 2
+    assert [h.type.ndim for h in health] == [1, 1]
+    values = model.compile_fn([logp, *health])({"a": 1e300})
+    assert values[0] == -np.inf
+    for record in values[1:]:
+        assert record.dtype == "float64"
+        assert record.shape == (3,)
+        assert record[1] != 0
+        assert record[2] == 1  # step 0 is met before any power of a
