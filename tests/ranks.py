@@ -66,8 +66,8 @@ class FakeRank:
         for rank, theirs in enumerate(self._table):
             assert theirs.shape == array.shape
             if rank != self.rank:
-                own = _part(rank, self.size, array.shape[1], per_block)
-                array[:, own] = theirs[:, own]
+                local = _part(rank, self.size, array.shape[1], per_block)
+                array[:, local] = theirs[:, local]
         self._barrier.wait()
 
 

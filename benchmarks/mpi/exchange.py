@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks.mpi.watched import many_exchanges
-from pymc_statespace_filters.filters.ensemble.partition import Share
-from pymc_statespace_filters.parallel.communicator import ranks_of
+from benchmarks.mpi.with_callback import many_exchanges
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.parallel.communicator import communicator_of
 
 ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as the filters have them
 ROUNDS = 300  # short ones: some meet a moment without neighbours
@@ -43,8 +43,8 @@ def bare(comm: MPI.Comm, array: np.ndarray) -> Callable[[int], None]:
 
 
 def main(target: str) -> None:
-    ranks = ranks_of("world")
-    share = Share(ranks.rank, ranks.size, ranks.exchange)
+    ranks = communicator_of("world")
+    share = RankLayout(ranks.rank, ranks.size, ranks.exchange)
     many_exchanges(share, np.zeros((ROWS, 2)), 1)
     found = {"n_bytes": [8 * ROWS * columns for columns in COLUMNS], "callback": []}
     for columns in COLUMNS:

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from xarray import DataTree
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.parallel.communicator import Communicator
 
 CHAINS, DRAWS, N = 4, 100_000, 5
 ROUNDS = 5
@@ -23,12 +23,12 @@ MEGABYTE = 2**20
 
 
 class Clock:
-    """Seconds that a rank spends in some methods of `Ranks`."""
+    """Seconds that a rank spends in some methods of `Communicator`."""
 
     def __init__(self, names: tuple[str, ...]):
         self.seconds = 0.0
         for name in names:
-            setattr(Ranks, name, self.around(getattr(Ranks, name)))
+            setattr(Communicator, name, self.around(getattr(Communicator, name)))
 
     def around(self, method):
         def timed(*arguments):

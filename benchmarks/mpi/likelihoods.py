@@ -14,8 +14,8 @@ from statistics import median
 from mpi4py import MPI
 
 from benchmarks.mpi.cases import Case, cases, evaluation, with_exact_kernels
-from benchmarks.mpi.watched import Watched
-from pymc_statespace_filters.parallel.communicator import ranks_of
+from benchmarks.mpi.with_callback import Watched
+from pymc_statespace_filters.parallel.communicator import communicator_of
 
 SECONDS, MOST, LEAST = 40.0, 15, 5  # of a case: about so long, at most and at least so many rounds
 
@@ -55,13 +55,13 @@ def wait_politely(comm: MPI.Comm) -> None:
 
 
 def measure(case: Case) -> Wall:
-    comm, both = MPI.COMM_WORLD, Watched(ranks_of("world"), time.perf_counter)
-    alone, together = evaluation(case, ranks_of(None)), evaluation(case, both)
+    comm, both = MPI.COMM_WORLD, Watched(communicator_of("world"), time.perf_counter)
+    alone, run_collectively = evaluation(case, communicator_of(None)), evaluation(case, both)
     found = Wall(case, [], [], [])
     if comm.rank == 0:
         alone(0)
     wait_politely(comm)
-    together(0)
+    run_collectively(0)
     seed, rounds = 0, MOST
     while seed < rounds:
         seed += 1
@@ -70,7 +70,7 @@ def measure(case: Case) -> Wall:
         wait_politely(comm)
         both.forget()
         comm.Barrier()
-        found.two.append(taken(together, seed))
+        found.two.append(taken(run_collectively, seed))
         found.in_exchanges.append(both.seconds)
         each = comm.bcast(median(found.one) + median(found.two) if comm.rank == 0 else None)
         rounds = max(LEAST, min(MOST, int(SECONDS / each)))

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.mpi.cases import SIZES, THREADS, cases, with_exact_kernels
-from benchmarks.mpi.watched import Cost, cost
+from benchmarks.mpi.with_callback import Cost, cost
 
 ROUNDS = 5
 LONG, FEW = 5.0, (1, 2, 16)  # what takes so many CPU seconds is measured once, on few sizes

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.mpi.cases import Case, Ranks, evaluation
-from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, Share, complete
+from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, RankLayout, allgather
 from tests.ranks import FakeRank, on_ranks
 
 N_TOLLS = 200
@@ -80,19 +80,19 @@ def toll(n_ranks: int) -> float:
 
     def run(rank: FakeRank) -> float:
         watched = Watched(rank, time.thread_time)
-        share, own = Share(rank.rank, n_ranks, watched.exchange), array.copy()
-        many_exchanges(share, own, N_TOLLS)
+        layout, local = RankLayout(rank.rank, n_ranks, watched.exchange), array.copy()
+        many_exchanges(layout, local, N_TOLLS)
         watched.forget()
         start = time.thread_time()
-        many_exchanges(share, own, N_TOLLS)
+        many_exchanges(layout, local, N_TOLLS)
         return (time.thread_time() - start - watched.seconds) / N_TOLLS
 
     array = np.zeros((1, n_ranks))
-    many_exchanges(Share(0, 1, 0), array, 1)
+    many_exchanges(RankLayout(0, 1, 0), array, 1)
     return min(on_ranks(n_ranks, run))
 
 
 @njit(nogil=True)
-def many_exchanges(share, array, n):
+def many_exchanges(layout, array, n):
     for _ in range(n):
-        complete(share, array, BLOCKS)
+        allgather(layout, array, BLOCKS)

@@ -13,8 +13,8 @@ from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.shared import SharedLogLikelihood
-from pymc_statespace_filters.parallel.communicator import Ranks, ranks_of
+from pymc_statespace_filters.ops.shared import DistributedLogLikelihood
+from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_seed, check_system, checked_record
@@ -105,7 +105,7 @@ def log_likelihood(
     theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
     seeds = np.broadcast_to(seeds, shape)
     points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         if ranks.size > 1:
             _check_agreement(ranks, filter, (points, *record, seeds))
         terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
@@ -114,12 +114,12 @@ def log_likelihood(
     return terms.reshape(*shape, record.steps.size)
 
 
-def _check_agreement(ranks: Ranks, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
+def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
     """Raise, on all ranks, unless all make the same call."""
     mine = hashlib.sha256(repr((filter, [array.shape for array in arrays])).encode())
     for array in arrays:
         mine.update(np.ascontiguousarray(array).tobytes())
-    digests = ranks.gather(mine.digest())
+    digests = ranks.allgather(mine.digest())
     for rank, theirs in enumerate(digests):
         if theirs != digests[0]:
             raise DataMismatchError(
@@ -134,7 +134,7 @@ def _evaluate(
     points: np.ndarray,
     record: tuple,
     seeds: np.ndarray,
-    ranks: Ranks,
+    ranks: Communicator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Terms and health of every point: side by side where the filter can, else in turn."""
     check_ranks(filter, ranks.size)
@@ -149,7 +149,7 @@ def _evaluate(
     return terms, health
 
 
-def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Ranks) -> Callable:
+def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Communicator) -> Callable:
     """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
 
     All call it with the same arguments, each moves its own members, and all get the same result, to
@@ -163,7 +163,7 @@ def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Ranks) -> C
     check_ranks(filter, ranks.size)
     if ranks.size == 1:
         return evaluator(LogLikelihood(system, filter))
-    evaluate = evaluator(SharedLogLikelihood(system, filter))
+    evaluate = evaluator(DistributedLogLikelihood(system, filter))
 
     def evaluate_together(*record: Any) -> tuple[np.ndarray, np.ndarray]:
         results = evaluate(*record, ranks.rank, ranks.size, ranks.exchange)

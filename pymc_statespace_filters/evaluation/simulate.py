@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
 from pymc_statespace_filters.compiler.lowering.observation_sampler import observation_sampler
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -25,7 +25,7 @@ from pymc_statespace_filters.system.record import (
 
 
 @lru_cache(maxsize=256)
-def continuation(system: StateSpaceModel) -> Compiled:
+def continuation(system: StateSpaceModel) -> CompiledFunction:
     """The function (rng, theta, x, first, steps, inputs, t0) -> states (R, n), observations (R, p).
 
     It goes on from the state x (n,) of step ``first`` and keeps what it meets at ``steps``, which
@@ -51,7 +51,7 @@ def continuation(system: StateSpaceModel) -> Compiled:
 
 
 @lru_cache(maxsize=256)
-def observer(system: StateSpaceModel) -> Compiled:
+def observer(system: StateSpaceModel) -> CompiledFunction:
     """The function (rng, theta, states, steps, inputs, t0) -> an observation (R, p) of each state.
 
     ``states`` (R, n) are those at ``steps`` (R,).
@@ -69,13 +69,13 @@ def observer(system: StateSpaceModel) -> Compiled:
     return _kept(look, key_of("look", machine.key, sampler.key))
 
 
-def _kept(function: Callable, key: str | None) -> Compiled:
+def _kept(function: Callable, key: str | None) -> CompiledFunction:
     """Compiled, from disk if any process did so before."""
     compiled = jit(function)
-    return Compiled(compiled if key is None else kept(compiled, key), key)
+    return CompiledFunction(compiled if key is None else cached_on_disk(compiled, key), key)
 
 
-def _sampler(system: StateSpaceModel) -> Compiled:
+def _sampler(system: StateSpaceModel) -> CompiledFunction:
     if system.equations.observation is None and system.equations.observation_draw is None:
         raise ModelError(
             "the system has a density of observations (observation_logp) but nothing to draw "
@@ -85,7 +85,7 @@ def _sampler(system: StateSpaceModel) -> Compiled:
 
 
 @lru_cache(maxsize=256)
-def simulator(system: StateSpaceModel) -> Compiled:
+def simulator(system: StateSpaceModel) -> CompiledFunction:
     """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
     machine = ensemble_machine(system)
     prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate

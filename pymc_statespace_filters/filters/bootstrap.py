@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.native.entry_point import Entry
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
 from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
 from pymc_statespace_filters.filters.ensemble.loop import filter_entry
@@ -29,13 +29,13 @@ from pymc_statespace_filters.filters.settings import check_choice, check_count, 
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
-@pasted
-def _workspace(system, own, settings):
+@inline_always
+def _workspace(system, local, settings):
     return ()
 
 
-@pasted
-def _update(system, j, k, t, d, noise, members, own, work):
+@inline_always
+def _update(system, j, k, t, d, noise, members, local, work):
     X, _, _, w, log_w, log_p, alive = members
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
@@ -43,15 +43,15 @@ def _update(system, j, k, t, d, noise, members, own, work):
     log_density(system, k, t, d, X, log_p)
     for i in range(alive.size):
         log_w[i] = log_w[i] + log_p[i] if alive[i] else -np.inf
-    weigh(log_w, w, own, 0)
-    sum_values(alive, own, 3)
-    exchange(own, 4)
-    if total(own, 3) == 0.0:
+    weigh(log_w, w, local, 0)
+    sum_values(alive, local, 3)
+    exchange(local, 4)
+    if total(local, 3) == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
-    increment, n_effective = total_weight(own, 0)  # Eq. 4.43
+    increment, n_effective = total_weight(local, 0)  # Eq. 4.43
     if increment == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
-    normalise_own(increment, log_w, w, own, 0)
+    normalise_own(increment, log_w, w, local, 0)
     return increment, n_effective, NONE
 
 
@@ -96,7 +96,7 @@ class BootstrapPF(EnsembleFilter):
     resampling: str = "systematic"
 
     unbiased: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry(
+    entry: ClassVar[EntryPoint] = filter_entry(
         "bootstrap_pf", _workspace, _update, n_settings=2, resamples=True
     )
 

@@ -10,7 +10,11 @@ from functools import lru_cache
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+)
 from pymc_statespace_filters.compiler.lowering.gaussian import log_normal
 from pymc_statespace_filters.compiler.lowering.structure import is_linear
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
@@ -19,19 +23,19 @@ from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, c
 from pymc_statespace_filters.filters.gaussian.batch import compile_batch
 from pymc_statespace_filters.filters.gaussian.linearization import (
     Symbols,
-    move_from,
+    innovation_moments,
+    linearize_transition,
     pack,
-    sight_from,
     state_size,
     unpack,
 )
 from pymc_statespace_filters.filters.gaussian.recursion import (
-    Recursion,
+    GaussianFilterFunctions,
     compile_taped,
     compile_value,
 )
 from pymc_statespace_filters.filters.gaussian.run import compile_run
-from pymc_statespace_filters.filters.gaussian.states import StatesPass, compile_states, states_pass
+from pymc_statespace_filters.filters.gaussian.states import ForwardPass, compile_states, states_pass
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -77,27 +81,27 @@ class EKF:
         """Whether the system is linear; False too where that cannot be seen."""
         return is_linear(system)
 
-    def compile(self, system: StateSpaceModel) -> Compiled:
+    def compile(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
         return compile_value(_recursion(system))
 
-    def compile_batch(self, system: StateSpaceModel) -> Compiled:
+    def compile_batch(self, system: StateSpaceModel) -> CompiledFunction:
         """The same of many points: theta (B, k) -> terms (B, J) and health (B, 3)."""
         return compile_batch(_recursion(system))
 
-    def compile_taped(self, system: StateSpaceModel) -> Compiled:
+    def compile_taped(self, system: StateSpaceModel) -> CompiledFunction:
         """That of one point with a third result: the tape, which `compile_reverse` reads."""
         return compile_taped(_recursion(system))
 
-    def compile_reverse(self, system: StateSpaceModel) -> Compiled:
+    def compile_reverse(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
         return compile_reverse(_recursion(system))
 
-    def compile_gradient(self, system: StateSpaceModel) -> Compiled:
+    def compile_gradient(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""
         return compile_gradient(_recursion(system))
 
-    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+    def compile_states(self, system: StateSpaceModel, moment: str) -> CompiledFunction:
         """The states at some steps, by their mean and standard deviation, and a draw of them.
 
         The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> (mean (R, n),
@@ -107,7 +111,7 @@ class EKF:
         """
         return compile_states(_states_pass(system), moment)
 
-    def compile_run(self, system: StateSpaceModel) -> Compiled:
+    def compile_run(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
 
         See `filters`, the room, for what it returns.
@@ -127,7 +131,7 @@ def _start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
 def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     """Eqs. 4.8-4.11: A and B are taken at the analysis of this step."""
     mean, cov = unpack(values["s"], system.n)
-    move = move_from(system, values, mean)
+    move = linearize_transition(system, values, mean)
     forecast_cov = move.state_jac @ cov @ move.state_jac.T
     if system.m:
         if system.equations.process_noise is not None:
@@ -141,14 +145,14 @@ def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
 def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
     mean, cov = unpack(values["s"], system.n)
-    sight = sight_from(system, values, mean, cov)
+    sight = innovation_moments(system, values, mean, cov)
     gain, kept = sight.gain, sight.kept
     analysis_cov = kept @ cov @ kept.T + gain @ sight.noise_cov @ gain.T
     increment = log_normal(sight.residual, sight.innovation_cov, sight.seen)
     return pack(mean + gain @ sight.residual, analysis_cov), increment
 
 
-def _recursion(system: StateSpaceModel) -> Recursion:
+def _recursion(system: StateSpaceModel) -> GaussianFilterFunctions:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
     s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
     values = symbols_of(system) | {"s": s}
@@ -158,7 +162,7 @@ def _recursion(system: StateSpaceModel) -> Recursion:
         return VectorFunction(arguments, graph, scalar)
 
     analysis, term = _update(system, values)
-    return Recursion(
+    return GaussianFilterFunctions(
         system,
         function("c", "theta", [_start(system, values)], False),
         function("c, inputs, k, t, s", "theta u t s", [_predict(system, values)], False),
@@ -173,5 +177,5 @@ def _recursion(system: StateSpaceModel) -> Recursion:
 
 
 @lru_cache(maxsize=256)
-def _states_pass(system: StateSpaceModel) -> StatesPass:
+def _states_pass(system: StateSpaceModel) -> ForwardPass:
     return states_pass(_recursion(system))

@@ -7,15 +7,15 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.native.entry_point import Entry
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import past_kernel
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     forecast_moments,
+    kalman_update,
     mark_finite,
-    nudge,
 )
 from pymc_statespace_filters.filters.ensemble.loop import filter_entry
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
@@ -50,16 +50,16 @@ class _Scratch(NamedTuple):
     residual: np.ndarray
 
 
-@pasted
-def _workspace(system, own, settings):
+@inline_always
+def _workspace(system, local, settings):
     n, p = system.n, system.p
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    scratch = _Scratch(moments, np.empty(own.size), np.empty(own.size), np.empty(p))
+    scratch = _Scratch(moments, np.empty(local.size), np.empty(local.size), np.empty(p))
     return settings[0] == _ENSEMBLE, scratch
 
 
-@pasted
-def _update(system, j, k, t, d, noise, members, own, work):
+@inline_always
+def _update(system, j, k, t, d, noise, members, local, work):
     X, D, _, w, _, log_p, alive = members
     of_ensemble, (moments, log_share, share, residual) = work
     n, p = system.n, system.p
@@ -71,29 +71,29 @@ def _update(system, j, k, t, d, noise, members, own, work):
     # Sums over the members of all ranks, in one exchange
     for i in range(alive.size):
         w[i] = 1.0 if alive[i] else 0.0
-    sum_values(w, own, 0)
-    sum_members(w, X, own, 1)
-    sum_members(w, D, own, 1 + n)
+    sum_values(w, local, 0)
+    sum_members(w, X, local, 1)
+    sum_members(w, D, local, 1 + n)
     n_rows = 1 + n + p
     if of_ensemble:
         log_density(system, k, t, d, X, log_p)
-        log_N = math.log(own.n_members)
+        log_N = math.log(local.n_members)
         for i in range(alive.size):
             log_share[i] = log_p[i] - log_N if alive[i] else -np.inf
-        weigh(log_share, share, own, n_rows)
-    exchange(own, n_rows + 3 * of_ensemble)
-    n_alive = total(own, 0)
+        weigh(log_share, share, local, n_rows)
+    exchange(local, n_rows + 3 * of_ensemble)
+    n_alive = total(local, 0)
     if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
 
     # Moments of the forecast
     x_mean, d_mean, _, _ = moments
-    means(own, 1, n_alive, x_mean)  # Eq. 4.16
-    means(own, 1 + n, n_alive, d_mean)
+    means(local, 1, n_alive, x_mean)  # Eq. 4.16
+    means(local, 1 + n, n_alive, d_mean)
     # The mean over the members of p(d | x^f_i), Eq. 4.26. How many members carry it is the same
     # question as in a particle filter (Eq. 4.43).
-    increment, n_effective = total_weight(own, n_rows) if of_ensemble else (0.0, n_alive)
-    if not forecast_moments(w, X, D, d, n_alive - 1.0, own, moments):  # Eqs. 4.17-4.19
+    increment, n_effective = total_weight(local, n_rows) if of_ensemble else (0.0, n_alive)
+    if not forecast_moments(w, X, D, d, n_alive - 1.0, local, moments):  # Eqs. 4.17-4.19
         return -np.inf, n_alive, COVARIANCE_NOT_POSITIVE
 
     # Increment of the log-likelihood
@@ -103,11 +103,11 @@ def _update(system, j, k, t, d, noise, members, own, work):
         return -np.inf, 0.0, ZERO_WEIGHTS
 
     # Analysis
-    nudge(d, D, alive, system.free, moments, X)  # Eqs. 4.20-4.21
+    kalman_update(d, D, alive, system.free, moments, X)  # Eqs. 4.20-4.21
     return increment, n_effective, NONE
 
 
-@pasted
+@inline_always
 def _gaussian_fit(d, moments, residual):
     """log N(d; d_bar, P_dd), observed components only."""
     _, d_mean, _, P_dd_chol = moments
@@ -158,7 +158,7 @@ class EnKF(EnsembleFilter):
 
     needs_simulated_observations: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry(
+    entry: ClassVar[EntryPoint] = filter_entry(
         "enkf", _workspace, _update, n_settings=1, resamples=False
     )
 
@@ -176,8 +176,8 @@ class EnKF(EnsembleFilter):
 
     def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
         """Bind the ensemble Kalman smoother to one system."""
-        watched, never = self.watched(machine), np.iinfo(np.int64).max // 2
-        return past_kernel(watched, machine, self.n_members, nudges=True, lag=never)
+        with_callback, never = self.with_callback(machine), np.iinfo(np.int64).max // 2
+        return past_kernel(with_callback, machine, self.n_members, nudges=True, lag=never)
 
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """Name the method of the smoothed states."""

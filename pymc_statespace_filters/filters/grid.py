@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.entry_points import one_state_entries
 from pymc_statespace_filters.compiler.lowering.scalar_state import (
     OneState,
@@ -25,8 +25,13 @@ from pymc_statespace_filters.compiler.lowering.scalar_state import (
     one_state,
 )
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    EntryPoint,
+    address_of,
+)
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
@@ -48,11 +53,11 @@ _ARGUMENTS = (
     types.intp, types.intp, types.intp,  # addresses of the system's functions
     types.intp, types.intp, types.intp, types.float64,  # p, inputs, same every step?, time step
     types.float64,  # tolerance
-    NUMBERS, types.intp,  # theta
-    COUNTS, types.intp, NUMBERS,  # steps and record
-    NUMBERS, types.intp,  # rows of inputs
+    F64_PTR, types.intp,  # theta
+    I64_PTR, types.intp, F64_PTR,  # steps and record
+    F64_PTR, types.intp,  # rows of inputs
     types.float64,  # t0
-    NUMBERS, NUMBERS,  # terms, health
+    F64_PTR, F64_PTR,  # terms, health
 )  # fmt: skip
 
 
@@ -136,12 +141,14 @@ class GridFilter:
         right_density = system.additive_noise or not system.gaussian_observation
         return right_density and has_smooth_transition(system)
 
-    def compile(self, system: StateSpaceModel) -> Compiled:
+    def compile(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, noise) -> (terms, health)."""
         functions = one_state(system)
-        return Compiled(_bound(functions, self.tolerance), key_of(repr(self), functions.key))
+        return CompiledFunction(
+            _bound(functions, self.tolerance), key_of(repr(self), functions.key)
+        )
 
-    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+    def compile_states(self, system: StateSpaceModel, moment: str) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
 
         States are (mean (R, 1), sd (R, 1), drawn (R, 1), n_effective (R,), health (3,)) of the law
@@ -150,15 +157,17 @@ class GridFilter:
         """
         functions = one_state(system)
         key = key_of(f"{self} {moment} states", functions.key)
-        return Compiled(_bound_states(functions, self.tolerance, MOMENTS[moment]), key)
+        return CompiledFunction(_bound_states(functions, self.tolerance, MOMENTS[moment]), key)
 
-    def compile_run(self, system: StateSpaceModel) -> Compiled:
+    def compile_run(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
 
         See `filters`, the room, for what it returns.
         """
         functions = one_state(system)
-        return Compiled(_bound_run(functions, self.tolerance), key_of(f"{self} run", functions.key))
+        return CompiledFunction(
+            _bound_run(functions, self.tolerance), key_of(f"{self} run", functions.key)
+        )
 
     def smoothing_method(self, system: StateSpaceModel) -> str:
         """How smoothed states are found, in words."""
@@ -175,7 +184,7 @@ def _bound(functions: OneState, tolerance: float) -> Any:
     n_inputs, p, dt = functions.n_inputs, functions.p, functions.dt
     same_every_step = int(functions.same_every_step)
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, noise):
         terms, health = np.full(steps.size, -np.inf), np.empty(3)
         health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
@@ -194,7 +203,7 @@ def _bound_states(functions: OneState, tolerance: float, moment: int) -> Any:
     """What `GridFilter.compile_states` gives, for the functions of one system."""
     evaluate = _bound_laws(functions, tolerance, moment)
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         record = (theta, steps, observed, inputs, t0)
         mean, sd, drawn, _, health = evaluate(record, rows, draw_seed)
@@ -208,7 +217,7 @@ def _bound_run(functions: OneState, tolerance: float) -> Any:
     """What `GridFilter.compile_run` gives, for the functions of one system."""
     evaluate = _bound_laws(functions, tolerance, MOMENTS["filtered"])
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows):
         record = (theta, steps, observed, inputs, t0)
         mean, sd, _, terms, health = evaluate(record, rows, 0)
@@ -228,7 +237,7 @@ def _bound_laws(functions: OneState, tolerance: float, moment: int) -> Any:
     n_inputs, p, dt = functions.n_inputs, functions.p, functions.dt
     same_every_step = int(functions.same_every_step)
 
-    @compiled
+    @njit_contract
     def laws(record, rows, draw_seed):
         theta, steps, observed, inputs, t0 = record
         # One state: what is (R, 1) for the caller is a vector here.
@@ -267,7 +276,7 @@ def _point_mass(
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
-@pasted
+@inline_always
 def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
     if not system.is_valid:
@@ -282,4 +291,4 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
             return code, j
 
 
-POINT_MASS = Entry(_point_mass, _ARGUMENTS, "point_mass", digest("point_mass"))
+POINT_MASS = EntryPoint(_point_mass, _ARGUMENTS, "point_mass", digest("point_mass"))

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always
 
 
-@pasted
+@inline_always
 def is_missing(observed, j):
     """Whether nothing was seen at observation j."""
     for i in range(observed.shape[1]):

@@ -6,15 +6,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.native.entry_point import Entry
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
     forecast_moments,
+    kalman_update,
     mark_finite,
-    nudge,
 )
 from pymc_statespace_filters.filters.ensemble.loop import filter_entry
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
@@ -54,20 +54,20 @@ _LIKELIHOODS = ("predictive", "weights", "as_printed")
 _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 
-@pasted
-def _workspace(system, own, settings):
-    return np.int64(settings[2]), nudging_workspace(system, own)
+@inline_always
+def _workspace(system, local, settings):
+    return np.int64(settings[2]), nudging_workspace(system, local)
 
 
-@pasted
-def _update(system, j, k, t, d, noise, members, own, work):
+@inline_always
+def _update(system, j, k, t, d, noise, members, local, work):
     X, D, X_f, w, log_w, log_p, alive = members
     likelihood, scratch = work
 
     # Simulated observations and previous weights, of the particles that are alive
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.29
     mark_finite(X, D, alive)
-    n_alive, n_effective, log_alive = _weigh_alive(members, own)
+    n_alive, n_effective, log_alive = _weigh_alive(members, local)
     if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
     if log_alive == -np.inf:
@@ -76,18 +76,18 @@ def _update(system, j, k, t, d, noise, members, own, work):
     # Predicted density of the observation, then proposal and weights
     log_density(system, k, t, d, X, log_p)
     copy_members(X, X_f)
-    forecast = _forecast(n_alive, n_effective, members, own, scratch)
+    forecast = _forecast(n_alive, n_effective, members, local, scratch)
     as_printed = likelihood == _AS_PRINTED
     if not (
         forecast.spread > _ONE_PARTICLE
-        and _nudge(system, d, members, forecast, own, scratch)  # Eqs. 4.30-4.35
-        and weigh_nudged(system, k, t, d, members, forecast, own, scratch, as_printed)  # Eq. 4.36
+        and _nudge(system, d, members, forecast, local, scratch)  # Eqs. 4.30-4.35
+        and weigh_nudged(system, k, t, d, members, forecast, local, scratch, as_printed)  # Eq. 4.36
     ):
         copy_members(X_f, X)
         log_density(system, k, t, d, X, log_p)
         for i in range(w.size):
             log_w[i] += log_p[i]  # Eq. 4.28
-    n_effective, log_total, log_printed = _normalise(members, own, scratch)  # Eqs. 4.37, 4.43
+    n_effective, log_total, log_printed = _normalise(members, local, scratch)  # Eqs. 4.37, 4.43
     if likelihood == _PREDICTIVE:
         increment = log_alive + forecast.log_mean  # Eq. 4.42 without its double count
     elif likelihood == _WEIGHTS:
@@ -99,62 +99,62 @@ def _update(system, j, k, t, d, noise, members, own, work):
     return increment, n_effective, NONE
 
 
-@pasted
-def _weigh_alive(members, own):
+@inline_always
+def _weigh_alive(members, local):
     """Normalise the weights of who is alive; return how many are, N_eff, and the log of the sum."""
     _, _, _, w, log_w, _, alive = members
     for i in range(w.size):
         log_w[i] = log_w[i] if alive[i] else -np.inf
-    weigh(log_w, w, own, 0)
-    sum_values(alive, own, 3)
-    exchange(own, 4)
-    log_alive, n_effective = total_weight(own, 0)
+    weigh(log_w, w, local, 0)
+    sum_values(alive, local, 3)
+    exchange(local, 4)
+    log_alive, n_effective = total_weight(local, 0)
     if log_alive > -np.inf:
-        normalise_own(log_alive, log_w, w, own, 0)
-    return total(own, 3), n_effective, log_alive
+        normalise_own(log_alive, log_w, w, local, 0)
+    return total(local, 3), n_effective, log_alive
 
 
-@pasted
-def _forecast(n_alive, n_effective, members, own, scratch):
+@inline_always
+def _forecast(n_alive, n_effective, members, local, scratch):
     """Means of the forecast, and its p(d | x)."""
     X, D, _, w, log_w, log_p, _ = members
     x_mean, d_mean, _, _ = scratch.moments
     n, p = X.shape[0], D.shape[0]
     for i in range(w.size):
         scratch.log_prior[i] = log_w[i] + log_p[i]
-    sum_spread(w, own, 0)
-    sum_members(w, X, own, 1)
-    sum_members(w, D, own, 1 + n)
-    weigh(scratch.log_prior, scratch.w_equal, own, 1 + n + p)
-    exchange(own, 1 + n + p + 3)
-    means(own, 1, 1.0, x_mean)
-    means(own, 1 + n, 1.0, d_mean)
-    return Forecast(n_alive, n_effective, total(own, 0), total_weight(own, 1 + n + p)[0])
+    sum_spread(w, local, 0)
+    sum_members(w, X, local, 1)
+    sum_members(w, D, local, 1 + n)
+    weigh(scratch.log_prior, scratch.w_equal, local, 1 + n + p)
+    exchange(local, 1 + n + p + 3)
+    means(local, 1, 1.0, x_mean)
+    means(local, 1 + n, 1.0, d_mean)
+    return Forecast(n_alive, n_effective, total(local, 0), total_weight(local, 1 + n + p)[0])
 
 
-@pasted
-def _nudge(system, d, members, forecast, own, scratch):
+@inline_always
+def _nudge(system, d, members, forecast, local, scratch):
     """Move X by the Kalman gain; False if its covariance is singular or not finite."""
     X, D, _, w, _, _, alive = members
-    if not forecast_moments(w, X, D, d, forecast.spread, own, scratch.moments):  # Eqs. 4.30-4.33
+    if not forecast_moments(w, X, D, d, forecast.spread, local, scratch.moments):  # Eqs. 4.30-4.33
         return False
-    nudge(d, D, alive, system.free, scratch.moments, X)  # Eqs. 4.34-4.35
+    kalman_update(d, D, alive, system.free, scratch.moments, X)  # Eqs. 4.34-4.35
     return True
 
 
-@pasted
-def _normalise(members, own, scratch):
+@inline_always
+def _normalise(members, local, scratch):
     """Normalise the weights; return N_eff, the log of their sum, and Eq. 4.42 to the letter."""
     _, _, _, w, log_w, log_p, _ = members
-    weigh(log_w, w, own, 0)
+    weigh(log_w, w, local, 0)
     for i in range(w.size):
         scratch.log_prior[i] = log_w[i] + log_p[i]
-    weigh(scratch.log_prior, scratch.w_equal, own, 3)
-    exchange(own, 6)
-    log_total, n_effective = total_weight(own, 0)
+    weigh(scratch.log_prior, scratch.w_equal, local, 3)
+    exchange(local, 6)
+    log_total, n_effective = total_weight(local, 0)
     if log_total > -np.inf:
-        normalise_own(log_total, log_w, w, own, 0)
-    return n_effective, log_total, total_weight(own, 3)[0] - log_total
+        normalise_own(log_total, log_w, w, local, 0)
+    return n_effective, log_total, total_weight(local, 3)[0] - log_total
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ class PFEnKF(EnsembleFilter):
     likelihood: str = "predictive"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[Entry] = filter_entry(
+    entry: ClassVar[EntryPoint] = filter_entry(
         "pf_enkf", _workspace, _update, n_settings=3, resamples=True
     )
 

@@ -17,9 +17,9 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.private_linkage import closed
+from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters import Filter
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -36,14 +36,14 @@ RECORD_INPUTS = (
 )
 
 
-class RecordOp(Op):
+class FilterOp(Op):
     """An operation on parameters and a record, made of a system and a filter."""
 
     __props__ = ("system", "filter")
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
     checks_record: ClassVar[bool] = True
     # How an input is written in the call of the kernel, where not as a number or a copy.
-    handed_as: ClassVar[Mapping[str, str]] = {}
+    argument_code: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.system = system
@@ -53,7 +53,7 @@ class RecordOp(Op):
         # The default would print every equation of the system.
         return f"{type(self).__name__}{{{self.filter}}}"
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The machine code, a function of the inputs."""
         raise NotImplementedError
 
@@ -88,7 +88,7 @@ def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
 
 
 @cache
-def evaluator(op: RecordOp) -> Any:
+def evaluator(op: FilterOp) -> Any:
     """A compiled Python function of the operation's inputs; its machine code is cached on disk.
 
     It is the machine code itself. The object around it keeps the arguments of a call in cells that
@@ -98,7 +98,7 @@ def evaluator(op: RecordOp) -> Any:
     function = pytensor.function(
         inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
     )
-    machine_code = closed(function.vm.jit_fn)
+    machine_code = with_internal_linkage(function.vm.jit_fn)
     dtypes = [dtype for _, dtype, _ in op.input_types]
 
     def evaluate(*values: Any) -> tuple:
@@ -140,19 +140,19 @@ def check_observed(p: int) -> Any:
     return check
 
 
-def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
+def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None:
     """What the machine code of this file is made of, on top of a compiled function."""
     checked = (system.p, system.n_inputs, system.observation_uses_inputs)
     return key_of(f"checked for {checked}", compiled.key)
 
 
 @cache
-def kernel(op: RecordOp) -> Compiled:
+def kernel(op: FilterOp) -> CompiledFunction:
     """The machine code of an operation, compiled once."""
     return op.compile()
 
 
-class ThetaDerivative(RecordOp):
+class ThetaDerivative(FilterOp):
     """An operation whose result is a cotangent of theta."""
 
     def results(self) -> list[Variable]:
@@ -164,7 +164,7 @@ class ThetaDerivative(RecordOp):
         return [input_shapes[0]]
 
 
-def by_theta_alone(op: Op, inputs: Sequence[Variable], theta_bar: Variable) -> list[Variable]:
+def theta_cotangent_only(op: Op, inputs: Sequence[Variable], theta_bar: Variable) -> list[Variable]:
     """Cotangents of all inputs, of which theta's is known and the record has none."""
     data_bars = [
         grad_not_implemented(op, i, variable, "only parameters have a gradient")
@@ -173,8 +173,8 @@ def by_theta_alone(op: Op, inputs: Sequence[Variable], theta_bar: Variable) -> l
     return [theta_bar, *data_bars]
 
 
-@register_funcify_and_cache_key(RecordOp)
-def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
+@register_funcify_and_cache_key(FilterOp)
+def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     """Check the record, then call the kernel.
 
     Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
@@ -185,7 +185,7 @@ def _numba(op: RecordOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     compiled = kernel(op)
     names = [name for name, _, _ in op.input_types]
     handed = [
-        op.handed_as.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
+        op.argument_code.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
         for name, _, ndim in op.input_types
     ]
     checks = ["check(steps, inputs)", "check_observed(steps, observed)"] * op.checks_record

@@ -8,18 +8,23 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.blockwise import Blockwise
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS, RecordOp, by_theta_alone
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.ops.base import (
+    HEALTH_SIZE,
+    RECORD_INPUTS,
+    FilterOp,
+    theta_cotangent_only,
+)
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
 
-class BatchLogLikelihood(RecordOp):
+class BatchLogLikelihood(FilterOp):
     """`LogLikelihood` of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
 
     input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code for many points."""
         return self.filter.compile_batch(self.system)  # type: ignore[union-attr]
 
@@ -43,7 +48,7 @@ class BatchLogLikelihood(RecordOp):
         if not isinstance(cotangents[0].type, DisconnectedType):
             gradient = Blockwise(LogLikelihoodGradient(self.system, self.filter))
             theta_bar = gradient(*inputs, cotangents[0])
-        return by_theta_alone(self, inputs, theta_bar)
+        return theta_cotangent_only(self, inputs, theta_bar)
 
 
 def has_batch(op: LogLikelihood) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS
@@ -22,17 +22,17 @@ Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 _DELEGATE = (("number", "int64", 0), ("delegate", "int64", 0))
 
 
-class DelegableLogLikelihood(LogLikelihood):
-    """`LogLikelihood` by the filter or, where its address is not 0, by a `Delegate`.
+class CallbackLogLikelihood(LogLikelihood):
+    """`LogLikelihood` by the filter or, where its address is not 0, by a `PythonCallback`.
 
     Two inputs more: a ``number``, by which the delegate knows the record, and the address.
     """
 
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (*RECORD_INPUTS, *_DELEGATE)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),()->(j),(h)"
-    handed_as: ClassVar[Mapping[str, str]] = {"seed": "seed.item(), no_normals.copy()"}
+    argument_code: ClassVar[Mapping[str, str]] = {"seed": "seed.item(), no_normals.copy()"}
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code and the call."""
         of_filter = super().compile()
         by_filter = of_filter.function
@@ -55,10 +55,10 @@ class DelegableLogLikelihood(LogLikelihood):
                 raise RuntimeError("the delegate of a likelihood raised an error")
             return terms, health
 
-        return Compiled(run, key_of("by the filter or a delegate", of_filter.key))
+        return CompiledFunction(run, key_of("by the filter or a delegate", of_filter.key))
 
 
-class DelegableLogLikelihoodOfNoise(DelegableLogLikelihood):
+class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
     """The same with a vector of `StoredNoise` that is read in place of the seed, or is empty.
 
     A delegate is given the seed alone.
@@ -67,10 +67,10 @@ class DelegableLogLikelihoodOfNoise(DelegableLogLikelihood):
     input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_DELEGATE)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(z),(),()->(j),(h)"
     # Not copied: they are many.
-    handed_as: ClassVar[Mapping[str, str]] = {"normals": "np.ascontiguousarray(normals)"}
+    argument_code: ClassVar[Mapping[str, str]] = {"normals": "np.ascontiguousarray(normals)"}
 
 
-class Delegate:
+class PythonCallback:
     """A Python function that evaluates likelihoods for machine code.
 
     Parameters

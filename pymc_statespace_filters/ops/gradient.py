@@ -1,6 +1,6 @@
 """The derivative of a log-likelihood as a PyTensor operation."""
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.ops.base import RECORD_INPUTS, ThetaDerivative
 
 
@@ -14,6 +14,6 @@ class LogLikelihoodGradient(ThetaDerivative):
     input_types = (*RECORD_INPUTS, ("terms_bar", "float64", 1))
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """Both passes of the filter."""
         return self.filter.compile_gradient(self.system)  # type: ignore[union-attr]

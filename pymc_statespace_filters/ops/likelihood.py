@@ -7,13 +7,13 @@ import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.errors import GradientUnavailableError
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, RecordOp, by_theta_alone
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, FilterOp, theta_cotangent_only
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 
 
-class LogLikelihood(RecordOp):
+class LogLikelihood(FilterOp):
     """log p(d_j | d_1 .. d_{j-1}) of every observation, and a record of the filter's health.
 
     Inputs: ``theta`` (k,), ``steps`` (J,), ``observed`` (J, p), ``inputs`` (steps, n_inputs),
@@ -22,9 +22,9 @@ class LogLikelihood(RecordOp):
     """
 
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
-    handed_as: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
+    argument_code: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code."""
         return self.filter.compile(self.system)
 
@@ -56,4 +56,4 @@ class LogLikelihood(RecordOp):
             theta_bar = pt.zeros_like(inputs[0])
         else:
             theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
-        return by_theta_alone(self, inputs, theta_bar)
+        return theta_cotangent_only(self, inputs, theta_bar)

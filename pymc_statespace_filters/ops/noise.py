@@ -10,18 +10,18 @@ from typing import ClassVar
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
 
-class StoredNoise(RecordOp):
+class StoredNoise(FilterOp):
     """The normals that a noisy filter uses with a seed: ``steps`` (J,), ``seed`` -> a vector."""
 
     input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
     checks_record = False
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's own layout of its normals."""
         return self.filter.stored_noise(self.system)  # type: ignore[union-attr]
 
@@ -36,6 +36,6 @@ class LogLikelihoodOfNoise(LogLikelihood):
     input_types = (*RECORD_INPUTS[:5], ("normals", "float64", 1))
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(z)->(j),(h)"
     # Not copied: they are many.
-    handed_as: ClassVar[Mapping[str, str]] = {
+    argument_code: ClassVar[Mapping[str, str]] = {
         "normals": "(np.int64(0), np.ascontiguousarray(normals))"
     }

@@ -3,11 +3,11 @@
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 
 
-class FilterRun(RecordOp):
+class FilterRun(FilterOp):
     """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``rows``.
 
     The latter as mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0
@@ -16,7 +16,7 @@ class FilterRun(RecordOp):
 
     input_types = (*RECORD_INPUTS, ("rows", "int64", 1))
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code."""
         return self.filter.compile_run(self.system)
 

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.ops.base import RECORD_INPUTS
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
 
-class SharedLogLikelihood(LogLikelihood):
+class DistributedLogLikelihood(LogLikelihood):
     """`LogLikelihood` of a noisy filter, called by all ranks at once; the same numbers on each.
 
     Three inputs more: ``rank``, ``n_ranks``, and the address of their ``exchange``.
@@ -21,8 +21,8 @@ class SharedLogLikelihood(LogLikelihood):
         ("exchange", "int64", 0),
     )
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
-    handed_as: ClassVar[Mapping[str, str]] = {}
+    argument_code: ClassVar[Mapping[str, str]] = {}
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code for one rank's share."""
         return self.filter.compile_shared(self.system)  # type: ignore[union-attr]

@@ -3,13 +3,13 @@
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.filters import Filter
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, RecordOp
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
-class States(RecordOp):
+class States(FilterOp):
     """Mean, sd and a draw (R, n) of the state at ``rows``, n_effective (R,), and health (3,).
 
     ``moment`` is "predicted" (observations at earlier steps than the row's are known), "filtered"
@@ -23,7 +23,7 @@ class States(RecordOp):
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self) -> Compiled:
+    def compile(self) -> CompiledFunction:
         """The filter's machine code."""
         return self.filter.compile_states(self.system, self.moment)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ParallelError
 from pymc_statespace_filters.parallel.allgather import Exchange
-from pymc_statespace_filters.parallel.environment import check_alike, surroundings
+from pymc_statespace_filters.parallel.environment import check_alike, describe_environment
 from pymc_statespace_filters.parallel.mpi import check_threads, communicator, mpi
 
 Result = TypeVar("Result")
@@ -34,7 +34,7 @@ class Message(NamedTuple):
     value: Any
 
 
-class Ranks:
+class Communicator:
     """A rank among others, with a communicator of its own; a context manager.
 
     Parameters
@@ -73,28 +73,28 @@ class Ranks:
 
     # All ranks at once
 
-    def wait_for_all(self) -> None:
+    def barrier(self) -> None:
         """Wait until every rank is here, without keeping a core busy."""
         if self._comm is not None:
             request = self._comm.Ibarrier()
             while not request.Test():
                 time.sleep(_NAP_SECONDS)
 
-    def gather(self, value: Any) -> list[Any]:
+    def allgather(self, value: Any) -> list[Any]:
         """The values of all ranks, on all of them."""
         if self._comm is None:
             return [value]
-        self.wait_for_all()
+        self.barrier()
         return self._comm.allgather(value)
 
     def broadcast(self, value: Any = None) -> Any:
         """The value of rank 0, on all ranks."""
         if self._comm is None:
             return value
-        self.wait_for_all()
+        self.barrier()
         return self._comm.bcast(value)
 
-    def together(self, function: Callable[[], Result]) -> Result:
+    def run_collectively(self, function: Callable[[], Result]) -> Result:
         """Call a function on every rank, and give its result here; if one raises, all do.
 
         Raises
@@ -108,7 +108,7 @@ class Ranks:
             result, failure = function(), None
         except BaseException as error:  # an interrupt too: the others are waiting
             failure = error
-        reports = self.gather(None if failure is None else described(failure))
+        reports = self.allgather(None if failure is None else describe_error(failure))
         failed = [rank for rank, report in enumerate(reports) if report is not None]
         if failed and self.rank != failed[0]:
             time.sleep(LAST_WORDS_SECONDS)
@@ -155,7 +155,7 @@ class Ranks:
 
     # Groups
 
-    def groups(self, size: int) -> "tuple[Ranks, Ranks | None]":
+    def groups(self, size: int) -> "tuple[Communicator, Communicator | None]":
         """Divide the ranks into groups of consecutive ones.
 
         Returns
@@ -166,14 +166,14 @@ class Ranks:
             The first rank of every group, among themselves; None on the others.
         """
         if self._comm is None or size == 1:
-            return Ranks(), Ranks(self._comm)
-        self.together(check_threads)
-        group = Ranks._owning(self._comm.Split(self.rank // size, self.rank))
+            return Communicator(), Communicator(self._comm)
+        self.run_collectively(check_threads)
+        group = Communicator._owning(self._comm.Split(self.rank // size, self.rank))
         leads = self.rank % size == 0
         leaders = self._comm.Split(0 if leads else mpi().UNDEFINED, self.rank)
-        return group, Ranks._owning(leaders) if leads else None
+        return group, Communicator._owning(leaders) if leads else None
 
-    def of_this_computer(self, value: Any = None) -> tuple[int, list[Any]]:
+    def node_local(self, value: Any = None) -> tuple[int, list[Any]]:
         """Place among the ranks that share this computer's memory, and the values of all these."""
         if self._comm is None:
             return 0, [value]
@@ -183,7 +183,7 @@ class Ranks:
         return place, values
 
     @classmethod
-    def _owning(cls, comm: Any) -> "Ranks":
+    def _owning(cls, comm: Any) -> "Communicator":
         ranks = cls()
         ranks._comm, ranks.rank, ranks.size = comm, comm.Get_rank(), comm.Get_size()
         return ranks
@@ -206,7 +206,7 @@ class Ranks:
         return Exchange(self._comm)
 
 
-def ranks_of(comm: Any, *, in_lockstep: bool = True) -> Ranks:
+def communicator_of(comm: Any, *, in_lockstep: bool = True) -> Communicator:
     """The ranks of a communicator, all of which call this.
 
     Parameters
@@ -228,13 +228,13 @@ def ranks_of(comm: Any, *, in_lockstep: bool = True) -> Ranks:
     ParallelWarning
         If other ranks are not alike.
     """
-    ranks = Ranks(communicator(comm))
+    ranks = Communicator(communicator(comm))
     if ranks.size > 1:
-        check_alike(ranks.gather(surroundings()), ranks.rank, in_lockstep=in_lockstep)
+        check_alike(ranks.allgather(describe_environment()), ranks.rank, in_lockstep=in_lockstep)
     return ranks
 
 
-def described(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """An error in one line: its type, its message and its notes."""
     notes = "; ".join(getattr(error, "__notes__", ()))
     return f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")

@@ -28,7 +28,7 @@ _CURE = (
 
 
 @cache
-def surroundings() -> dict[str, str]:
+def describe_environment() -> dict[str, str]:
     """What this process computes with, by name."""
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()
     features = f"{crc32(features.encode()):08x}"  # some hundred names

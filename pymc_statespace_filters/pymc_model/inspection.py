@@ -16,9 +16,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
 from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
 from pymc_statespace_filters.ops.distributed import (
-    DelegableLogLikelihood,
-    DelegableLogLikelihoodOfNoise,
-    Delegate,
+    CallbackLogLikelihood,
+    CallbackLogLikelihoodOfNoise,
+    PythonCallback,
 )
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
@@ -28,16 +28,15 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 __all__ = [
     "COLLAPSED",
     "FAILURES",
-    "Delegable",
-    "Delegate",
-    "MovedNoise",
-    "delegable_likelihoods",
+    "AutoregressiveNoise",
+    "CallbackLikelihoods",
+    "PythonCallback",
+    "autoregressive_noise",
     "exactness",
     "health_outputs",
     "is_filter",
     "likelihood_nodes",
     "log_density_terms",
-    "move_noise",
     "noise_seeds",
     "noisy_filters",
     "resized",
@@ -45,6 +44,7 @@ __all__ = [
     "state_space_names",
     "state_space_nodes",
     "with_filter",
+    "with_likelihood_callback",
 ]
 
 
@@ -112,8 +112,8 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     return [node.outputs[1] for node in likelihood_nodes(graphs)]
 
 
-class Delegable(NamedTuple):
-    """The symbols of `delegable_likelihoods`.
+class CallbackLikelihoods(NamedTuple):
+    """The symbols of `with_likelihood_callback`.
 
     Attributes
     ----------
@@ -131,10 +131,10 @@ class Delegable(NamedTuple):
     normals: dict[TensorVariable, TensorVariable]
 
 
-def delegable_likelihoods(
+def with_likelihood_callback(
     graphs: Sequence[Variable], held: Mapping[str, SharedVariable]
-) -> tuple[list[Variable], Delegable]:
-    """Graphs whose noisy likelihoods a `Delegate` can evaluate, with the same values.
+) -> tuple[list[Variable], CallbackLikelihoods]:
+    """Graphs whose noisy likelihoods a `PythonCallback` can evaluate, with the same values.
 
     With seeds that are held, stored normals are read where they were made from one of these.
     """
@@ -149,17 +149,17 @@ def delegable_likelihoods(
         if seed in names:
             stored = pt.dvector(f"{names[seed]}_normals")
             normals[stored] = StoredNoise(system, filter)(steps, seed)
-            op: LogLikelihood = DelegableLogLikelihoodOfNoise(system, filter)
+            op: LogLikelihood = CallbackLogLikelihoodOfNoise(system, filter)
             outputs = op(*node.inputs, stored, number, address)
         else:
-            outputs = DelegableLogLikelihood(system, filter)(*node.inputs, number, address)
+            outputs = CallbackLogLikelihood(system, filter)(*node.inputs, number, address)
         replaced |= dict(zip(node.outputs, outputs, strict=True))
     kinds = tuple((node.op.system, node.op.filter) for node in delegable)
-    return clone_replace(list(graphs), replaced), Delegable(kinds, address, normals)
+    return clone_replace(list(graphs), replaced), CallbackLikelihoods(kinds, address, normals)
 
 
-class MovedNoise(NamedTuple):
-    """The symbols of `move_noise`; one entry a noisy variable in each tuple, in the same order.
+class AutoregressiveNoise(NamedTuple):
+    """The symbols of `autoregressive_noise`; one entry per noisy variable.
 
     Attributes
     ----------
@@ -179,9 +179,9 @@ class MovedNoise(NamedTuple):
     sizes: tuple[TensorVariable, ...]
 
 
-def move_noise(
+def autoregressive_noise(
     graphs: Sequence[Variable], seeds: Mapping[str, SharedVariable]
-) -> tuple[list[Variable], MovedNoise]:
+) -> tuple[list[Variable], AutoregressiveNoise]:
     """Graphs whose noise is moved from given normals instead of made from a seed.
 
     Normals u become rho u + sqrt(1 - rho^2) v, where v are fresh ones, those of the seed; they are
@@ -214,7 +214,7 @@ def move_noise(
             replaced |= dict(zip(node.outputs, outputs, strict=True))
             noises.append((normals, moved, size))
     columns = zip(*noises, strict=True) if noises else ((), (), ())
-    return clone_replace(list(graphs), replaced), MovedNoise(correlation, *columns)
+    return clone_replace(list(graphs), replaced), AutoregressiveNoise(correlation, *columns)
 
 
 def with_filter(
@@ -267,7 +267,7 @@ def _is_same(a: Variable, b: Variable) -> bool:
 
 
 def smooth_filters(model: pm.Model) -> dict[str, Filter]:
-    """Every noisy variable's filter in the version that `move_noise` puts in its place."""
+    """The filters that `autoregressive_noise` uses, by the names of the noisy variables."""
     nodes = state_space_nodes(model)
     ops = {name: nodes[name].op for name in noisy_filters(model)}
     return {name: op.filter.smooth(op.system) for name, op in ops.items()}

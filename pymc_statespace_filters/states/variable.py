@@ -12,7 +12,7 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
-from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.progress import watched
 from pymc_statespace_filters.pymc_model.state_graphs import (
@@ -121,7 +121,7 @@ class VariableAtDraws:
         inputs = [pt.lscalar("number"), *self._symbols, *drawn, *constant]
         function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
         columns = [np.arange(np.prod(self._draws.shape)), *self._columns, *drawn.values()]
-        calls = ManyCalls(function, [column[0] for column in columns], list(constant.values()))
+        calls = ParallelMap(function, [column[0] for column in columns], list(constant.values()))
         with watched(calls, enabled=progressbar) as announce:
             announce(task, len(columns[0]))
             results = calls(*columns)

@@ -15,9 +15,9 @@ import pytensor.tensor as pt
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
-from pymc_statespace_filters.compiler.native.entry_point import Entry
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 
-Entry.compile = lambda entry: None  # the text is asked for, not the code
+EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
 sources = []
 build = lowering.build
 def noted(name, arguments, body, fallbacks):

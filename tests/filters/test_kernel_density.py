@@ -5,8 +5,8 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.filters.ensemble.partition import Share
-from pymc_statespace_filters.filters.ensemble.reductions import own_members, sum_products
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import local_partition, sum_products
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     kernel_workspace,
@@ -14,29 +14,29 @@ from pymc_statespace_filters.filters.kernel_density.density import (
     scott_bandwidth,
 )
 
-ALONE = Share(0, 1, 0)
+ALONE = RankLayout(0, 1, 0)
 
 
 def all_members(n_members, n):
-    return own_members.py_func(ALONE, n_members, n * n)
+    return local_partition.py_func(ALONE, n_members, n * n)
 
 
 def bandwidth(X, w, free=None):
     n, N = X.shape
     free = np.arange(n) if free is None else np.array(free)
-    own, kernel = all_members(N, n), kernel_workspace.py_func(n, free.size)
+    local, kernel = all_members(N, n), kernel_workspace.py_func(n, free.size)
     kernel.mean[:] = np.where(w > 0, X, 0) @ w
-    sum_products(w, X, kernel.mean, X, kernel.mean, own, 0)
-    ok = scott_bandwidth(own, 0, 1 - w @ w, 1 / (w @ w), free, kernel)
+    sum_products(w, X, kernel.mean, X, kernel.mean, local, 0)
+    ok = scott_bandwidth(local, 0, 1 - w @ w, 1 / (w @ w), free, kernel)
     return ok, kernel, free
 
 
 def log_density(X, w, V, free=None):
     ok, kernel, free = bandwidth(X, w, free)
     assert ok
-    out, own = np.full(w.size, np.nan), all_members(w.size, 1)
-    work = density_workspace(own, free.size)
-    log_kernel_density(own, w, X, V, free, kernel, work, out)
+    out, local = np.full(w.size, np.nan), all_members(w.size, 1)
+    work = density_workspace(local, free.size)
+    log_kernel_density(local, w, X, V, free, kernel, work, out)
     return out
 
 

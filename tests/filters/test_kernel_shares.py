@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.compiler.numerics.philox import padded
-from pymc_statespace_filters.filters.ensemble.partition import Share
-from pymc_statespace_filters.filters.ensemble.reductions import own_members
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     log_kernel_density,
@@ -22,14 +22,14 @@ def densities(size, X, w, V, kernel):
     free = np.arange(n)
 
     def call(rank):
-        own = own_members.py_func(Share(rank.rank, size, rank.exchange), N, 1)
-        columns = slice(own.first, own.first + own.size)
-        work = density_workspace(own, n)
+        local = local_partition.py_func(RankLayout(rank.rank, size, rank.exchange), N, 1)
+        columns = slice(local.first, local.first + local.size)
+        work = density_workspace(local, n)
         for scratch in (work[0].rows, work[1].rows):
             scratch[:] = np.nan  # what a rank is not told it does not know
-        out = np.empty(own.size)
+        out = np.empty(local.size)
         own_w, own_X, own_V = (np.ascontiguousarray(A[..., columns]) for A in (w, X, V))
-        log_kernel_density(own, own_w, own_X, own_V, free, kernel, work, out)
+        log_kernel_density(local, own_w, own_X, own_V, free, kernel, work, out)
         return out, [n_columns for _, n_columns, _ in rank.exchanged]
 
     results = on_ranks(size, call)

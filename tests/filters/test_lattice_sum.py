@@ -9,7 +9,7 @@ from numba import njit
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.compiler.numerics.philox import padded
-from pymc_statespace_filters.filters.ensemble.partition import Share
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
     FLOOR,
@@ -29,9 +29,9 @@ REACHED = 2e-9  # what the module promises of a pair, and a little for what wind
 
 @njit
 def _sums(sources, targets, work):
-    share, n_members, n_dims = Share(0, 1, 0), sources.shape[1], sources.shape[0] - 1
+    layout, n_members, n_dims = RankLayout(0, 1, 0), sources.shape[1], sources.shape[0] - 1
     sources, targets = Points(sources, n_members, True), Points(targets, n_members, True)
-    return lattice_sums(share, sources, targets, n_dims, work)
+    return lattice_sums(layout, sources, targets, n_dims, work)
 
 
 def sums(w, Y, V):

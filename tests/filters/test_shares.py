@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native.jit import compiled
+from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS, fill_normals
 from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, shared_evaluator
 from pymc_statespace_filters.filters import BootstrapPF, EnKF
-from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, MEMBERS, Share, part
+from pymc_statespace_filters.filters.ensemble.partition import (
+    BLOCKS,
+    MEMBERS,
+    RankLayout,
+    local_range,
+)
 from pymc_statespace_filters.filters.ensemble.reductions import (
     exchange,
-    own_members,
+    local_partition,
     sum_members,
     sum_products,
     sum_spread,
@@ -78,7 +83,9 @@ def assert_all_the_same(results):
 def test_every_column_belongs_to_one_rank_and_ranks_to_whole_blocks(n, per_block):
     n_blocks = -(-n // per_block)
     for size in {1, 2, 3, 7, n_blocks} & set(range(1, n_blocks + 1)):
-        ends = [part.py_func(Share(rank, size, 0), n, per_block) for rank in range(size)]
+        ends = [
+            local_range.py_func(RankLayout(rank, size, 0), n, per_block) for rank in range(size)
+        ]
         assert ends[0][0] == 0
         assert ends[-1][1] == n
         assert all(before[1] == after[0] for before, after in pairwise(ends))
@@ -98,26 +105,26 @@ def test_normals_of_a_part_are_those_of_the_whole():
 # ---- sums
 
 
-@compiled
+@njit_contract
 def all_sums(rank, n_ranks, address, w, X, log_w):
     """Sums of our part of w, X and log_w, by way of the ranks' exchange."""
-    own = own_members(Share(rank, n_ranks, address), w.size, 12)
-    mine = slice(own.first, own.first + own.size)
+    local = local_partition(RankLayout(rank, n_ranks, address), w.size, 12)
+    mine = slice(local.first, local.first + local.size)
     v, Y, out, log_v = w[mine].copy(), X[:, mine].copy(), np.empty(9), log_w[mine].copy()
     relative, zeros = np.empty(v.size), np.zeros(2)
-    sum_values(v, own, 0)
-    sum_spread(v, own, 1)
-    sum_members(v, Y, own, 2)
-    sum_products(v, Y, zeros, Y[:1], zeros, own, 4)
-    weigh(log_v, relative, own, 6)
-    exchange(own, 9)
+    sum_values(v, local, 0)
+    sum_spread(v, local, 1)
+    sum_members(v, Y, local, 2)
+    sum_products(v, Y, zeros, Y[:1], zeros, local, 4)
+    weigh(log_v, relative, local, 6)
+    exchange(local, 9)
     for row in range(6):
-        out[row] = total(own, row)
-    out[6], out[7] = total_weight(own, 6)
-    normalise_own(out[6], log_v, relative, own, 6)
-    sum_values(relative, own, 0)
-    exchange(own, 1)
-    out[8] = total(own, 0)
+        out[row] = total(local, row)
+    out[6], out[7] = total_weight(local, 6)
+    normalise_own(out[6], log_v, relative, local, 6)
+    sum_values(relative, local, 0)
+    exchange(local, 1)
+    out[8] = total(local, 0)
     return out
 
 
@@ -143,9 +150,9 @@ def test_sums_are_those_of_exact_arithmetic_and_the_same_on_any_number_of_ranks(
     exact += [math.fsum(v * y * Y[0]) for y in Y]
     assert sums[0][:6] == pytest.approx(exact, rel=1e-13, abs=1e-15)
     finite = log_w[np.isfinite(log_w)]
-    share = np.exp(finite - finite.max())
-    assert sums[0][6] == pytest.approx(finite.max() + math.log(math.fsum(share)), rel=1e-14)
-    assert sums[0][7] == pytest.approx(math.fsum(share) ** 2 / math.fsum(share**2), rel=1e-13)
+    layout = np.exp(finite - finite.max())
+    assert sums[0][6] == pytest.approx(finite.max() + math.log(math.fsum(layout)), rel=1e-14)
+    assert sums[0][7] == pytest.approx(math.fsum(layout) ** 2 / math.fsum(layout**2), rel=1e-13)
     assert sums[0][8] == pytest.approx(1, rel=1e-13)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.target import leader_follower as lockstep
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -20,7 +20,7 @@ def chain(group=None):
 
 
 def chain_together(comm):
-    with Ranks(comm) as ranks:
+    with Communicator(comm) as ranks:
         return led(ranks, chain, ranks)
 
 
@@ -56,7 +56,7 @@ def fail(rank):
 
     lockstep.shared_evaluator = failing
     lockstep._ANSWER_SECONDS = 1.0
-    with Ranks(MPI.COMM_WORLD) as ranks:
+    with Communicator(MPI.COMM_WORLD) as ranks:
         led(ranks, chain, ranks)
 
 

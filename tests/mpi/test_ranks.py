@@ -1,4 +1,4 @@
-"""What `parallel.Ranks` promises, on real ranks."""
+"""What `parallel.Communicator` promises, on real ranks."""
 
 import ctypes
 import time
@@ -8,19 +8,19 @@ import pytest
 
 from pymc_statespace_filters import ParallelError
 from pymc_statespace_filters.parallel import communicator as parallel
-from pymc_statespace_filters.parallel.communicator import ranks_of
+from pymc_statespace_filters.parallel.communicator import communicator_of
 from tests.mpi.launch import on_ranks
 
 
 def collectives(comm):
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         assert (ranks.rank, ranks.size) == (comm.rank, comm.size)
-        assert ranks.gather(ranks.rank**2) == [r**2 for r in range(ranks.size)]
+        assert ranks.allgather(ranks.rank**2) == [r**2 for r in range(ranks.size)]
         assert ranks.broadcast({"of": ranks.rank}) == {"of": 0}
-        assert ranks.together(lambda: ranks.rank) == ranks.rank
-        place, values = ranks.of_this_computer(ranks.rank)
+        assert ranks.run_collectively(lambda: ranks.rank) == ranks.rank
+        place, values = ranks.node_local(ranks.rank)
         assert (place, values) == (ranks.rank, list(range(ranks.size)))
-        ranks.wait_for_all()
+        ranks.barrier()
 
 
 def fail_on_the_last(comm):
@@ -29,14 +29,14 @@ def fail_on_the_last(comm):
             raise LookupError("not here")
 
     try:
-        ranks_of(comm).together(function)
+        communicator_of(comm).run_collectively(function)
     except (LookupError, ParallelError) as error:
-        return parallel.described(error)
+        return parallel.describe_error(error)
 
 
 def messages(comm):
     """Each writes to the next, which takes what comes."""
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         ranks.send((ranks.rank + 1) % ranks.size, "greeting", {"from": ranks.rank})
         message = None
         while message is None:
@@ -56,7 +56,7 @@ def arrays(comm):
         np.array(7),
         np.arange(100, dtype="u1"),
     ]
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         if ranks.rank == 0:
             ranks.send_arrays(1, sent)
         if ranks.rank == 1:
@@ -67,7 +67,7 @@ def arrays(comm):
 
 
 def groups(comm):
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         group, leaders = ranks.groups(2)
         alone, all_of_them = ranks.groups(1)
         assert (alone.size, all_of_them.size) == (1, ranks.size)
@@ -81,7 +81,7 @@ def groups(comm):
 
 def exchanges(comm):
     """Each array is completed, whoever has which blocks of it, and known again at its address."""
-    with ranks_of(comm) as ranks:
+    with communicator_of(comm) as ranks:
         call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_ssize_t] * 3)(ranks.exchange)
         for rows, columns, per_block in [(1, 400, 64), (3, 300, 64), (2, 9, 1), (3, 300, 64)]:
             whole = np.arange(float(rows * columns)).reshape(rows, columns)
@@ -112,12 +112,12 @@ def test_four_ranks():
 
 
 def test_one_rank_sends_nothing():
-    with ranks_of(None) as ranks:
+    with communicator_of(None) as ranks:
         assert (ranks.rank, ranks.size, ranks.exchange) == (0, 1, 0)
-        assert ranks.gather("x") == ["x"]
-        assert ranks.broadcast("x") == ranks.together(lambda: "x") == "x"
+        assert ranks.allgather("x") == ["x"]
+        assert ranks.broadcast("x") == ranks.run_collectively(lambda: "x") == "x"
         assert ranks.receive() is None
-        assert ranks.of_this_computer("x") == (0, ["x"])
+        assert ranks.node_local("x") == (0, ["x"])
         ranks.check_exchange()
         with pytest.raises(LookupError):
-            ranks.together(lambda: {}["x"])
+            ranks.run_collectively(lambda: {}["x"])

@@ -53,7 +53,7 @@ def refusals(comm):
     from mpi4py import MPI
 
     from pymc_statespace_filters import ModelError, ParallelError
-    from pymc_statespace_filters.parallel.communicator import ranks_of
+    from pymc_statespace_filters.parallel.communicator import communicator_of
 
     freed = comm.Dup()
     freed.Free()
@@ -61,11 +61,11 @@ def refusals(comm):
     heard = []
     for wrong in [freed, comm.Get_group(), comm.handle, left_out if comm.rank else MPI.COMM_NULL]:
         with pytest.raises(ModelError) as caught:
-            ranks_of(wrong)
+            communicator_of(wrong)
         heard.append(str(caught.value))
     with pytest.raises(ParallelError) as caught:
-        ranks_of(comm).groups(2)
-    return [*heard, str(caught.value), ranks_of(comm.Split(comm.rank)).size]
+        communicator_of(comm).groups(2)
+    return [*heard, str(caught.value), communicator_of(comm.Split(comm.rank)).size]
 
 
 def test_communicators_that_cannot_be_used():
@@ -83,14 +83,14 @@ def different(comm):
     if comm.rank == 1:
         os.environ |= {"NUMBA_CPU_NAME": "nocona", "NUMBA_CPU_FEATURES": ""}
     from pymc_statespace_filters import ParallelError, ParallelWarning
-    from pymc_statespace_filters.parallel.communicator import ranks_of
+    from pymc_statespace_filters.parallel.communicator import communicator_of
 
     with pytest.raises(ParallelError, match=r"nocona .* on rank 1.* NUMBA_CPU_NAME=x86-64-v3"):
-        ranks_of(comm, in_lockstep=True)
+        communicator_of(comm, in_lockstep=True)
     if comm.rank == 1:
-        return ranks_of(comm, in_lockstep=False).size
+        return communicator_of(comm, in_lockstep=False).size
     with pytest.warns(ParallelWarning, match=r"The ranks differ: processor .* on rank 0, nocona"):
-        return ranks_of(comm, in_lockstep=False).size
+        return communicator_of(comm, in_lockstep=False).size
 
 
 def test_ranks_on_different_processors():

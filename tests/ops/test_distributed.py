@@ -7,9 +7,9 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.distributed import DelegableLogLikelihood, Delegate
+from pymc_statespace_filters.ops.distributed import CallbackLogLikelihood, PythonCallback
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.inspection import delegable_likelihoods, health_outputs
+from pymc_statespace_filters.pymc_model.inspection import health_outputs, with_likelihood_callback
 from tests.pymc_model.test_inspection import ENSEMBLE, FEW, filters_in, twins, two_systems
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
 
@@ -19,7 +19,7 @@ THETA = np.array([0.6])
 
 
 def delegated(delegate, theta=THETA, record=RECORD, number=3):
-    return evaluator(DelegableLogLikelihood(FORCED, ENSEMBLE))(
+    return evaluator(CallbackLogLikelihood(FORCED, ENSEMBLE))(
         theta, *record, number, delegate.address
     )
 
@@ -31,7 +31,7 @@ def test_the_delegate_is_given_what_the_filter_would_be():
         given.append(arguments)
         return np.array([1.0, -2.0, np.nan, -np.inf]), np.array([5.0, 1.0, 3.0])
 
-    terms, health = delegated(Delegate(evaluate))
+    terms, health = delegated(PythonCallback(evaluate))
     np.testing.assert_array_equal(terms, [1.0, -2.0, np.nan, -np.inf])
     np.testing.assert_array_equal(health, [5.0, 1.0, 3.0])
     (arguments,) = given
@@ -54,12 +54,12 @@ def test_the_graph_gives_the_numbers_of_the_filter(mode):
 
     density = model.logp()
     graphs = [density, *health_outputs([density])]
-    replaced, delegable = delegable_likelihoods(graphs, {})
+    replaced, delegable = with_likelihood_callback(graphs, {})
     kinds += delegable.kinds
     a = model.value_vars[0]
     plain = pytensor.function([a], graphs, mode=mode)
     shared = pytensor.function([a, delegable.address], replaced, mode=mode)
-    delegate = Delegate(evaluate)
+    delegate = PythonCallback(evaluate)
     for value in (0.7, -0.4, 2.0):
         for mine, theirs in zip(shared(value, delegate.address), plain(value), strict=True):
             np.testing.assert_array_equal(mine, theirs)
@@ -67,7 +67,7 @@ def test_the_graph_gives_the_numbers_of_the_filter(mode):
 
 def test_likelihoods_without_noise_stay():
     model = two_systems(psf.EKF(), FEW)
-    replaced, delegable = delegable_likelihoods([model.logp()], {})
+    replaced, delegable = with_likelihood_callback([model.logp()], {})
     assert delegable.kinds == ((FORCED, FEW),)
     assert filters_in(replaced) == sorted(map(repr, (psf.EKF(), FEW)))
 
@@ -81,9 +81,9 @@ def test_twins_are_evaluated_each_with_its_own_seed():
         seen[number] = record[-1]
         return np.zeros(STEPS.size), np.array([9.0, 0.0, -1.0])
 
-    replaced, delegable = delegable_likelihoods([model.logp()], {})
+    replaced, delegable = with_likelihood_callback([model.logp()], {})
     function = pytensor.function([model.value_vars[0], delegable.address], replaced)
-    delegate = Delegate(evaluate)
+    delegate = PythonCallback(evaluate)
     function(0.3, delegate.address)
     assert len(delegable.kinds) == 2
     assert sorted(seen) == [0, 1]
@@ -97,7 +97,7 @@ def test_an_error_is_kept_and_the_delegate_is_asked_no_more():
         calls.append(arguments)
         raise ValueError("no luck")
 
-    delegate = Delegate(evaluate)
+    delegate = PythonCallback(evaluate)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="delegate of a likelihood"):
             delegated(delegate)
@@ -106,7 +106,7 @@ def test_an_error_is_kept_and_the_delegate_is_asked_no_more():
 
 
 def test_a_wrong_record_never_reaches_the_delegate():
-    delegate = Delegate(by_the_filter)
+    delegate = PythonCallback(by_the_filter)
     steps, *rest = RECORD
     with pytest.raises(ModelError, match="increase strictly"):
         delegated(delegate, record=(steps[::-1], *rest))

@@ -12,7 +12,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.blockwise import Blockwise
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native.entry_point import Entry
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.base import cache_key, evaluator
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
@@ -89,7 +89,9 @@ CHANGES = [
 
 @pytest.mark.parametrize("filter", [psf.EKF(), *NOISY], ids=lambda f: type(f).__name__)
 def test_machine_code_on_disk_is_named_by_all_that_is_compiled_in(filter, monkeypatch):
-    monkeypatch.setattr(Entry, "compile", lambda entry: None)  # names are asked for, not the code
+    monkeypatch.setattr(
+        EntryPoint, "compile", lambda entry: None
+    )  # names are asked for, not the code
     timed = {"transition": CHANGES[-2]["transition"]}  # dt matters where time is asked for
     systems = [PAIR, *(pair(**c) for c in CHANGES if filter.noisy or "carried" not in c)]
     systems += [pair(**timed, dt=0.5), FORCED]

@@ -9,10 +9,10 @@ import pytest
 from pytensor.graph.basic import Apply
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.ops.base import RecordOp, evaluator
+from pymc_statespace_filters.ops.base import FilterOp, evaluator
 from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapeReversal
+from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapePullback
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 THETA = np.array([0.6, 0.2])
@@ -23,7 +23,7 @@ BARS = np.array([1.0, -2.0, 0.5, 3.0])  # tells apart which term a cotangent mee
 def operations(function) -> list[type]:
     """The kinds of operations on a record in a compiled function, sorted by name."""
     nodes: list[Apply] = function.maker.fgraph.apply_nodes
-    kinds = (type(node.op) for node in nodes if isinstance(node.op, RecordOp))
+    kinds = (type(node.op) for node in nodes if isinstance(node.op, FilterOp))
     return sorted(kinds, key=lambda kind: kind.__name__)
 
 
@@ -39,7 +39,7 @@ def together():
 
 
 def test_value_and_gradient_run_the_filter_forwards_once(together):
-    assert operations(together) == [TapeReversal, TapedLogLikelihood]
+    assert operations(together) == [TapePullback, TapedLogLikelihood]
 
 
 def test_value_and_gradient_are_those_of_the_operations_alone(together):
@@ -63,7 +63,7 @@ def test_several_gradients_read_one_tape():
     terms, _ = LogLikelihood(PAIR, psf.EKF())(theta, *RECORD)
     gradients = [pt.grad(terms[j], theta) for j in (0, 3)]
     function = pytensor.function([theta], [terms, *gradients])
-    assert operations(function) == [TapeReversal, TapeReversal, TapedLogLikelihood]
+    assert operations(function) == [TapePullback, TapePullback, TapedLogLikelihood]
     _, first, last = function(THETA)
     alone = evaluator(LogLikelihoodGradient(PAIR, psf.EKF()))
     np.testing.assert_allclose(first, alone(THETA, *RECORD, np.eye(4)[0])[0], rtol=1e-13)
@@ -75,7 +75,7 @@ def test_a_cotangent_may_depend_on_the_value():
     theta = pt.dvector("theta")
     likelihood = pt.exp(LogLikelihood(PAIR, psf.EKF())(theta, *RECORD)[0].sum())
     function = pytensor.function([theta], [likelihood, pt.grad(likelihood, theta)])
-    assert operations(function) == [TapeReversal, TapedLogLikelihood]
+    assert operations(function) == [TapePullback, TapedLogLikelihood]
     value, gradient = function(THETA)
     alone = evaluator(LogLikelihoodGradient(PAIR, psf.EKF()))(THETA, *RECORD, np.ones(4))[0]
     np.testing.assert_allclose(gradient, value * alone, rtol=1e-12)

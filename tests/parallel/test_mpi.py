@@ -177,7 +177,7 @@ HERE = {"numba": "0.68.0", "numpy": "2.4", "processor": "znver3"}
 def test_ranks_that_are_alike():
     with warnings.catch_warnings(action="error"):
         surroundings.check_alike([HERE] * 3, 0, in_lockstep=True)
-    assert surroundings.surroundings()["processor"]
+    assert surroundings.describe_environment()["processor"]
 
 
 def test_ranks_that_differ_may_run_chains():

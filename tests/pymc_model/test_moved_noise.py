@@ -12,7 +12,11 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import StoredNoise
-from pymc_statespace_filters.pymc_model.inspection import health_outputs, move_noise, noise_seeds
+from pymc_statespace_filters.pymc_model.inspection import (
+    autoregressive_noise,
+    health_outputs,
+    noise_seeds,
+)
 
 STEPS = np.array([1, 3, 4])
 OBSERVED = np.array([0.3, np.nan, -0.2])
@@ -43,7 +47,7 @@ def one_variable(filter, system_=None):
 def moving(model):
     """Compile: (a, correlation, normals, seed) -> log-density, health, moved normals, size."""
     logp, seeds = model.logp(), noise_seeds(model)
-    (logp, health), noise = move_noise([logp, *health_outputs([logp])], seeds)
+    (logp, health), noise = autoregressive_noise([logp, *health_outputs([logp])], seeds)
     outputs = [logp, health, noise.moved[0], noise.sizes[0]]
     seed = seeds["d"].type("seed")
     outputs = clone_replace(outputs, {seeds["d"]: seed})
@@ -101,7 +105,7 @@ def test_every_noisy_variable_has_normals_of_its_own():
             "g", system(), filter=psf.EKF(), params={"a": model["a"]},
             observed=OBSERVED[:, None], steps=STEPS,
         )  # fmt: skip
-    (logp,), noise = move_noise([model.logp()], noise_seeds(model))
+    (logp,), noise = autoregressive_noise([model.logp()], noise_seeds(model))
     assert sorted(v.name for v in noise.normals) == ["d_normals", "f_normals"]
     nodes = [v.owner.op for v in pytensor.graph.traversal.ancestors([logp]) if v.owner is not None]
     filters = {op.filter for op in nodes if isinstance(op, LogLikelihood)}
@@ -114,7 +118,7 @@ def test_every_noisy_variable_has_normals_of_its_own():
 
 def test_without_noise_nothing_moves():
     model = one_variable(psf.EKF())
-    (logp,), noise = move_noise([model.logp()], noise_seeds(model))
+    (logp,), noise = autoregressive_noise([model.logp()], noise_seeds(model))
     assert noise[1:] == ((), (), ())
     assert pytensor.function(model.value_vars, logp)(0.7) == model.compile_logp()({"a": 0.7})
 
@@ -124,8 +128,8 @@ def test_too_many_states_for_an_order_are_refused():
     model = one_variable(psf.BootstrapPF(20), wide)
     message = "resampling='sorted' orders particles of at most 8 states, this system has 9"
     with pytest.raises(psf.ModelError, match=message):
-        move_noise([model.logp()], noise_seeds(model))
+        autoregressive_noise([model.logp()], noise_seeds(model))
     for filter in (psf.BootstrapPF, psf.PFEnKF):
         with pytest.raises(psf.ModelError, match=message):
             one_variable(filter(20, resampling="sorted"), wide)
-    move_noise([one_variable(psf.EnKF(20), wide).logp()], noise_seeds(model))
+    autoregressive_noise([one_variable(psf.EnKF(20), wide).logp()], noise_seeds(model))

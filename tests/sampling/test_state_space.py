@@ -8,8 +8,8 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.distributed import (
-    DelegableLogLikelihood,
-    DelegableLogLikelihoodOfNoise,
+    CallbackLogLikelihood,
+    CallbackLogLikelihoodOfNoise,
 )
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import StoredNoise
@@ -156,8 +156,8 @@ def test_held_noise_is_made_once_and_gives_what_its_seed_gives(filter):
         for holds in (False, True)
     )
     made_inside = {type(n.op) for n in by_normals._function.maker.fgraph.apply_nodes}
-    assert DelegableLogLikelihoodOfNoise in made_inside
-    assert not made_inside & {LogLikelihood, DelegableLogLikelihood, StoredNoise}
+    assert CallbackLogLikelihoodOfNoise in made_inside
+    assert not made_inside & {LogLikelihood, CallbackLogLikelihood, StoredNoise}
     values = []
     for seed in (3, 4):
         seeds["d"].set_value(np.array(seed))

@@ -15,7 +15,7 @@ from pytensor.compile.ops import wrap_py
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import progress
 from pymc_statespace_filters.compiler.native import parallel_map as many_calls
-from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.variable import VariableAtDraws
@@ -51,7 +51,7 @@ def test_results_of_several_shapes_and_types():
     x, n, c = pt.dvector("x"), pt.lscalar("n"), pt.lvector("c")
     function = pytensor.function([x, n, c], [x[::-1] * n, pt.outer(x, c), n], trust_input=True)
     columns = np.array([[1.5, 2.5], [0.5, -1.0], [3.0, 4.0]]), np.array([2**60, -3, 5])
-    calls = ManyCalls(function, [column[0] for column in columns], [np.array([10, 20, 30])])
+    calls = ParallelMap(function, [column[0] for column in columns], [np.array([10, 20, 30])])
     found = calls(*columns)
     assert calls.shapes == [(2,), (2, 3), ()]
     for row, (a, k) in zip(found, zip(*columns, strict=True), strict=True):

@@ -13,7 +13,7 @@ from pytensor.link.numba.dispatch.basic import numba_funcify_and_cache_key
 from pymc_statespace_filters.compiler.codegen.array_linalg import use_loops
 from pymc_statespace_filters.compiler.codegen.function_types import (
     MEMBER_INPUTS,
-    Compiled,
+    CompiledFunction,
     Graph,
     VectorFunction,
     function_of,
@@ -31,7 +31,7 @@ _WHOLE = {
 }  # fmt: skip
 
 
-def array_vector_function(name: str, function: VectorFunction) -> Compiled:
+def array_vector_function(name: str, function: VectorFunction) -> CompiledFunction:
     """A vector function that hands arrays on; NaN where the array code raises."""
     graph = function.graph
     used = _used(graph.inputs, graph.outputs)
@@ -54,7 +54,7 @@ def array_vector_function(name: str, function: VectorFunction) -> Compiled:
     return _build(name, function.arguments, body, array_code=compiled)
 
 
-def array_member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
+def array_member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
     """A member function that calls array code for each member."""
     members = [v for n, v in graph.inputs.items() if n in MEMBER_INPUTS]
     common = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
@@ -87,10 +87,12 @@ def array_member_function(name: str, arguments: str, graph: Graph, target: str) 
     return _build(name, arguments, body, before=before, inside=inside)
 
 
-def _build(name: str, arguments: str, body: list[str], **parts: Compiled) -> Compiled:
+def _build(
+    name: str, arguments: str, body: list[str], **parts: CompiledFunction
+) -> CompiledFunction:
     namespace = FOR_ONE | {part: compiled.function for part, compiled in parts.items()}
     function, source = function_of(name, arguments, body, namespace)
-    return Compiled(function, key_of(source, *(part.key for part in parts.values())))
+    return CompiledFunction(function, key_of(source, *(part.key for part in parts.values())))
 
 
 def _whole(inputs: Mapping[str, Variable]) -> str:
@@ -122,7 +124,7 @@ def _frontier(
     return list(dict.fromkeys(frontier))
 
 
-def array_code(inputs: list, outputs: Sequence[Variable]) -> Compiled:
+def array_code(inputs: list, outputs: Sequence[Variable]) -> CompiledFunction:
     """A graph as PyTensor itself compiles it: arrays in, a tuple of arrays out."""
     # PyMC's checks of parameters become minus infinity: nothing may raise inside a filter.
     mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
@@ -142,4 +144,4 @@ def array_code(inputs: list, outputs: Sequence[Variable]) -> Compiled:
                 f"Write the function without it, in terms of pytensor.tensor operations that "
                 f"numba supports."
             ) from error
-    return Compiled(code, None if key is None else digest(str(key)))
+    return CompiledFunction(code, None if key is None else digest(str(key)))

@@ -14,7 +14,7 @@ MEMBER_INPUTS = frozenset({"x", "z"})
 
 
 @dataclass(frozen=True)
-class Compiled:
+class CompiledFunction:
     """A compiled function and the key that identifies its code (None: not cacheable)."""
 
     function: Any

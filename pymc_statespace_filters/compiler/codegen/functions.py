@@ -21,7 +21,7 @@ from pymc_statespace_filters.compiler.codegen.array_fallback import (
 from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value
 from pymc_statespace_filters.compiler.codegen.function_types import (
     MEMBER_INPUTS,
-    Compiled,
+    CompiledFunction,
     Graph,
     VectorFunction,
     function_of,
@@ -78,7 +78,7 @@ def _element_code(graph: Graph) -> dict[str, str]:
     }
 
 
-def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compiled]:
+def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, CompiledFunction]:
     """Functions that hand vectors to each other: all of them in scalars, or all on arrays.
 
     In scalars a vector is a tuple of numbers, otherwise an array; both are read by index.
@@ -90,7 +90,7 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
     return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
 
 
-def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> Compiled:
+def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
     writer = Writer(_element_code(function.graph))
     lines = writer.statements(v for group in values for v in group)
     results = [
@@ -101,7 +101,7 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
     return build(name, function.arguments, body, writer)
 
 
-def member_function(name: str, arguments: str, graph: Graph, target: str) -> Compiled:
+def member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
     """``name(arguments)`` writes the first output of every member to ``target``.
 
     What does not depend on the member is computed once, before the loop.
@@ -169,11 +169,13 @@ def _tuple(names: Sequence[str]) -> str:
     return "(" + "".join(f"{name}, " for name in names) + ")"
 
 
-def build(name: str, arguments: str, body: list[str], writer: Writer) -> Compiled:
+def build(name: str, arguments: str, body: list[str], writer: Writer) -> CompiledFunction:
     """Compile a body that a writer wrote."""
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     function, source = function_of(name, arguments, body, {**writer.vocabulary, **others})
-    return Compiled(function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values())))
+    return CompiledFunction(
+        function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values()))
+    )
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

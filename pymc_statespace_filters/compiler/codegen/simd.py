@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, VectorFunction
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, VectorFunction
 from pymc_statespace_filters.compiler.codegen.functions import build, sorted_by_number, unrolled
 from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
 from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
@@ -44,8 +44,8 @@ def lane_functions(functions: Mapping[str, VectorFunction], size: int) -> Lanes:
     n_theta = next(iter(functions.values())).graph.inputs["theta"].type.shape[0]
     last = n_theta + size
     n_rows = last + 1
-    built: dict[str, Compiled] = {}
-    prepare: dict[str, Compiled] = {}
+    built: dict[str, CompiledFunction] = {}
+    prepare: dict[str, CompiledFunction] = {}
     for name, function in functions.items():
         values = [v for group in unrolled(function.graph) for v in group]
         code = _element_code(function, n_theta)
@@ -96,7 +96,7 @@ def _function(
     known: Mapping[Value, str],
     values: Sequence[Value],
     targets: Sequence[str],
-) -> Compiled:
+) -> CompiledFunction:
     """Write ``values`` to ``targets`` in every lane; what lanes share is computed before."""
     writer = Writer(code, FOR_MEMBERS, known)
     of_lane = depends_on(values, _named(code, "theta", "s"))

@@ -12,7 +12,7 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    Compiled,
+    CompiledFunction,
     Graph,
     VectorFunction,
     jit,
@@ -22,7 +22,7 @@ from pymc_statespace_filters.compiler.lowering.gaussian import log_normal, witho
 from pymc_statespace_filters.compiler.lowering.structure import merged_noise
 from pymc_statespace_filters.compiler.lowering.symbols import call, observation_moments, symbols_of
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import NUMBERS, Entry
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -86,7 +86,7 @@ def ensemble_machine(system: StateSpaceModel) -> Machine:
 
     def members(
         name: str, arguments: str, output: TensorVariable, target: str, *inputs: str, n_z: int = 0
-    ) -> Compiled:
+    ) -> CompiledFunction:
         graph_inputs = {"theta": c, **{i: symbols[i] for i in inputs}}
         if n_z:
             graph_inputs["z"] = z[n_z]
@@ -184,7 +184,9 @@ def _log_density(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
     return log_normal(*without_missing(symbols["d"], mean, cov))
 
 
-def _prepare(system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]) -> Compiled:
+def _prepare(
+    system: StateSpaceModel, blocks: Mapping[str, FrozenFunctionGraph]
+) -> CompiledFunction:
     """theta -> c: parameters, initial mean, then the lower square root of every covariance."""
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
     mean = call(system.equations.initial_mean, system, {"theta": theta})
@@ -196,7 +198,7 @@ def _followed_by_roots(
     system: StateSpaceModel,
     theta: TensorVariable,
     blocks: Mapping[str, FrozenFunctionGraph],
-) -> Compiled:
+) -> CompiledFunction:
     """theta -> these vectors, then the lower square root of every covariance, in one array."""
     covs = [call(graph, system, {"theta": theta}) for graph in blocks.values()]
     graph = Graph({"theta": theta}, [pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])])
@@ -217,10 +219,10 @@ def _followed_by_roots(
             start += size * size
         return c
 
-    return Compiled(jit(prepare), key_of(repr((length, sizes)), flat.key, SQUARE_ROOT.key))
+    return CompiledFunction(jit(prepare), key_of(repr((length, sizes)), flat.key, SQUARE_ROOT.key))
 
 
-def covariance_check(system: StateSpaceModel) -> Compiled:
+def covariance_check(system: StateSpaceModel) -> CompiledFunction:
     """``check(theta)``: whether every covariance is symmetric and non-negative at theta.
 
     A filter of moments would go on with a negative variance and give it a likelihood.
@@ -231,7 +233,7 @@ def covariance_check(system: StateSpaceModel) -> Compiled:
         if any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
     }
     if not blocks:
-        return Compiled(jit(lambda theta: True), key_of("nothing to check"))
+        return CompiledFunction(jit(lambda theta: True), key_of("nothing to check"))
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
     prepare = _followed_by_roots([], system, theta, blocks)
     roots = prepare.function
@@ -242,7 +244,7 @@ def covariance_check(system: StateSpaceModel) -> Compiled:
                 return False
         return True
 
-    return Compiled(jit(check), key_of("check", prepare.key))
+    return CompiledFunction(jit(check), key_of("check", prepare.key))
 
 
 @jit
@@ -285,5 +287,5 @@ def _take_root(a, size):
     semidefinite_cholesky(carray(a, (size, size)))
 
 
-SQUARE_ROOT = Entry(_take_root, (NUMBERS, types.intp), "square_root", digest("square_root"))
+SQUARE_ROOT = EntryPoint(_take_root, (F64_PTR, types.intp), "square_root", digest("square_root"))
 """`semidefinite_cholesky` of the matrix at an address, compiled once for all systems."""

@@ -8,30 +8,30 @@ from numba import carray, types
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
 from pymc_statespace_filters.compiler.lowering.scalar_state import OneState
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import NUMBERS, Entry
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 
 # c, inputs, k, t, what comes to all members (Z and its columns, or d), X, out, number of members
 _MEMBERS = (
-    NUMBERS, NUMBERS, types.intp, types.float64, NUMBERS, types.intp, NUMBERS, NUMBERS, types.intp,
+    F64_PTR, F64_PTR, types.intp, types.float64, F64_PTR, types.intp, F64_PTR, F64_PTR, types.intp,
 )  # fmt: skip
 
 
 class MachineEntries(NamedTuple):
     """One for each function of a `Machine`; ``observe`` is None where the machine has none."""
 
-    prepare: Entry
-    initialise: Entry
-    propagate: Entry
-    log_density: Entry
-    observe: Entry | None
+    prepare: EntryPoint
+    initialise: EntryPoint
+    propagate: EntryPoint
+    log_density: EntryPoint
+    observe: EntryPoint | None
 
 
 class OneStateEntries(NamedTuple):
     """Those of a `OneState`: ``start`` writes (valid or 0, mean, variance)."""
 
-    start: Entry
-    move: Entry
-    log_density: Entry
+    start: EntryPoint
+    move: EntryPoint
+    log_density: EntryPoint
 
 
 def machine_entries(machine: Machine) -> MachineEntries:
@@ -64,7 +64,7 @@ def machine_entries(machine: Machine) -> MachineEntries:
 
     key = key_of(repr(sizes), machine.key)
     return MachineEntries(
-        prepare=_entry(prepare_constants, (NUMBERS, types.intp, NUMBERS), key),
+        prepare=_entry(prepare_constants, (F64_PTR, types.intp, F64_PTR), key),
         initialise=_entry(initialise_members, _MEMBERS, key),
         propagate=_entry(propagate_members, _MEMBERS, key),
         log_density=_entry(log_density_members, _MEMBERS, key),
@@ -92,12 +92,12 @@ def one_state_entries(system: OneState) -> OneStateEntries:
         log_density(carray(c, (n_theta,)), carray(inputs, (k + 1, n_inputs)), k, t, d, X, log_p)
 
     return OneStateEntries(
-        start=_entry(start_state, (NUMBERS, types.intp, NUMBERS), system.key),
+        start=_entry(start_state, (F64_PTR, types.intp, F64_PTR), system.key),
         move=_entry(move_state, _MEMBERS, system.key),
         log_density=_entry(log_density_state, _MEMBERS, system.key),
     )
 
 
-def _entry(function: Callable, arguments: tuple, key: str | None) -> Entry:
+def _entry(function: Callable, arguments: tuple, key: str | None) -> EntryPoint:
     name = function.__name__
-    return Entry(function, arguments, name, key_of(name, key))
+    return EntryPoint(function, arguments, name, key_of(name, key))

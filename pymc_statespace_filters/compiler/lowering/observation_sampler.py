@@ -6,14 +6,14 @@ import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 
 from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
 from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
-def observation_sampler(system: StateSpaceModel) -> Compiled:
+def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
     """``observe(rng, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1) to out (p,)."""
     if (draw := system.equations.observation_draw) is not None:
         return _distribution_sampler(system, draw)
@@ -23,10 +23,10 @@ def observation_sampler(system: StateSpaceModel) -> Compiled:
     def observe(rng, c, inputs, k, t, x, out):
         observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))
 
-    return Compiled(jit(observe), machine.key)
+    return CompiledFunction(jit(observe), machine.key)
 
 
-def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> Compiled:
+def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
     """The user's distributions, drawn by PyTensor's own code."""
     no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}
     symbols = symbols_of(system) | no_noise
@@ -49,4 +49,4 @@ def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -
     )
     namespace = {"np": np, "draw_code": draw_code, "n_theta": n_theta, "no_inputs": no_inputs}
     exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
-    return Compiled(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))
+    return CompiledFunction(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))

@@ -23,10 +23,13 @@ from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, digest
-from pymc_statespace_filters.compiler.native.private_linkage import ClosedCompiler, closed
+from pymc_statespace_filters.compiler.native.private_linkage import (
+    InternalLinkageCompiler,
+    with_internal_linkage,
+)
 
-NUMBERS = types.CPointer(types.float64)
-COUNTS = types.CPointer(types.int64)
+F64_PTR = types.CPointer(types.float64)
+I64_PTR = types.CPointer(types.int64)
 
 
 class _CacheByKey(FunctionCache):
@@ -44,11 +47,11 @@ class _CacheByKey(FunctionCache):
 _compiled: dict[str, Any] = {}
 
 
-def kept(function: Any, key: str) -> Any:
+def cached_on_disk(function: Any, key: str) -> Any:
     """Keep a compiled function on PyTensor's disk cache, under a key that identifies its code."""
     if config.numba__cache:
         function._cache = _cache(function.py_func, key)
-    return closed(function)
+    return with_internal_linkage(function)
 
 
 def _cache(function: Callable, key: str) -> _CacheByKey:
@@ -57,7 +60,7 @@ def _cache(function: Callable, key: str) -> _CacheByKey:
     return _CacheByKey(function)
 
 
-class Entry:
+class EntryPoint:
     """A function that is compiled when `compile` is first called, and called by its ``symbol``.
 
     Parameters
@@ -65,7 +68,7 @@ class Entry:
     function : callable
         Returns nothing and raises nothing. It may close over compiled functions.
     arguments : tuple of numba types
-        ``NUMBERS`` and ``COUNTS`` are addresses, which ``numba.carray`` makes arrays of.
+        ``F64_PTR`` and ``I64_PTR`` are addresses, which ``numba.carray`` makes arrays of.
     name : str
         Part of the symbol, for the reader of a profile.
     key : str or None
@@ -80,7 +83,7 @@ class Entry:
         arguments: tuple,
         name: str,
         key: str | None,
-        needs: Sequence["Entry"] = (),
+        needs: Sequence["EntryPoint"] = (),
     ):
         self._function = function
         self._arguments = arguments
@@ -100,7 +103,7 @@ class Entry:
             (self._arguments, types.void),
             {},
             options,
-            pipeline_class=ClosedCompiler,
+            pipeline_class=InternalLinkageCompiler,
         )
         if self.key is not None and config.numba__cache:
             compiled._cache = _cache(self._function, self.key)

@@ -7,9 +7,9 @@ against NaN and infinity would be compiled away.
 
 from numba import njit
 
-compiled = njit(error_model="numpy", nogil=True, fastmath={"contract"})
+njit_contract = njit(error_model="numpy", nogil=True, fastmath={"contract"})
 
-internal = njit(
+njit_internal = njit(
     error_model="numpy",
     nogil=True,
     fastmath={"contract"},
@@ -18,20 +18,20 @@ internal = njit(
 )
 """For a function that only compiled functions call: what Python would need is not compiled."""
 
-pasted = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
+inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
 """For a function with one caller, or a few instructions inside a loop that must become vector code.
 
 It becomes part of its caller before anything is compiled. Compilation optimises a function again at
 every level that it is called from, so this also halves the time a new model waits.
 """
 
-reducing = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+njit_reassoc = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
 """For sums over members, which may be added up in another order and so become vector code."""
 
-strict = njit(error_model="numpy", nogil=True, inline="always")
+njit_strict = njit(error_model="numpy", nogil=True, inline="always")
 """Pasted too, and computed to the letter: for sums that must not depend on what is around them."""
 
 
-@compiled
-def keep(array):
+@njit_contract
+def keep_alive(array):
     """Be the last reader of an array whose address was handed on; else it was freed before."""

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
 from pymc_statespace_filters.parallel.cpu_affinity import available_cores
 
@@ -34,13 +34,13 @@ def _call_rows(call, argument, rows, results, told):
     return True
 
 
-_call_rows = kept(
+_call_rows = cached_on_disk(
     njit(_call_rows, error_model="numpy", nogil=True),
     digest("call_rows", Path(__file__).read_text()),
 )
 
 
-class ManyCalls:
+class ParallelMap:
     """A compiled PyTensor function at many points; neither order nor number of threads matters.
 
     Parameters

@@ -29,7 +29,7 @@ class _ClosedLibrary(JITCodeLibrary):
         super()._optimize_final_module()
 
 
-class ClosedCompiler(Compiler):
+class InternalLinkageCompiler(Compiler):
     """Numba's compiler, for functions that machine code calls by address."""
 
     def __init__(
@@ -48,7 +48,7 @@ class ClosedCompiler(Compiler):
             self.state.library.enable_object_caching()
 
 
-def closed(function: Any) -> Any:
+def with_internal_linkage(function: Any) -> Any:
     """Have a jitted function compiled into a closed library, if it is not compiled yet."""
-    function._compiler.pipeline_class = ClosedCompiler
+    function._compiler.pipeline_class = InternalLinkageCompiler
     return function

@@ -20,8 +20,13 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry, call_address
-from pymc_statespace_filters.compiler.native.private_linkage import closed
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    EntryPoint,
+    call_address,
+)
+from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 
@@ -79,7 +84,7 @@ class NativeFunction:
             isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
         )
         if self._is_native:
-            closed(function.vm.jit_fn)
+            with_internal_linkage(function.vm.jit_fn)
         # The values of now, in the one layout that adapters know.
         self._data = [_contiguous(value) for value in shared] if self._is_native else []
         self.shapes = [np.shape(result) for result in self(*example)]
@@ -168,7 +173,7 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
     key = digest("adapter", Path(__file__).read_text(), source, str(signature), str(results))
-    entry = Entry(namespace["adapter"], (COUNTS, NUMBERS), "adapter", key)
+    entry = EntryPoint(namespace["adapter"], (I64_PTR, F64_PTR), "adapter", key)
     entry.compile()
     return entry.address
 

@@ -11,8 +11,8 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import NUMBERS, Entry
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.restricted_domain import (
     exp,
     float_of,
@@ -43,7 +43,7 @@ _ONE = np.uint64(0x3FF0000000000000)  # the bits of 1.0
 _TWO_MINUS_53 = 2.0**-53
 
 
-@pasted
+@inline_always
 def philox(c0, c1, c2, c3, k0, k1):
     """Philox4x32-10: four 32-bit words (held in uint64) from a counter of four and a key of two."""
     c0, c1, c2, c3 = c0 & _LOW_WORD, c1 & _LOW_WORD, c2 & _LOW_WORD, c3 & _LOW_WORD
@@ -59,21 +59,21 @@ def philox(c0, c1, c2, c3, k0, k1):
     return c0, c1, c2, c3
 
 
-@pasted
+@inline_always
 def key_words(seed):
     """The 64 bits of an integer seed, negative ones included, as the two words of a key."""
     bits = np.uint64(seed)
     return bits & _LOW_WORD, bits >> _WORD_BITS
 
 
-@pasted
+@inline_always
 def open_unit(low, high):
     """Uniform in the open interval (0, 1), symmetric about 1/2, from 52 bits of two words."""
     bits = (high << _TWENTY) | (low >> _TWELVE) | _ONE
     return (float_of(bits) - 1.0) + _TWO_MINUS_53
 
 
-@pasted
+@inline_always
 def box_muller(w0, w1, w2, w3):
     """Two independent standard normals from four 32-bit words.
 
@@ -92,7 +92,7 @@ def padded(n_members: int) -> int:
     return -(-n_members // BLOCK) * BLOCK
 
 
-@compiled
+@njit_contract
 def fill_normals(seed, purpose, step, Z, first_block=0):
     """Fill Z (components, padded members) with the standard normals of members from a block on.
 
@@ -111,7 +111,7 @@ def fill_normals(seed, purpose, step, Z, first_block=0):
                 lower[pair], upper[pair] = box_muller(w0, w1, w2, w3)
 
 
-@pasted
+@inline_always
 def uniform_at(seed, purpose, step, component):
     """A uniform number in (0, 1) of its own."""
     k0, k1 = key_words(seed)
@@ -120,13 +120,13 @@ def uniform_at(seed, purpose, step, component):
     return open_unit(w0, w1)
 
 
-@pasted
+@inline_always
 def exponential(z0, z1):
     """A standard exponential from two independent standard normals."""
     return 0.5 * (z0 * z0 + z1 * z1)
 
 
-@pasted
+@inline_always
 def uniform(z0, z1):
     """A uniform number in (0, 1] from two independent standard normals."""
     return exp(-exponential(z0, z1))
@@ -136,9 +136,9 @@ def _fill(seed, purpose, step, first_block, z, n_rows, width):
     fill_normals(seed, np.uint64(purpose), step, carray(z, (n_rows, width)), first_block)
 
 
-FILL_NORMALS = Entry(
+FILL_NORMALS = EntryPoint(
     _fill,
-    (types.int64, types.int64, types.int64, types.int64, NUMBERS, types.intp, types.intp),
+    (types.int64, types.int64, types.int64, types.int64, F64_PTR, types.intp, types.intp),
     "fill_normals",
     digest("fill_normals"),
 )

@@ -5,7 +5,7 @@ become vector code: exp takes two thirds of the time of that one, log as well. I
 the relative error is below 1e-15. The polynomial of log is that of fdlibm (Sun Microsystems, 1993).
 """
 
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.exponential import (
     EXPONENT_BITS,
     LN2_HIGH,
@@ -30,7 +30,7 @@ _HALF_PI = 1.5707963267948966
 EXP_LOWEST = -708.0
 
 
-@pasted
+@inline_always
 def exp(x):
     """exp(x) for x <= 0; below -708, and for NaN, about 3e-308."""
     x = x if x > EXP_LOWEST else EXP_LOWEST
@@ -53,7 +53,7 @@ def exp(x):
     return float_of(bits_of(p) + (bits_of(shifted) << EXPONENT_BITS))
 
 
-@pasted
+@inline_always
 def log(x):
     """log(x) for positive, normal, finite x."""
     bits = bits_of(x) + ONE_OVER_SQRT_HALF
@@ -73,7 +73,7 @@ def log(x):
     return k * LN2_HIGH - ((half_square - tail) - f)
 
 
-@pasted
+@inline_always
 def sin_cos_quarter(v):
     """(sin(pi v / 2), cos(pi v / 2)) for |v| <= 1/2."""
     a = v * _HALF_PI

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 
@@ -12,7 +12,7 @@ _STRICT = 1e-14  # a pivot below this share of its variance is rounding noise of
 _SEMIDEFINITE = 1e-12  # wider: a direction is rather dropped than divided by a noisy pivot
 
 
-@pasted
+@inline_always
 def _eliminate(A, j):
     """Pivot j of the factor of A whose columns before j are done."""
     pivot = A[j, j]
@@ -21,7 +21,7 @@ def _eliminate(A, j):
     return pivot
 
 
-@pasted
+@inline_always
 def _scale_column(A, j, root):
     """Column j of the factor below and on the diagonal, zeros above."""
     n = A.shape[0]
@@ -34,7 +34,7 @@ def _scale_column(A, j, root):
         A[j, i] = 0.0
 
 
-@compiled
+@njit_contract
 def cholesky(A):
     """Replace A by its lower Cholesky factor; False, with A half done, if not positive definite."""
     for j in range(A.shape[0]):
@@ -45,7 +45,7 @@ def cholesky(A):
     return True
 
 
-@compiled
+@njit_contract
 def semidefinite_cholesky(A, floor, active):
     """Replace A by a lower factor in which directions without variance have a zero column.
 
@@ -65,7 +65,7 @@ def semidefinite_cholesky(A, floor, active):
     return True
 
 
-@compiled
+@njit_contract
 def solve_lower(L, b):
     """Replace b by L^-1 b."""
     for i in range(b.size):
@@ -74,7 +74,7 @@ def solve_lower(L, b):
         b[i] /= L[i, i]
 
 
-@compiled
+@njit_contract
 def solve_lower_transposed(L, b):
     """Replace b by L^-T b."""
     for i in range(b.size - 1, -1, -1):
@@ -83,7 +83,7 @@ def solve_lower_transposed(L, b):
         b[i] /= L[i, i]
 
 
-@compiled
+@njit_contract
 def log_gaussian(r, L, n_dims):
     """log N(r; 0, L L^T) of which ``n_dims`` components count; r is overwritten.
 

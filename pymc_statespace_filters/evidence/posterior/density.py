@@ -14,7 +14,7 @@ from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.parallel_map import ManyCalls
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds, smooth_filters, with_filter
 
@@ -50,7 +50,7 @@ class RowFunction:
         function = compile_pymc(inputs, [output], on_unused_input="ignore")
         function.trust_input = True
         point = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
-        self._calls = ManyCalls(function, [point, *self.model_seeds])
+        self._calls = ParallelMap(function, [point, *self.model_seeds])
 
     @property
     def watch(self) -> Callable[[int], None]:

@@ -23,19 +23,19 @@ from numba import carray
 
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, keep, reducing
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
     solve_lower_transposed,
 )
 from pymc_statespace_filters.filters.ensemble.callbacks import (
+    CALLBACK_ARGUMENTS,
     ENDED,
     FORECAST,
     RESAMPLED,
     UPDATED,
-    WITNESS_ARGUMENTS,
 )
 from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
 from pymc_statespace_filters.filters.ensemble.summaries import (
@@ -93,7 +93,7 @@ def _carry(counts, numbers, event, j, k, members, log_weights, d, simulated, anc
             _settle(of, real, past, origins, log_w)
 
 
-@compiled
+@njit_contract
 def _settle(of, real, past, origins, log_w):
     """Write down what is known of the oldest row that is kept."""
     row = of[_SETTLED]
@@ -105,7 +105,7 @@ def _settle(of, real, past, origins, log_w):
     of[_SETTLED] += 1
 
 
-@compiled
+@njit_contract
 def _count_distinct(w, origins):
     """How many ancestors the members that have weight come from."""
     seen, count = np.zeros(w.size, np.bool_), 0
@@ -116,7 +116,7 @@ def _count_distinct(w, origins):
     return count
 
 
-@compiled
+@njit_contract
 def _follow(parents, past, origins):
     """Give every member the past of its parent."""
     old_past, old_origins = past.copy(), origins.copy()
@@ -126,7 +126,7 @@ def _follow(parents, past, origins):
             past[a, i] = old_past[a, parents[i]]
 
 
-@compiled
+@njit_contract
 def _nudge_past(past, first, end, log_w, d, D, free):
     """Move the free states of rows first to end as `_ensemble.nudge` moves the present ones."""
     p, N = D.shape
@@ -144,7 +144,7 @@ def _nudge_past(past, first, end, log_w, d, D, free):
                     x[i] += gain[b] * V[b, i]
 
 
-@reducing
+@njit_reassoc
 def _product(a, x):
     """Sum of a_i x_i; where a_i is zero x_i may be NaN."""
     total = 0.0
@@ -154,7 +154,7 @@ def _product(a, x):
     return total
 
 
-@compiled
+@njit_contract
 def _innovations(log_w, d, D, A, V):
     """A, whose product with past states is P_xd, and V = P_dd^-1 (d - d_i); False if none move.
 
@@ -204,7 +204,7 @@ def _innovations(log_w, d, D, A, V):
     return True
 
 
-CARRY = Entry(_carry, WITNESS_ARGUMENTS, "carry_past", digest("carry_past"))
+CARRY = EntryPoint(_carry, CALLBACK_ARGUMENTS, "carry_past", digest("carry_past"))
 
 
 def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool, lag: int) -> Any:
@@ -213,7 +213,7 @@ def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool
     Parameters
     ----------
     evaluate : njit function
-        Of a filter and a system, see `EnsembleFilter.watched`.
+        Of a filter and a system, see `EnsembleFilter.with_callback`.
     machine : Machine
     n_members : int
     nudges : bool
@@ -224,7 +224,7 @@ def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool
     CARRY.compile()
     witness, free, n, p, N = CARRY.symbol, machine.free, machine.n, machine.p, n_members
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R = rows.size
         settled_at, S = _settlement(rows, steps, observed, lag)
@@ -243,7 +243,7 @@ def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool
         numbers[(3 * n + 1) * R : (3 * n + 1) * R + N] = -math.log(N)
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
         _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep(counts)
+        keep_alive(counts)
         if health[1] != NONE:
             for row in range(R):
                 forget_row(numbers, n, R, row)
@@ -252,7 +252,7 @@ def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool
     return run
 
 
-@compiled
+@njit_contract
 def _settlement(rows, steps, observed, lag):
     """At which observation each row is settled, and how many rows wait for that at most."""
     seen = np.array([j for j in range(steps.size) if not is_missing(observed, j)], np.int64)

@@ -21,12 +21,17 @@ from numba import carray, types
 
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, keep, pasted
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    EntryPoint,
+    address_of,
+)
+from pymc_statespace_filters.compiler.native.jit import inline_always, keep_alive, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import STATES, key_words, open_unit, philox
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.compiler.numerics.small_cholesky import cholesky, solve_lower
-from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, UPDATED, WITNESS_ARGUMENTS
+from pymc_statespace_filters.filters.ensemble.callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED
 from pymc_statespace_filters.filters.ensemble.summaries import (
     choose,
     finite_weights,
@@ -56,17 +61,17 @@ def _store(counts, numbers, event, j, k, members, log_weights, d, simulated, anc
         at[n * N :] = log_w
 
 
-STORE = Entry(_store, WITNESS_ARGUMENTS, "store_particles", digest("store_particles"))
+STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles", digest("store_particles"))
 
 _ARGUMENTS = (
-    COUNTS, types.float64,  # table of the system and its time step
+    I64_PTR, types.float64,  # table of the system and its time step
     types.intp, types.intp, types.intp, types.intp,  # particles, noises, paths, steps
-    NUMBERS, types.intp,  # theta
-    NUMBERS, types.intp,  # rows of inputs
+    F64_PTR, types.intp,  # theta
+    F64_PTR, types.intp,  # rows of inputs
     types.float64, types.int64,  # t0, seed of the draws
-    NUMBERS,  # what was stored
-    COUNTS, types.intp,  # rows
-    NUMBERS, NUMBERS,  # results, and whether all went well
+    F64_PTR,  # what was stored
+    I64_PTR, types.intp,  # rows
+    F64_PTR, F64_PTR,  # results, and whether all went well
 )  # fmt: skip
 
 
@@ -107,7 +112,7 @@ def _walk_back(
     carray(succeeded, (1,))[0] = 1.0
 
 
-@compiled
+@njit_contract
 def _kernels(system, k, t, X, w, noise, scratch, kernel):
     """Means, lower roots of covariances and log-constants of the next state from each particle."""
     means, roots, log_constants = kernel
@@ -137,7 +142,7 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
     return True
 
 
-@compiled
+@njit_contract
 def _choose_particles(seed, k, w, shares, kernel, paths, chosen):
     """Draw for every path the particle from which it came."""
     log_constants, N = kernel[2], w.size
@@ -164,7 +169,7 @@ def _choose_particles(seed, k, w, shares, kernel, paths, chosen):
                 chosen[path] = _find(shares, u)
 
 
-@pasted
+@inline_always
 def _log_density(kernel, i, x, residual):
     """log N(x; mean_i, root_i root_i^T) without what is the same for all."""
     means, roots, log_constants = kernel
@@ -177,7 +182,7 @@ def _log_density(kernel, i, x, residual):
     return log_constants[i] - 0.5 * square
 
 
-@pasted
+@inline_always
 def _uniforms(seed, attempt, path, k):
     """Two uniform numbers of their own."""
     k0, k1 = key_words(seed)
@@ -185,7 +190,7 @@ def _uniforms(seed, attempt, path, k):
     return open_unit(words[0], words[1]), open_unit(words[2], words[3])
 
 
-@compiled
+@njit_contract
 def _share_out(w, shares):
     """Cumulative weights, and for each of N equal parts of them the particle where it begins."""
     cumulative, begins = shares
@@ -200,7 +205,7 @@ def _share_out(w, shares):
         begins[part] = i
 
 
-@pasted
+@inline_always
 def _find(shares, u):
     """The particle in whose share of the weight a number of (0, 1) falls, after a step or two."""
     cumulative, begins = shares
@@ -211,7 +216,7 @@ def _find(shares, u):
     return i
 
 
-@compiled
+@njit_contract
 def _summarise_paths(out, n_rows, row, paths, chosen, N):
     """Mean, deviation and the first of the paths; the number of distinct particles in them."""
     M, n = paths.shape
@@ -232,7 +237,7 @@ def _summarise_paths(out, n_rows, row, paths, chosen, N):
     out[3 * n * n_rows + row] = count
 
 
-WALK_BACK = Entry(_walk_back, _ARGUMENTS, "walk_back", digest("walk_back"))
+WALK_BACK = EntryPoint(_walk_back, _ARGUMENTS, "walk_back", digest("walk_back"))
 
 
 def backward_kernel(evaluate: Any, make_table: Any, machine: Machine, n_particles: int) -> Any:
@@ -241,7 +246,7 @@ def backward_kernel(evaluate: Any, make_table: Any, machine: Machine, n_particle
     Parameters
     ----------
     evaluate, make_table : njit functions
-        Of a filter and a system, see `EnsembleFilter.watched` and `EnsembleFilter.table`.
+        Of a filter and a system, see `EnsembleFilter.with_callback` and `EnsembleFilter.table`.
     machine : Machine
     n_particles : int
     """
@@ -251,14 +256,14 @@ def backward_kernel(evaluate: Any, make_table: Any, machine: Machine, n_particle
     n, m, dt, N = machine.n, machine.m, machine.dt, n_particles
     M = max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R, n_steps = rows.size, steps[-1] if steps.size else np.int64(0)
         counts, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
         numbers, succeeded = np.full((3 * n + 1) * R, np.nan), np.zeros(1)
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(stored.ctypes.data))
         _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep(counts)
+        keep_alive(counts)
         if health[1] == NONE:
             table = make_table()
             walk_back(
@@ -266,7 +271,7 @@ def backward_kernel(evaluate: Any, make_table: Any, machine: Machine, n_particle
                 inputs.ctypes.data, inputs.shape[0], t0, draw_seed, stored.ctypes.data,
                 rows.ctypes.data, R, numbers.ctypes.data, succeeded.ctypes.data,
             )  # fmt: skip
-            keep(table)
+            keep_alive(table)
             if succeeded[0] == 0.0:
                 health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
                 for row in range(R):

@@ -4,17 +4,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.ensemble import Machine, ensemble_machine
 from pymc_statespace_filters.compiler.lowering.entry_points import machine_entries
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, keep
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, padded
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.callbacks import NOBODY
+from pymc_statespace_filters.filters.ensemble.callbacks import NO_CALLBACK
 from pymc_statespace_filters.filters.ensemble.noise import STORE_NORMALS, NoiseSizes, n_stored
-from pymc_statespace_filters.filters.ensemble.partition import ALONE
+from pymc_statespace_filters.filters.ensemble.partition import SINGLE_RANK
 from pymc_statespace_filters.filters.ensemble.run_summaries import members_kernel
 from pymc_statespace_filters.filters.ensemble.summaries import summary_kernel
 from pymc_statespace_filters.filters.ensemble.system_table import N_TABLE
@@ -33,7 +33,7 @@ class EnsembleFilter:
     has_gradient: ClassVar[bool] = False
     needs_simulated_observations: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
-    entry: ClassVar[Entry]
+    entry: ClassVar[EntryPoint]
 
     def size(self) -> int:
         """Return the number of members."""
@@ -89,52 +89,54 @@ class EnsembleFilter:
         resampling = self.resampling_normals()
         return NoiseSizes(padded(self.size()), machine.n, machine.m, simulated, resampling)
 
-    def compile(self, system: StateSpaceModel) -> Compiled:
+    def compile(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, noise) -> (terms, health).
 
         ``noise`` is a seed and a vector of stored normals; the seed counts where the vector is
         empty.
         """
         machine = ensemble_machine(system)
-        return Compiled(self.kernel(machine), key_of(repr(self), machine.key))
+        return CompiledFunction(self.kernel(machine), key_of(repr(self), machine.key))
 
     def kernel(self, machine: Machine) -> Any:
         """Bind the filter's entry to the functions of one system."""
         evaluate = self.algorithm(machine)._bound(machine)
 
-        @compiled
+        @njit_contract
         def run(theta, steps, observed, inputs, t0, noise):
-            return evaluate(theta, steps, observed, inputs, t0, noise, NOBODY, ALONE)
+            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK)
 
         return run
 
-    def compile_shared(self, system: StateSpaceModel) -> Compiled:
+    def compile_shared(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange).
 
         It moves one rank's share of the members (see `_share`) and gives the same terms and health
         on all ranks, to the bit those of `compile` on one.
         """
         machine = ensemble_machine(system)
-        return Compiled(self.shared_kernel(machine), key_of(f"shared {self!r}", machine.key))
+        return CompiledFunction(
+            self.shared_kernel(machine), key_of(f"shared {self!r}", machine.key)
+        )
 
     def shared_kernel(self, machine: Machine) -> Any:
         """Bind the filter's entry to one system, for several ranks."""
         evaluate = self.algorithm(machine)._bound(machine)
 
-        @compiled
+        @njit_contract
         def run(theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange):
-            noise, share = (seed, np.empty(0)), (rank, n_ranks, exchange)
-            return evaluate(theta, steps, observed, inputs, t0, noise, NOBODY, share)
+            noise, layout = (seed, np.empty(0)), (rank, n_ranks, exchange)
+            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, layout)
 
         return run
 
-    def watched(self, machine: Machine) -> Any:
+    def with_callback(self, machine: Machine) -> Any:
         """The kernel with the addresses of a witness and its two vectors: `_witness`."""
         evaluate = self._bound(machine)
 
-        @compiled
+        @njit_contract
         def run(theta, steps, observed, inputs, t0, noise, watch):
-            return evaluate(theta, steps, observed, inputs, t0, noise, watch, ALONE)
+            return evaluate(theta, steps, observed, inputs, t0, noise, watch, SINGLE_RANK)
 
         return run
 
@@ -144,8 +146,8 @@ class EnsembleFilter:
         sizes = self.noise_sizes(machine)
         settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
 
-        @compiled
-        def run(theta, steps, observed, inputs, t0, noise, watch, share):
+        @njit_contract
+        def run(theta, steps, observed, inputs, t0, noise, watch, layout):
             seed, normals = noise
             n_steps = steps[-1] if steps.size else np.int64(0)
             if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
@@ -157,16 +159,16 @@ class EnsembleFilter:
                 table.ctypes.data, dt, settings.ctypes.data, theta.ctypes.data, theta.size,
                 steps.ctypes.data, steps.size, observed.ctypes.data,
                 inputs.ctypes.data, inputs.shape[0], t0,
-                seed, normals.ctypes.data, normals.size, *watch, *share,
+                seed, normals.ctypes.data, normals.size, *watch, *layout,
                 terms.ctypes.data, health.ctypes.data,
             )  # fmt: skip
-            keep(table)
-            keep(normals)
+            keep_alive(table)
+            keep_alive(normals)
             return terms, health
 
         return run
 
-    def compile_states(self, system: StateSpaceModel, moment: str) -> Compiled:
+    def compile_states(self, system: StateSpaceModel, moment: str) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
 
         See `filters`, the room, for what it returns.
@@ -176,18 +178,18 @@ class EnsembleFilter:
         if moment == "smoothed":
             kernel = filter.smoother(system, machine)
         else:
-            kernel = summary_kernel(filter.watched(machine), system.n, self.size(), moment)
-        return Compiled(kernel, key_of(f"{moment} states {self!r}", machine.key))
+            kernel = summary_kernel(filter.with_callback(machine), system.n, self.size(), moment)
+        return CompiledFunction(kernel, key_of(f"{moment} states {self!r}", machine.key))
 
-    def compile_run(self, system: StateSpaceModel) -> Compiled:
+    def compile_run(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
 
         See `filters`, the room, for what it returns.
         """
         machine = ensemble_machine(system)
-        watched = self.algorithm(machine).watched(machine)
-        kernel = members_kernel(watched, system.n, self.size())
-        return Compiled(kernel, key_of(f"run {self!r}", machine.key))
+        with_callback = self.algorithm(machine).with_callback(machine)
+        kernel = members_kernel(with_callback, system.n, self.size())
+        return CompiledFunction(kernel, key_of(f"run {self!r}", machine.key))
 
     def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
         """Bind the smoother of this filter to one system."""
@@ -197,18 +199,18 @@ class EnsembleFilter:
         """Name the method of the smoothed states."""
         raise NotImplementedError
 
-    def stored_noise(self, system: StateSpaceModel) -> Compiled:
+    def stored_noise(self, system: StateSpaceModel) -> CompiledFunction:
         """The function (steps, seed) -> the normals that an evaluation with this seed uses."""
         return self.stored_normals(ensemble_machine(system))
 
-    def stored_normals(self, machine: Machine) -> Compiled:
+    def stored_normals(self, machine: Machine) -> CompiledFunction:
         """Bind the making of normals to the sizes of one system."""
         sizes = self.algorithm(machine).noise_sizes(machine)
         width, initial, process, observation, resampling = sizes
         STORE_NORMALS.compile()
         store = STORE_NORMALS.external
 
-        @compiled
+        @njit_contract
         def stored(steps, seed):
             n_steps = steps[-1] if steps.size else np.int64(0)
             out = np.empty(n_stored(sizes, n_steps, steps.size))
@@ -218,7 +220,7 @@ class EnsembleFilter:
             )  # fmt: skip
             return out
 
-        return Compiled(stored, key_of(f"stored noise {sizes}", STORE_NORMALS.key))
+        return CompiledFunction(stored, key_of(f"stored noise {sizes}", STORE_NORMALS.key))
 
 
 def system_table(machine: Machine) -> Any:
@@ -233,7 +235,7 @@ def system_table(machine: Machine) -> Any:
     padding = [0] * (N_TABLE - len(shape))
     constants = np.array([*shape, *padding, *machine.free], dtype=np.int64)
 
-    @compiled
+    @njit_contract
     def make_table():
         table = constants.copy()
         table[5], table[6] = address_of(prepare), address_of(initialise)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted, reducing
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
 from pymc_statespace_filters.filters.ensemble.kalman_update import mean
 
 MOST_STATES = 8  # of 8 bits each: a place on the curve is one 64-bit number
@@ -37,7 +37,7 @@ class OrderWork(NamedTuple):
     counts: np.ndarray
 
 
-@pasted
+@inline_always
 def order_workspace(n, n_particles):
     """Scratch for particles of n states."""
     N = n_particles
@@ -49,7 +49,7 @@ def order_workspace(n, n_particles):
     )  # fmt: skip
 
 
-@compiled
+@njit_contract
 def order_particles(w, X, work):
     """The order of the particles X (n, N) with weights w: an array of ``work``, of their numbers.
 
@@ -73,7 +73,7 @@ def order_particles(w, X, work):
     return _sort(n_active * n_bits, work)
 
 
-@reducing
+@njit_reassoc
 def _spreads(w, X, x_mean, out):
     """Weighted standard deviation of each row; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
@@ -84,7 +84,7 @@ def _spreads(w, X, x_mean, out):
         out[a] = np.sqrt(total)
 
 
-@compiled
+@njit_contract
 def _fill_cells(X, x_mean, spread, n_bits, cells):
     """Number of the cell, from 0 to 2^n_bits - 1, in each direction that has spread."""
     half, last = 0.5 * (1 << n_bits), (1 << n_bits) - 1
@@ -101,7 +101,7 @@ def _fill_cells(X, x_mean, spread, n_bits, cells):
         row += 1
 
 
-@compiled
+@njit_contract
 def undo_turns(cells, n_bits):
     """Turn each point, level by level, as the curve in its cell is turned against the whole curve.
 
@@ -122,7 +122,7 @@ def undo_turns(cells, n_bits):
                 first[i] = x ^ turn  # after the line above: they are one row where a is 0
 
 
-@compiled
+@njit_contract
 def read_places(cells, n_bits, keys):
     """Place on the curve: the bits of turned points, level by level, are its Gray code."""
     for i in range(keys.size):
@@ -135,7 +135,7 @@ def read_places(cells, n_bits, keys):
                 keys[i] = (key << 1) | ((key ^ (cell[i] >> level)) & 1)
 
 
-@compiled
+@njit_contract
 def _sort(n_bits, work):
     """Numbers of the particles by increasing key, digit by digit from the lowest; ties in order."""
     keys, moved_keys, counts = work.keys, work.moved_keys, work.counts

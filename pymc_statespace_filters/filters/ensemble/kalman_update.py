@@ -6,7 +6,7 @@ equal weights 1/N the weighted covariances of Eqs. 4.32-4.33 are those of Eqs. 4
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, reducing
+from pymc_statespace_filters.compiler.native.jit import njit_contract, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
@@ -15,7 +15,7 @@ from pymc_statespace_filters.compiler.numerics.small_cholesky import (
 from pymc_statespace_filters.filters.ensemble.reductions import exchange, sum_products, total
 
 
-@compiled
+@njit_contract
 def mark_finite(X, D, alive):
     """Set ``alive`` where states and simulated observations are all finite."""
     for i in range(alive.size):
@@ -26,7 +26,7 @@ def mark_finite(X, D, alive):
                 alive[i] &= np.isfinite(A[a, i])
 
 
-@compiled
+@njit_contract
 def count_true(flags):
     """Return how many flags are set."""
     count = 0
@@ -35,7 +35,7 @@ def count_true(flags):
     return count
 
 
-@compiled
+@njit_contract
 def copy_members(X, out):
     """Copy X into out, by loops: a slice assignment brings its error message into every filter."""
     for a in range(X.shape[0]):
@@ -43,14 +43,14 @@ def copy_members(X, out):
             out[a, i] = X[a, i]
 
 
-@compiled
+@njit_contract
 def equal_weights(alive, count, w):
     """Weight 1/count for the members alive, zero for the others."""
     for i in range(w.size):
         w[i] = 1.0 / count if alive[i] else 0.0
 
 
-@reducing
+@njit_reassoc
 def mean(w, X, out):
     """Weighted mean of each row; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
@@ -61,8 +61,8 @@ def mean(w, X, out):
         out[a] = total
 
 
-@compiled
-def forecast_moments(w, X, D, d, divisor, own, moments):
+@njit_contract
+def forecast_moments(w, X, D, d, divisor, local, moments):
     """Covariances of states and simulated observations, whose means are given (Eqs. 4.16-4.19).
 
     They are sums with weights w over ``divisor``. P_dd is left as its Cholesky factor.
@@ -72,14 +72,14 @@ def forecast_moments(w, X, D, d, divisor, own, moments):
     """
     x_mean, d_mean, P_xd, P_dd = moments
     n, p = P_xd.shape
-    sum_products(w, X, x_mean, D, d_mean, own, 0)
-    sum_products(w, D, d_mean, D, d_mean, own, n * p)
-    exchange(own, (n + p) * p)
+    sum_products(w, X, x_mean, D, d_mean, local, 0)
+    sum_products(w, D, d_mean, D, d_mean, local, n * p)
+    exchange(local, (n + p) * p)
     for b in range(p):
         for a in range(n):
-            P_xd[a, b] = total(own, a * p + b) / divisor
+            P_xd[a, b] = total(local, a * p + b) / divisor
         for a in range(p):
-            P_dd[a, b] = total(own, (n + a) * p + b) / divisor
+            P_dd[a, b] = total(local, (n + a) * p + b) / divisor
     for b in range(p):
         if np.isnan(d[b]):
             for a in range(n):
@@ -90,8 +90,8 @@ def forecast_moments(w, X, D, d, divisor, own, moments):
     return cholesky(P_dd)
 
 
-@compiled
-def nudge(d, D, alive, free, moments, X):
+@njit_contract
+def kalman_update(d, D, alive, free, moments, X):
     """x^a_i = x^f_i + K (d - d_i) with K = P_xd P_dd^-1 (Eqs. 4.20-4.21, 4.34-4.35), in place.
 
     Only free states are moved. P_xd becomes the gain.

@@ -8,15 +8,15 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.philox import FILL_NORMALS
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
     FORECAST,
     RESAMPLED,
     UPDATED,
-    tell,
+    emit,
 )
 from pymc_statespace_filters.filters.ensemble.noise import (
     NoiseSizes,
@@ -25,24 +25,24 @@ from pymc_statespace_filters.filters.ensemble.noise import (
     process_normals,
     resampling_normals,
 )
-from pymc_statespace_filters.filters.ensemble.partition import Share
-from pymc_statespace_filters.filters.ensemble.reductions import own_members
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.ensemble.resampling import resample_if_few, resampler
 from pymc_statespace_filters.filters.ensemble.system_table import initialise, propagate, read_system
 from pymc_statespace_filters.filters.missing import is_missing
 from pymc_statespace_filters.filters.outcomes import NONE
 
 _ARGUMENTS = (
-    COUNTS, types.float64,  # table of the system and its time step
-    NUMBERS,  # number of members, sizes of their noise, then the filter's settings
-    NUMBERS, types.intp,  # theta
-    COUNTS, types.intp, NUMBERS,  # steps and record
-    NUMBERS, types.intp,  # rows of inputs
+    I64_PTR, types.float64,  # table of the system and its time step
+    F64_PTR,  # number of members, sizes of their noise, then the filter's settings
+    F64_PTR, types.intp,  # theta
+    I64_PTR, types.intp, F64_PTR,  # steps and record
+    F64_PTR, types.intp,  # rows of inputs
     types.float64,  # t0
-    types.int64, NUMBERS, types.intp,  # seed, stored normals
+    types.int64, F64_PTR, types.intp,  # seed, stored normals
     types.intp, types.intp, types.intp,  # who watches, see `_witness`, and its two vectors
     types.intp, types.intp, types.intp,  # our share of the members, see `_share`
-    NUMBERS, NUMBERS,  # terms, health
+    F64_PTR, F64_PTR,  # terms, health
 )  # fmt: skip
 
 _N_LEADING = 6  # number of members and five of `NoiseSizes`
@@ -65,52 +65,52 @@ class Members(NamedTuple):
     alive: np.ndarray
 
 
-@pasted
-def _members(n, p, own):
-    N = own.size
+@inline_always
+def _members(n, p, local):
+    N = local.size
     log_w = np.empty(N)
     for i in range(N):
-        log_w[i] = -math.log(own.n_members)
+        log_w[i] = -math.log(local.n_members)
     return Members(
         np.empty((n, N)), np.empty((p, N)), np.empty((n, N)),
         np.empty(N), log_w, np.empty(N), np.empty(N, np.bool_),
     )  # fmt: skip
 
 
-@pasted
+@inline_always
 def _n_sums(system):
     """Enough rows for the weights, means and covariances of an update."""
     return 8 + 2 * (system.n + system.p) ** 2
 
 
-@pasted
-def _resampler(settings, n, own):
-    return resampler(settings[0], np.int64(settings[1]), n, own)
+@inline_always
+def _resampler(settings, n, local):
+    return resampler(settings[0], np.int64(settings[1]), n, local)
 
 
-@pasted
-def _resample(resampling, noise, j, k, n_effective, members, own):
+@inline_always
+def _resample(resampling, noise, j, k, n_effective, members, local):
     z = resampling_normals(noise, j, k)
-    return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, own)
+    return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, local)
 
 
 class _NoResampling(NamedTuple):
     ancestors: np.ndarray
 
 
-@pasted
-def _no_resampler(settings, n, own):
+@inline_always
+def _no_resampler(settings, n, local):
     return _NoResampling(np.empty(0, np.int64))
 
 
-@pasted
-def _keep_all(resampling, noise, j, k, n_effective, members, own):
+@inline_always
+def _keep_all(resampling, noise, j, k, n_effective, members, local):
     return False
 
 
 def filter_entry(
     name: str, workspace: Callable, update: Callable, n_settings: int, *, resamples: bool
-) -> Entry:
+) -> EntryPoint:
     """A filter as one function for all systems and numbers of members.
 
     Parameters
@@ -118,7 +118,7 @@ def filter_entry(
     name : str
     workspace : njit function ``(system, own, settings) -> tuple``
         Allocates, once an evaluation, what ``update`` needs beside the members; the filter's
-        settings go with it. ``own`` is an `Own`: which of all members these are.
+        settings go with it. ``local`` is an `Own`: which of all members these are.
     update : njit function
         ``(system, j, k, t, d, noise, members, own, work) -> (increment, n_effective, failure)``.
         Replaces the forecast members by the analysis of observation j at step k, with normalised
@@ -148,43 +148,43 @@ def filter_entry(
         given = carray(settings, (_N_LEADING + n_settings,))
         n_members = int(given[0])
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-        own = own_members(Share(rank, n_ranks, address), n_members, _n_sums(system))
-        width = own.width
+        local = local_partition(RankLayout(rank, n_ranks, address), n_members, _n_sums(system))
+        width = local.width
         sizes = NoiseSizes(width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
         at = carray(steps, (n_observations,))
         record = carray(observed, (n_observations, system.p))
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
         n_steps = at[n_observations - 1] if n_observations else np.int64(0)
-        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps, own.first_block)
-        work = workspace(system, own, given[_N_LEADING:])
-        resampling = make_resampler(given[_N_LEADING:], system.n, own)
-        members = _members(system.n, system.p, own)
-        watched = (witness, counts, numbers)
+        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps, local.first_block)
+        work = workspace(system, local, given[_N_LEADING:])
+        resampling = make_resampler(given[_N_LEADING:], system.n, local)
+        members = _members(system.n, system.p, local)
+        with_callback = (witness, counts, numbers)
         state[0], state[1], state[2] = n_members, NONE, -1
         initialise(system, initial_normals(noise), width, members.X)
         k = np.int64(0)
         nothing, ancestors = np.empty(0), resampling.ancestors
-        tell(watched, FORECAST, -1, k, members, nothing, ancestors)
+        emit(with_callback, FORECAST, -1, k, members, nothing, ancestors)
         for j in range(n_observations):
             while k < at[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
                 k += 1
-                tell(watched, FORECAST, j, k, members, nothing, ancestors)
+                emit(with_callback, FORECAST, j, k, members, nothing, ancestors)
             if is_missing(record, j):
                 out[j] = 0.0
                 continue
             increment, n_effective, failure = update(
-                system, j, k, t0 + k * dt, record[j], noise, members, own, work
+                system, j, k, t0 + k * dt, record[j], noise, members, local, work
             )
             state[0] = min(state[0], n_effective)
             if failure != NONE:
                 state[1], state[2] = failure, j
                 break
             out[j] = increment
-            tell(watched, UPDATED, j, k, members, record[j], ancestors)
-            if resample(resampling, noise, j, k, n_effective, members, own):
-                tell(watched, RESAMPLED, j, k, members, nothing, ancestors)
+            emit(with_callback, UPDATED, j, k, members, record[j], ancestors)
+            if resample(resampling, noise, j, k, n_effective, members, local):
+                emit(with_callback, RESAMPLED, j, k, members, nothing, ancestors)
         if state[1] == NONE:
-            tell(watched, ENDED, n_observations, k, members, nothing, ancestors)
+            emit(with_callback, ENDED, n_observations, k, members, nothing, ancestors)
 
-    return Entry(run, _ARGUMENTS, name, digest(name), needs=(FILL_NORMALS,))
+    return EntryPoint(run, _ARGUMENTS, name, digest(name), needs=(FILL_NORMALS,))

@@ -11,8 +11,8 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, Entry
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.philox import (
     FILL_NORMALS,
     INITIAL,
@@ -53,7 +53,7 @@ class Noise(NamedTuple):
     first_block: int
 
 
-@pasted
+@inline_always
 def noise_of(seed, stored, sizes, n_steps, first_block):
     """The source of normals for a record whose last observation is at step ``n_steps``."""
     rows = max(sizes.initial, sizes.process, sizes.observation)
@@ -61,14 +61,14 @@ def noise_of(seed, stored, sizes, n_steps, first_block):
     return Noise(seed, stored, buffer, sizes, n_steps, first_block)
 
 
-@pasted
+@inline_always
 def n_stored(sizes, n_steps, n_observations):
     """How many normals an evaluation stores; those of one more observation begin there."""
     of_states = (sizes.initial + n_steps * sizes.process) * sizes.width
     return of_states + n_observations * (sizes.observation * sizes.width + sizes.resampling)
 
 
-@pasted
+@inline_always
 def _normals(noise, purpose, step, place, n_rows, width):
     # Signed: an unsigned address plus a signed number would be a float64.
     if noise.stored.size > 0:
@@ -78,14 +78,14 @@ def _normals(noise, purpose, step, place, n_rows, width):
     return address
 
 
-@pasted
+@inline_always
 def initial_normals(noise):
     """Address of the normals of the start."""
     sizes = noise.sizes
     return _normals(noise, np.int64(INITIAL), np.int64(0), np.int64(0), sizes.initial, sizes.width)
 
 
-@pasted
+@inline_always
 def process_normals(noise, k):
     """Address of the normals of step k."""
     sizes = noise.sizes
@@ -93,7 +93,7 @@ def process_normals(noise, k):
     return _normals(noise, np.int64(PROCESS), k, place, sizes.process, sizes.width)
 
 
-@pasted
+@inline_always
 def observation_normals(noise, j, k):
     """Address of the normals of the simulated observation j, at step k."""
     sizes = noise.sizes
@@ -101,7 +101,7 @@ def observation_normals(noise, j, k):
     return _normals(noise, np.int64(OBSERVATION), k, place, sizes.observation, sizes.width)
 
 
-@pasted
+@inline_always
 def resampling_normals(noise, j, k):
     """Normals of a resampling after observation j, at step k, a vector; on every rank the same."""
     sizes = noise.sizes
@@ -130,9 +130,9 @@ def _store(seed, steps, n_observations, width, initial, process, observation, re
         at += _NUMBER_BYTES * resampling
 
 
-STORE_NORMALS = Entry(
+STORE_NORMALS = EntryPoint(
     _store,
-    (types.int64, COUNTS, *(types.intp,) * 7),
+    (types.int64, I64_PTR, *(types.intp,) * 7),
     "store_normals",
     digest("store_normals"),
     needs=(FILL_NORMALS,),

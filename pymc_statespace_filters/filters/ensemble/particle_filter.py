@@ -20,10 +20,10 @@ def particle_smoother(
     filter: EnsembleFilter, system: StateSpaceModel, machine: Machine, *, nudges: bool
 ) -> Any:
     """Bind the smoother of a particle filter to one system."""
-    watched, n_particles = filter.watched(machine), filter.size()
+    with_callback, n_particles = filter.with_callback(machine), filter.size()
     if _has_transition_density(system):
-        return backward_kernel(watched, system_table(machine), machine, n_particles)
-    return past_kernel(watched, machine, n_particles, nudges=nudges, lag=LAG)
+        return backward_kernel(with_callback, system_table(machine), machine, n_particles)
+    return past_kernel(with_callback, machine, n_particles, nudges=nudges, lag=LAG)
 
 
 def particle_smoothing_method(system: StateSpaceModel) -> str:

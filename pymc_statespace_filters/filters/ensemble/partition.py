@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 
 MEMBERS, BLOCKS = BLOCK, 1
@@ -20,7 +20,7 @@ With one column a block, an array may also be any list whose columns are dealt o
 """
 
 
-class Share(NamedTuple):
+class RankLayout(NamedTuple):
     """A rank, the number of ranks, and the address of their exchange, 0 where there is one rank.
 
     An exchange takes the address of an array, its rows, its columns, and the columns of a block.
@@ -31,22 +31,22 @@ class Share(NamedTuple):
     exchange: int
 
 
-ALONE = (0, 1, 0)
+SINGLE_RANK = (0, 1, 0)
 """A share of all members."""
 
 
-@pasted
-def part(share, n_columns, per_block):
+@inline_always
+def local_range(layout, n_columns, per_block):
     """First and last (exclusive) of the columns that are our own."""
     n_blocks = -(-n_columns // per_block)
-    first = per_block * (n_blocks * share.rank // share.n_ranks)
-    last = per_block * (n_blocks * (share.rank + 1) // share.n_ranks)
+    first = per_block * (n_blocks * layout.rank // layout.n_ranks)
+    last = per_block * (n_blocks * (layout.rank + 1) // layout.n_ranks)
     return np.int64(min(first, n_columns)), np.int64(min(last, n_columns))
 
 
-@pasted
-def complete(share, array, per_block):
+@inline_always
+def allgather(layout, array, per_block):
     """Fill the columns of a contiguous array (rows, columns) that are not our own."""
-    if share.exchange != 0:
+    if layout.exchange != 0:
         rows, columns = np.int64(array.shape[0]), np.int64(array.shape[1])
-        call_address(share.exchange, (array, rows, columns, np.int64(per_block)))
+        call_address(layout.exchange, (array, rows, columns, np.int64(per_block)))

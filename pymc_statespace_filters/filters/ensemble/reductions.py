@@ -10,21 +10,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted, reducing, strict
+from pymc_statespace_filters.compiler.native.jit import (
+    inline_always,
+    njit_contract,
+    njit_reassoc,
+    njit_strict,
+)
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
     MEMBERS,
-    Share,
-    complete,
-    part,
+    RankLayout,
+    allgather,
+    local_range,
 )
 
 HALVES = (32, 16, 8, 4, 2, 1)
 """The halves of a block, then of its first half, and so on."""
 
 
-class Own(NamedTuple):
+class LocalPartition(NamedTuple):
     """Our own members among those of all ranks, and scratch of sums over members.
 
     There are ``size`` of them, padded to whole blocks ``width``, from member ``first`` and block
@@ -32,7 +37,7 @@ class Own(NamedTuple):
     member of a block.
     """
 
-    share: Share
+    layout: RankLayout
     n_members: int
     first: int
     size: int
@@ -42,26 +47,28 @@ class Own(NamedTuple):
     lanes: np.ndarray
 
 
-@pasted
-def own_members(share, n_members, n_rows):
+@inline_always
+def local_partition(layout, n_members, n_rows):
     """Our own of all members, with room for so many rows of sums."""
-    first, last = part(share, n_members, MEMBERS)
+    first, last = local_range(layout, n_members, MEMBERS)
     width = BLOCK * -(-(last - first) // BLOCK)
     sums = np.empty((n_rows, -(-n_members // BLOCK)))
     lanes = np.empty(BLOCK)
-    return Own(share, n_members, first, last - first, width, first // BLOCK, sums, lanes)
+    return LocalPartition(
+        layout, n_members, first, last - first, width, first // BLOCK, sums, lanes
+    )
 
 
-@pasted
-def exchange(own, n_rows):
+@inline_always
+def exchange(local, n_rows):
     """Complete the first rows of sums."""
-    complete(own.share, own.sums[:n_rows], BLOCKS)
+    allgather(local.layout, local.sums[:n_rows], BLOCKS)
 
 
-@reducing
-def total(own, row):
+@njit_reassoc
+def total(local, row):
     """Add up a completed row."""
-    sums, result = own.sums[row], 0.0
+    sums, result = local.sums[row], 0.0
     for block in range(sums.size):
         result += sums[block]
     return result
@@ -74,7 +81,7 @@ def _by_blocks(term):
     block must not depend on how many follow it.
     """
 
-    @strict
+    @njit_strict
     def write_sums(given, n, out):
         lanes = np.empty(BLOCK)
         for first in range(0, n, BLOCK):
@@ -92,25 +99,25 @@ def _by_blocks(term):
 
 
 @_by_blocks
-@strict
+@njit_strict
 def _values(values, i):
     return values[i]
 
 
 @_by_blocks
-@strict
+@njit_strict
 def _squares(values, i):
     return values[i] * values[i]
 
 
 @_by_blocks
-@strict
+@njit_strict
 def _spread(w, i):
     return w[i] * (1.0 - w[i])
 
 
 @_by_blocks
-@strict
+@njit_strict
 def _weighted(given, i):
     w, x = given
     term = w[i] * x[i]
@@ -118,60 +125,60 @@ def _weighted(given, i):
 
 
 @_by_blocks
-@strict
+@njit_strict
 def _products(given, i):
     w, x, x_mean, y, y_mean = given
     term = w[i] * (x[i] - x_mean) * (y[i] - y_mean)
     return term if w[i] > 0.0 else 0.0
 
 
-@pasted
-def _own_blocks(own, row):
-    return own.sums[row, own.first_block :]
+@inline_always
+def _own_blocks(local, row):
+    return local.sums[row, local.first_block :]
 
 
-@compiled
+@njit_contract
 def sum_blocks(values, out):
     """Sum of every block of a vector."""
     _values(values, values.size, out)
 
 
-@compiled
-def sum_values(values, own, row):
+@njit_contract
+def sum_values(values, local, row):
     """Row of the sums of a vector, of numbers or flags."""
-    _values(values, values.size, _own_blocks(own, row))
+    _values(values, values.size, _own_blocks(local, row))
 
 
-@compiled
-def sum_squares(values, own, row):
+@njit_contract
+def sum_squares(values, local, row):
     """Row of the sums of the squares of a vector."""
-    _squares(values, values.size, _own_blocks(own, row))
+    _squares(values, values.size, _own_blocks(local, row))
 
 
-@compiled
-def sum_spread(w, own, row):
+@njit_contract
+def sum_spread(w, local, row):
     """Row of the sums of w (1 - w), all positive: in all 1 - sum w^2, if w is normalised."""
-    _spread(w, w.size, _own_blocks(own, row))
+    _spread(w, w.size, _own_blocks(local, row))
 
 
-@compiled
-def sum_members(w, X, own, row):
+@njit_contract
+def sum_members(w, X, local, row):
     """Rows of sum_i w_i X_ai for each row of X; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
-        _weighted((w, X[a]), w.size, _own_blocks(own, row + a))
+        _weighted((w, X[a]), w.size, _own_blocks(local, row + a))
 
 
-@compiled
-def sum_products(w, X, x_mean, Y, y_mean, own, row):
+@njit_contract
+def sum_products(w, X, x_mean, Y, y_mean, local, row):
     """Rows of sum_i w_i (X_ai - mean) (Y_bi - mean), b fastest; zero weight as above."""
     for a in range(X.shape[0]):
         for b in range(Y.shape[0]):
-            out = _own_blocks(own, row + a * Y.shape[0] + b)
+            out = _own_blocks(local, row + a * Y.shape[0] + b)
             _products((w, X[a], x_mean[a], Y[b], y_mean[b]), w.size, out)
 
 
-@pasted
-def means(own, row, weight, out):
+@inline_always
+def means(local, row, weight, out):
     """Means from completed rows of `sum_members`, of so much weight in all."""
     for a in range(out.size):
-        out[a] = total(own, row + a) / weight
+        out[a] = total(local, row + a) / weight

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, exponential, padded, uniform
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
@@ -25,11 +25,11 @@ from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     order_particles,
     order_workspace,
 )
-from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, complete
+from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
 from pymc_statespace_filters.filters.ensemble.reductions import sum_blocks
 
 
-@compiled
+@njit_contract
 def systematic(z, points):
     """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is not used."""
     n = points.size - 1
@@ -38,7 +38,7 @@ def systematic(z, points):
         points[i] = (i + u) / n
 
 
-@compiled
+@njit_contract
 def multinomial(z, points):
     """N sorted uniforms: partial sums of N + 1 exponentials over their total."""
     n = points.size - 1
@@ -75,21 +75,21 @@ class Resampling(NamedTuple):
     w_ordered: np.ndarray
 
 
-@pasted
-def resampler(fraction, scheme, n_states, own):
+@inline_always
+def resampler(fraction, scheme, n_states, local):
     """Resample below this fraction of the particles, by the scheme of this number."""
-    N, in_order = own.n_members, scheme == _SORTED
+    N, in_order = local.n_members, scheme == _SORTED
     n_ordered = N if in_order else 0
     return Resampling(
         fraction * N, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
-        np.empty(N + 1), np.empty(own.size, np.int64),
-        np.empty((1 + n_states, N)), np.empty(own.sums.shape[1]),
+        np.empty(N + 1), np.empty(local.size, np.int64),
+        np.empty((1 + n_states, N)), np.empty(local.sums.shape[1]),
         order_workspace(n_states, n_ordered), np.empty(n_ordered),
     )  # fmt: skip
 
 
-@pasted
-def resample_if_few(resampling, n_effective, z, log_w, w, X, own):
+@inline_always
+def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
     """Draw new particles of equal weight if the effective number is below the threshold.
 
     ``z`` are the normals that a resampling takes. Returns whether it was done; ``ancestors`` tell
@@ -102,8 +102,8 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, own):
         multinomial(z, points)
     else:
         systematic(z, points)
-    gather_particles(w, X, own, everyone)
-    w_all, X_all, own_points = everyone[0], everyone[1:], points[own.first :]
+    gather_particles(w, X, local, everyone)
+    w_all, X_all, own_points = everyone[0], everyone[1:], points[local.first :]
     if resampling.in_order:
         order = order_particles(w_all, X_all, resampling.order_work)
         w_ordered = resampling.w_ordered
@@ -112,7 +112,7 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, own):
         choose_ancestors(w_all, own_points, resampling.cumulative, ancestors)
     copy_ancestors(X_all, ancestors, X)
     for i in range(log_w.size):
-        log_w[i] = -math.log(own.n_members)
+        log_w[i] = -math.log(local.n_members)
     return True
 
 
@@ -141,19 +141,19 @@ def check_sortable(scheme: str, n_states: int) -> None:
         )
 
 
-@compiled
-def gather_particles(w, X, own, everyone):
+@njit_contract
+def gather_particles(w, X, local, everyone):
     """Weights and states of the particles of all ranks, (1 + n, N)."""
-    own_columns = everyone[:, own.first : own.first + own.size]
+    own_columns = everyone[:, local.first : local.first + local.size]
     for i in range(w.size):
         own_columns[0, i] = w[i]
     for a in range(X.shape[0]):
         for i in range(w.size):
             own_columns[1 + a, i] = X[a, i]
-    complete(own.share, everyone, MEMBERS)
+    allgather(local.layout, everyone, MEMBERS)
 
 
-@compiled
+@njit_contract
 def choose_ancestors(w, points, cumulative, ancestors):
     """Ancestor of each point: the n with v_{n-1} <= u < v_n, v the cumulative weights (Eq. 4.44).
 
@@ -186,7 +186,7 @@ def choose_ancestors(w, points, cumulative, ancestors):
         ancestors[i] = n
 
 
-@pasted
+@inline_always
 def _last_of_weight(w, first):
     """The last particle of a block that has weight; the first, if none has."""
     last = min(first + BLOCK, w.size) - 1
@@ -195,7 +195,7 @@ def _last_of_weight(w, first):
     return last
 
 
-@compiled
+@njit_contract
 def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
     """Ancestor of each point on a walk along the particles in this order."""
     for i in range(order.size):
@@ -205,7 +205,7 @@ def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
         ancestors[i] = order[ancestors[i]]
 
 
-@compiled
+@njit_contract
 def copy_ancestors(X_all, ancestors, X):
     """Make the columns of X (states, particles) those of their ancestors in X_all."""
     for a in range(X.shape[0]):

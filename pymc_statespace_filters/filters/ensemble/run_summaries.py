@@ -6,9 +6,13 @@ import numpy as np
 from numba import carray
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, keep
-from pymc_statespace_filters.filters.ensemble.callbacks import UPDATED, WITNESS_ARGUMENTS, place_of
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract
+from pymc_statespace_filters.filters.ensemble.callbacks import (
+    CALLBACK_ARGUMENTS,
+    UPDATED,
+    searchsorted,
+)
 from pymc_statespace_filters.filters.ensemble.summaries import finite_weights
 from pymc_statespace_filters.filters.ensemble.weights import effective_number
 from pymc_statespace_filters.filters.outcomes import NONE
@@ -25,7 +29,7 @@ def _note_down(counts, numbers, event, j, k, members, log_weights, d, simulated,
     if event > UPDATED:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + R,))[_N_COUNTS:]
-    row = of[_NEXT] = place_of(k, rows, of[_NEXT])
+    row = of[_NEXT] = searchsorted(k, rows, of[_NEXT])
     if row == R or rows[row] != k:
         return
     X = carray(members, (n, N))
@@ -39,12 +43,12 @@ def _note_down(counts, numbers, event, j, k, members, log_weights, d, simulated,
         _moments(w, X, mean[row], cov[row])
 
 
-@compiled
+@njit_contract
 def _size(n, N, R):
     return R * (n + n * n + N * n + N)
 
 
-@compiled
+@njit_contract
 def _parts(numbers, n, N, R):
     """Mean, covariance, members and weights, which lie one after the other."""
     of_cov = R * n
@@ -58,7 +62,7 @@ def _parts(numbers, n, N, R):
     )
 
 
-@compiled
+@njit_contract
 def _moments(w, X, mean, cov):
     """Weighted mean and covariance of the members, the latter over 1 - sum w^2 (Eq. 4.33)."""
     spread = 1.0 - 1.0 / effective_number(w)
@@ -75,7 +79,9 @@ def _moments(w, X, mean, cov):
             cov[a, b] = cov[b, a] = total / spread if spread > 0.0 else 0.0
 
 
-NOTE_DOWN = Entry(_note_down, WITNESS_ARGUMENTS, "note_down_members", digest("note_down_members"))
+NOTE_DOWN = EntryPoint(
+    _note_down, CALLBACK_ARGUMENTS, "note_down_members", digest("note_down_members")
+)
 
 
 def members_kernel(evaluate: Any, n: int, n_members: int) -> Any:
@@ -84,14 +90,14 @@ def members_kernel(evaluate: Any, n: int, n_members: int) -> Any:
     Parameters
     ----------
     evaluate : njit function
-        Of a filter and a system, see `EnsembleFilter.watched`.
+        Of a filter and a system, see `EnsembleFilter.with_callback`.
     n, n_members : int
         Numbers of states and members.
     """
     NOTE_DOWN.compile()
     witness, N = NOTE_DOWN.symbol, n_members
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows):
         R = rows.size
         counts, numbers = np.empty(_N_COUNTS + R, np.int64), np.full(_size(n, N, R), np.nan)
@@ -99,7 +105,7 @@ def members_kernel(evaluate: Any, n: int, n_members: int) -> Any:
         counts[_N_COUNTS:] = rows
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
         terms, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep(counts)
+        keep_alive(counts)
         mean, cov, members, weights = _parts(numbers, n, N, R)
         if health[1] != NONE:
             for row in range(R):

@@ -7,14 +7,14 @@ import numpy as np
 from numba import carray
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import Entry, address_of
-from pymc_statespace_filters.compiler.native.jit import compiled, keep
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.filters.ensemble.callbacks import (
+    CALLBACK_ARGUMENTS,
     FORECAST,
     UPDATED,
-    WITNESS_ARGUMENTS,
-    place_of,
+    searchsorted,
 )
 from pymc_statespace_filters.filters.ensemble.weights import effective_number, normalise
 from pymc_statespace_filters.filters.outcomes import NONE
@@ -34,7 +34,7 @@ def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated,
     if event > of[_LAST]:  # members before resampling say the same, more exactly
         return
     rows = carray(counts, (_N_COUNTS + n_rows,))[_N_COUNTS:]
-    row = of[_NEXT] = place_of(k, rows, of[_NEXT])
+    row = of[_NEXT] = searchsorted(k, rows, of[_NEXT])
     if row == n_rows or rows[row] != k:
         return
     X = carray(members, (n, N))
@@ -42,7 +42,7 @@ def _summarise(counts, numbers, event, j, k, members, log_weights, d, simulated,
     summarise_row(carray(numbers, ((3 * n + 1) * n_rows,)), n_rows, row, X, w, of[_SEED], k)
 
 
-@compiled
+@njit_contract
 def finite_weights(X, log_w):
     """Normalised weights of the members that are finite; all zero if none is."""
     log_w, w = log_w.copy(), np.zeros(log_w.size)
@@ -54,7 +54,7 @@ def finite_weights(X, log_w):
     return w
 
 
-@compiled
+@njit_contract
 def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
     """Write mean, deviation, a draw and the effective number of weighted members to their row.
 
@@ -71,7 +71,7 @@ def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
     numbers[3 * n * n_rows + row] = effective_number(w)
 
 
-@compiled
+@njit_contract
 def _moments(w, X, mean, sd):
     """Weighted mean and deviation of each row, the variance over 1 - sum w^2."""
     spread = 1.0 - 1.0 / effective_number(w)
@@ -87,7 +87,7 @@ def _moments(w, X, mean, sd):
         sd[a] = math.sqrt(variance / spread) if spread > 0.0 else 0.0
 
 
-@compiled
+@njit_contract
 def choose(w, u):
     """The member in whose share of the whole weight a number of (0, 1) falls."""
     chosen, cumulative = 0, 0.0
@@ -100,7 +100,7 @@ def choose(w, u):
     return chosen
 
 
-SUMMARISE = Entry(_summarise, WITNESS_ARGUMENTS, "summarise", digest("summarise"))
+SUMMARISE = EntryPoint(_summarise, CALLBACK_ARGUMENTS, "summarise", digest("summarise"))
 
 
 def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
@@ -109,7 +109,7 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
     Parameters
     ----------
     evaluate : njit function
-        Of a filter and a system, see `EnsembleFilter.watched`.
+        Of a filter and a system, see `EnsembleFilter.with_callback`.
     n, n_members : int
         Numbers of states and members.
     moment : {"predicted", "filtered"}
@@ -117,7 +117,7 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
     SUMMARISE.compile()
     witness, last_event = SUMMARISE.symbol, _LAST_EVENT[moment]
 
-    @compiled
+    @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R = rows.size
         counts, numbers = np.empty(_N_COUNTS + R, np.int64), np.full((3 * n + 1) * R, np.nan)
@@ -126,7 +126,7 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
         counts[_N_COUNTS:] = rows
         watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
         _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep(counts)
+        keep_alive(counts)
         if health[1] != NONE:
             for row in range(R):
                 if rows[row] >= steps[int(health[2])]:
@@ -136,7 +136,7 @@ def summary_kernel(evaluate: Any, n: int, n_members: int, moment: str) -> Any:
     return run
 
 
-@compiled
+@njit_contract
 def forget_row(numbers, n, n_rows, row):
     """Leave a row unknown."""
     for place in range(3):
@@ -145,7 +145,7 @@ def forget_row(numbers, n, n_rows, row):
     numbers[3 * n * n_rows + row] = np.nan
 
 
-@compiled
+@njit_contract
 def results(numbers, n, n_rows, health):
     """What rows were summarised to, as the function of the states gives it."""
     moments = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)

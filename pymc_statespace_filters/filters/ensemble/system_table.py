@@ -6,7 +6,7 @@ import numpy as np
 from numba import carray
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always
 
 N_TABLE = 10
 """Numbers in the table of a system before its free states."""
@@ -33,7 +33,7 @@ class System(NamedTuple):
     observe: int
 
 
-@pasted
+@inline_always
 def read_system(table, dt, theta, n_theta, inputs, n_rows):
     """Prepare the constants and give names to the numbers of a table.
 
@@ -49,32 +49,32 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
     )
 
 
-@pasted
+@inline_always
 def call_members(address, system, k, t, z, width, X, out):
     """Call a function of all members, by the form that all of them have in `lowering.members`."""
     n_members = np.int64(X.shape[1])
     call_address(address, (system.c, system.inputs, k, t, z, width, X, out, n_members))
 
 
-@pasted
+@inline_always
 def initialise(system, z, width, X):
     """Draw every member's state at step 0 from normals at the address z."""
     call_members(system.initialise, system, NOTHING, 0.0, z, width, X, NOTHING)
 
 
-@pasted
+@inline_always
 def propagate(system, k, t, z, width, X):
     """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
     call_members(system.propagate, system, k, t, z, width, X, NOTHING)
 
 
-@pasted
+@inline_always
 def observe(system, k, t, z, width, X, D):
     """Simulate an observation of every member (Eq. 4.15)."""
     call_members(system.observe, system, k, t, z, width, X, D)
 
 
-@pasted
+@inline_always
 def log_density(system, k, t, d, X, log_p):
     """Write log p(d | x) of every member; components of d that are NaN are left out."""
     call_members(system.log_density, system, k, t, d, NOTHING, X, log_p)

@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted, reducing
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
 from pymc_statespace_filters.filters.ensemble.reductions import HALVES, sum_squares, sum_values
 
 
-@compiled
+@njit_contract
 def normalise(log_w, w):
     """Make w and log_w the normalised weights; return the log of their former sum.
 
@@ -41,7 +41,7 @@ def normalise(log_w, w):
     return log_total
 
 
-@reducing
+@njit_reassoc
 def effective_number(w):
     """1 / sum w^2 of normalised weights (thesis, Eq. 4.43)."""
     total = 0.0
@@ -50,24 +50,24 @@ def effective_number(w):
     return 1.0 / total
 
 
-@compiled
-def weigh(log_w, w, own, row):
+@njit_contract
+def weigh(log_w, w, local, row):
     """Leave in w the weights relative to the largest of their block, and three rows of sums.
 
     The rows, for `total_weight`: the log of the largest, and the sums of w and of w^2. NaN and
     +inf are weights of zero, and become so in log_w.
     """
-    n_whole, out = w.size // BLOCK, own.sums[row, own.first_block :]
+    n_whole, out = w.size // BLOCK, local.sums[row, local.first_block :]
     for block in range(n_whole):  # a loop of fixed length becomes straight vector code
-        out[block] = _weigh_block(log_w, w, BLOCK * block, BLOCK, own.lanes)
+        out[block] = _weigh_block(log_w, w, BLOCK * block, BLOCK, local.lanes)
     if BLOCK * n_whole < w.size:
         first = BLOCK * n_whole
-        out[n_whole] = _weigh_block(log_w, w, first, w.size - first, own.lanes)
-    sum_values(w, own, row + 1)
-    sum_squares(w, own, row + 2)
+        out[n_whole] = _weigh_block(log_w, w, first, w.size - first, local.lanes)
+    sum_values(w, local, row + 1)
+    sum_squares(w, local, row + 2)
 
 
-@pasted
+@inline_always
 def _weigh_block(log_w, w, first, n, lanes):
     """Return the largest of n weights, and leave them relative to it."""
     log_block, w_block = log_w[first : first + n], w[first : first + n]
@@ -85,20 +85,20 @@ def _weigh_block(log_w, w, first, n, lanes):
     return largest
 
 
-@pasted
+@inline_always
 def _relative(log_w, largest):
     above = log_w - largest
     return exp(above) if above > EXP_LOWEST else 0.0
 
 
-@compiled
-def total_weight(own, row):
+@njit_contract
+def total_weight(local, row):
     """Log of the sum of all weights, and their effective number (thesis, Eq. 4.43).
 
     From three completed rows of `weigh`; -inf and 0 if every weight is zero. What a block's weights
     are to be multiplied by, so that all are normalised, is left in the first of them.
     """
-    scales, sums, squares = own.sums[row], own.sums[row + 1], own.sums[row + 2]
+    scales, sums, squares = local.sums[row], local.sums[row + 1], local.sums[row + 2]
     largest = -np.inf
     for block in range(scales.size):
         if scales[block] > largest:
@@ -116,11 +116,11 @@ def total_weight(own, row):
     return largest + math.log(all_weight), all_weight * all_weight / all_squares
 
 
-@compiled
-def normalise_own(log_total, log_w, w, own, row):
+@njit_contract
+def normalise_own(log_total, log_w, w, local, row):
     """Make w and log_w normalised weights after `total_weight`, which found ``log_total``."""
     for first in range(0, w.size, BLOCK):
-        scale = own.sums[row, own.first_block + first // BLOCK]
+        scale = local.sums[row, local.first_block + first // BLOCK]
         for i in range(first, min(first + BLOCK, w.size)):
             w[i] *= scale
     for i in range(w.size):

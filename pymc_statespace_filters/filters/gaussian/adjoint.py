@@ -9,13 +9,21 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+)
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
-from pymc_statespace_filters.filters.gaussian.recursion import Recursion, compile_taped, compiled_of
+from pymc_statespace_filters.filters.gaussian.recursion import (
+    GaussianFilterFunctions,
+    compile_taped,
+    compiled_of,
+)
 from pymc_statespace_filters.filters.missing import is_missing
 
 
-def compile_reverse(recursion: Recursion) -> Compiled:
+def compile_reverse(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
     parts = vector_functions(_reverse(recursion))
     parameters, zeros, start_vjp, predict_vjp, update_vjp = (
@@ -50,7 +58,7 @@ def compile_reverse(recursion: Recursion) -> Compiled:
     return compiled_of(reverse, "reverse", parts, recursion)
 
 
-def compile_gradient(recursion: Recursion) -> Compiled:
+def compile_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""
     parts = {"taped": compile_taped(recursion), "reverse": compile_reverse(recursion)}
     taped, reverse = (part.function for part in parts.values())
@@ -62,7 +70,7 @@ def compile_gradient(recursion: Recursion) -> Compiled:
     return compiled_of(gradient, "gradient", parts, recursion)
 
 
-def _reverse(recursion: Recursion) -> dict[str, VectorFunction]:
+def _reverse(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
     """Vector-Jacobian products of the three parts; each adds to ``c_bar``, theta's cotangent.
 
     They are linear in the cotangent, and only the cotangent waits for the step after. An element

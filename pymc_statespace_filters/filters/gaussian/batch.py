@@ -8,17 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled, jit
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
 from pymc_statespace_filters.compiler.codegen.simd import LANES, LANES_AT_ONCE, lane_functions
 from pymc_statespace_filters.compiler.lowering.ensemble import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.filters.gaussian.recursion import Recursion, compile_value, compiled_of
+from pymc_statespace_filters.filters.gaussian.recursion import (
+    GaussianFilterFunctions,
+    compile_value,
+    compiled_of,
+)
 from pymc_statespace_filters.filters.missing import is_missing
 from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
 
 
-def compile_batch(recursion: Recursion) -> Compiled:
+def compile_batch(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta (B, k), steps, observed, inputs, t0, seed) -> terms, health."""
     try:
         group = _lanes(recursion)
@@ -39,7 +43,7 @@ def compile_batch(recursion: Recursion) -> Compiled:
     return compiled_of(batch, "batch", {"group": group}, recursion)
 
 
-def _one_by_one(value: Compiled) -> Compiled:
+def _one_by_one(value: CompiledFunction) -> CompiledFunction:
     run = value.function
 
     @jit
@@ -47,10 +51,10 @@ def _one_by_one(value: Compiled) -> Compiled:
         for i in range(theta.shape[0]):
             terms[i], health[i] = run(theta[i].copy(), steps, observed, inputs, t0, seed)
 
-    return Compiled(group, key_of("one by one", value.key))
+    return CompiledFunction(group, key_of("one by one", value.key))
 
 
-def _lanes(recursion: Recursion) -> Compiled:
+def _lanes(recursion: GaussianFilterFunctions) -> CompiledFunction:
     functions = {name: f for name, f in recursion.parts().items() if name != "parameters"}
     lanes = lane_functions(functions, recursion.size)
     start, predict, update = lanes.functions.values()
@@ -98,10 +102,10 @@ def _lanes(recursion: Recursion) -> Compiled:
             if not alive.any():
                 break
 
-    return Compiled(group, key_of("lanes", lanes.key, valid.key))
+    return CompiledFunction(group, key_of("lanes", lanes.key, valid.key))
 
 
-def _finite_mean(recursion: Recursion) -> Any:
+def _finite_mean(recursion: GaussianFilterFunctions) -> Any:
     """``is_finite(W, finite)``: whether the mean is, lane by lane."""
     first, n = recursion.system.n_theta, recursion.system.n
 

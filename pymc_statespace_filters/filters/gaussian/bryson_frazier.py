@@ -36,25 +36,25 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
 from pymc_statespace_filters.filters.gaussian.linearization import (
-    Sight,
+    Innovation,
     Symbols,
-    move_from,
+    innovation_moments,
+    linearize_transition,
     pack,
-    sight_from,
     unpack,
 )
-from pymc_statespace_filters.filters.gaussian.recursion import Recursion
+from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
 
 
 class BrysonFrazier:
-    """The functions of the smoother of a Gaussian filter, which is given as a `Recursion`.
+    """The functions of the smoother that belongs to a Gaussian filter.
 
     The vector ``s`` is the filter's, then the simulated error (n,); the adjoint ``s_bar`` is l, the
     lower triangle of L, then l*. ``Z`` holds the noises of each step in its columns: q, then
     standard normals for v.
     """
 
-    def __init__(self, recursion: Recursion) -> None:
+    def __init__(self, recursion: GaussianFilterFunctions) -> None:
         self.recursion = recursion
         system, size = recursion.system, recursion.size
         graphs = (recursion.start.graph, recursion.predict.graph, recursion.update.graph)
@@ -123,8 +123,8 @@ class BrysonFrazier:
         """Outputs that were written in the filter's ``s`` and an error, as a function of both."""
         size, s = self.recursion.size, self._symbols["s"]
         parts = {s: self._whole[:size], self._error: self._whole[size:]}
-        own = {"s": self._whole, "tape": self._whole, "s_bar": self._adjoint, "z": self._z}
-        inputs = {name: own.get(name, self._symbols.get(name)) for name in names.split()}
+        local = {"s": self._whole, "tape": self._whole, "s_bar": self._adjoint, "z": self._z}
+        inputs = {name: local.get(name, self._symbols.get(name)) for name in names.split()}
         whole = graph_replace(list(outputs), parts, strict=False)
         return VectorFunction(arguments, Graph(inputs, whole), scalar or (False,))
 
@@ -137,17 +137,17 @@ class BrysonFrazier:
 
     def _moved_error(self) -> TensorVariable:
         system, (mean, _) = self.recursion.system, self._moments()
-        move = move_from(system, self._symbols, mean)
+        move = linearize_transition(system, self._symbols, mean)
         moved = move.state_jac @ self._error
         return moved + move.noise_jac @ self._z[: system.m] if system.m else moved
 
-    def _sight(self) -> tuple[Sight, TensorVariable]:
+    def _sight(self) -> tuple[Innovation, TensorVariable]:
         """The linearised observation, and the innovation y+ of the simulated record.
 
         Where nothing was seen y+ is noise alone, which the gain and H leave out.
         """
         system = self.recursion.system
-        sight = sight_from(system, self._symbols, *self._moments())
+        sight = innovation_moments(system, self._symbols, *self._moments())
         noise = cholesky(sight.noise_cov, lower=True) @ self._z[system.m :]
         return sight, sight.seen_jac @ self._error + noise
 
@@ -157,7 +157,9 @@ class BrysonFrazier:
 
     def _unmoved(self) -> TensorVariable:
         vector, matrix, drawn = self._adjoints()
-        back = move_from(self.recursion.system, self._symbols, self._moments()[0]).state_jac.T
+        back = linearize_transition(
+            self.recursion.system, self._symbols, self._moments()[0]
+        ).state_jac.T
         return pt.concatenate([pack(back @ vector, back @ matrix @ back.T), back @ drawn])
 
     def _unseen(self) -> TensorVariable:

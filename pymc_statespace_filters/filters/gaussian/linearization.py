@@ -38,7 +38,7 @@ def unpack(s: TensorVariable, n: int) -> tuple[TensorVariable, TensorVariable]:
     return s[:n], s[n:][where]
 
 
-class Move(NamedTuple):
+class LinearizedTransition(NamedTuple):
     """One step from a mean on: x' = mean + A (x - mean before) + B q (Eq. 4.9)."""
 
     mean: TensorVariable
@@ -46,7 +46,7 @@ class Move(NamedTuple):
     noise_jac: TensorVariable
 
 
-class Sight(NamedTuple):
+class Innovation(NamedTuple):
     """One observation: residual = C (x - mean) + e, e ~ N(0, noise_cov), with Kalman's gain.
 
     Rows of C are zero for what was not seen.
@@ -62,16 +62,18 @@ class Sight(NamedTuple):
     kept: TensorVariable
 
 
-def move_from(system: StateSpaceModel, values: Symbols, mean: TensorVariable) -> Move:
+def linearize_transition(
+    system: StateSpaceModel, values: Symbols, mean: TensorVariable
+) -> LinearizedTransition:
     """Eqs. 4.8-4.10, at the mean of the state before the step."""
     q = pt.zeros((system.m,))
     forecast = call(system.equations.transition, system, {**values, "x": mean, "q": q})
-    return Move(forecast, jacobian_of(forecast, mean), jacobian_of(forecast, q))
+    return LinearizedTransition(forecast, jacobian_of(forecast, mean), jacobian_of(forecast, q))
 
 
-def sight_from(
+def innovation_moments(
     system: StateSpaceModel, values: Symbols, mean: TensorVariable, cov: TensorVariable
-) -> Sight:
+) -> Innovation:
     """Eqs. 4.3-4.7, at the mean of the forecast."""
     expected, noise_cov = observation_moments(system, {**values, "x": mean})
     seen_jac = jacobian_of(expected, mean)
@@ -83,4 +85,4 @@ def sight_from(
     half = solve_triangular(chol, seen_jac @ cov, lower=True, b_ndim=2)
     gain = solve_triangular(chol.T, half, lower=False, b_ndim=2).T
     kept = pt.eye(system.n) - gain @ seen_jac
-    return Sight(residual, seen, seen_jac, noise_cov, innovation_cov, chol, gain, kept)
+    return Innovation(residual, seen, seen_jac, noise_cov, innovation_cov, chol, gain, kept)

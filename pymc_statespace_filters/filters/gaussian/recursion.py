@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    Compiled,
+    CompiledFunction,
     Graph,
     VectorFunction,
     jit,
@@ -25,7 +25,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class Recursion:
+class GaussianFilterFunctions:
     """The functions of a filter for one system; the first ``system.n`` entries of s are the mean.
 
     * ``start(c) -> s`` at step 0; ``c`` are the parameters.
@@ -106,22 +106,24 @@ def _tape_to_the_end(size: int) -> _Tape:
     return _Tape(jit(new), save, jit(result))
 
 
-def compile_value(recursion: Recursion) -> Compiled:
+def compile_value(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
     return _compile_forward(recursion, "value", _no_tape())
 
 
-def compile_taped(recursion: Recursion) -> Compiled:
+def compile_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The same function, with the tape as a third result."""
     return _compile_forward(recursion, "taped", _tape(recursion.size))
 
 
-def compile_taped_to_the_end(recursion: Recursion) -> Compiled:
+def compile_taped_to_the_end(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The same with a tape that holds the last state too, and is there if the filter fails."""
     return _compile_forward(recursion, "taped to the end", _tape_to_the_end(recursion.size))
 
 
-def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
+def _compile_forward(
+    recursion: GaussianFilterFunctions, what: str, tape: _Tape
+) -> CompiledFunction:
     parts = vector_functions(recursion.parts())
     parameters, start, predict, update = (part.function for part in parts.values())
     valid = covariance_check(recursion.system)
@@ -165,8 +167,11 @@ def _compile_forward(recursion: Recursion, what: str, tape: _Tape) -> Compiled:
 
 
 def compiled_of(
-    function: Any, what: str, parts: Mapping[str, Compiled], recursion: Recursion
-) -> Compiled:
+    function: Any,
+    what: str,
+    parts: Mapping[str, CompiledFunction],
+    recursion: GaussianFilterFunctions,
+) -> CompiledFunction:
     """Compile a function that is made of parts of a recursion."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
-    return Compiled(jit(function), key_of(what, *(part.key for part in parts.values())))
+    return CompiledFunction(jit(function), key_of(what, *(part.key for part in parts.values())))

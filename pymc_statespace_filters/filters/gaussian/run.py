@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import Compiled
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.filters.gaussian.recursion import (
-    Recursion,
+    GaussianFilterFunctions,
     compile_taped_to_the_end,
     compiled_of,
 )
 
 
-def compile_run(recursion: Recursion) -> Compiled:
+def compile_run(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
 
     See `filters`, the room, for what it returns.

@@ -10,7 +10,7 @@ import numpy as np
 import pytensor.tensor as pt
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    Compiled,
+    CompiledFunction,
     Graph,
     VectorFunction,
     jit,
@@ -24,7 +24,7 @@ from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
-from pymc_statespace_filters.filters.gaussian.recursion import Recursion, compiled_of
+from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions, compiled_of
 from pymc_statespace_filters.filters.missing import is_missing
 from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -34,21 +34,21 @@ _ALONG, _AT_START = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
-class StatesPass:
+class ForwardPass:
     """What the states of all moments begin with: compiled once for a system."""
 
     smoother: BrysonFrazier
-    noise: Compiled
-    forwards: Compiled
+    noise: CompiledFunction
+    forwards: CompiledFunction
 
 
-def states_pass(recursion: Recursion) -> StatesPass:
+def states_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
     """The pass forwards of a filter."""
     smoother = BrysonFrazier(recursion)
-    return StatesPass(smoother, _noise(recursion.system), _forwards(smoother))
+    return ForwardPass(smoother, _noise(recursion.system), _forwards(smoother))
 
 
-def compile_states(begin: StatesPass, moment: str) -> Compiled:
+def compile_states(begin: ForwardPass, moment: str) -> CompiledFunction:
     """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
     recursion = begin.smoother.recursion
     if moment == "smoothed":
@@ -74,7 +74,7 @@ def compile_states(begin: StatesPass, moment: str) -> Compiled:
     return compiled_of(states, f"states {moment}", parts, recursion)
 
 
-def _forwards(smoother: BrysonFrazier) -> Compiled:
+def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
     """The filter and a simulated error of it along a record; ``end`` is the first step lost."""
     system, size = smoother.recursion.system, smoother.size
     parts = vector_functions(smoother.forwards())
@@ -114,10 +114,10 @@ def _forwards(smoother: BrysonFrazier) -> Compiled:
         return before, after, n_steps + 1, health
 
     key = key_of(f"forwards {dt!r} {n}", valid.key, *(part.key for part in parts.values()))
-    return Compiled(jit(forwards), key)
+    return CompiledFunction(jit(forwards), key)
 
 
-def _read_forwards(n: int, *, predicted: bool) -> Compiled:
+def _read_forwards(n: int, *, predicted: bool) -> CompiledFunction:
     """Write what the filter knew at the rows, and return how many have a state."""
     size = n + n * (n + 1) // 2
 
@@ -139,10 +139,10 @@ def _read_forwards(n: int, *, predicted: bool) -> Compiled:
                 drawn[r, i] = s[i] + s[size + i]
         return rows.size
 
-    return Compiled(jit(read), key_of(f"read forwards {n} {predicted}"))
+    return CompiledFunction(jit(read), key_of(f"read forwards {n} {predicted}"))
 
 
-def _read_backwards(smoother: BrysonFrazier) -> Compiled:
+def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
     """Write what all data say of the rows; nothing where the filter failed."""
     system = smoother.recursion.system
     parts = vector_functions(smoother.backwards())
@@ -177,10 +177,10 @@ def _read_backwards(smoother: BrysonFrazier) -> Compiled:
         return rows.size
 
     key = key_of(f"read backwards {dt!r} {n}", *(part.key for part in parts.values()))
-    return Compiled(jit(read), key)
+    return CompiledFunction(jit(read), key)
 
 
-def _noise(system: StateSpaceModel) -> Compiled:
+def _noise(system: StateSpaceModel) -> CompiledFunction:
     """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (m + p, steps).
 
     The first m rows of Z have the covariance of q. The roots are those of the user's covariances,
@@ -210,7 +210,7 @@ def _noise(system: StateSpaceModel) -> Compiled:
         return X, Z
 
     key = key_of(f"noise of states {n} {m} {n_rows}", flat.key, FILL_NORMALS.key)
-    return Compiled(jit(noise), key)
+    return CompiledFunction(jit(noise), key)
 
 
 @jit

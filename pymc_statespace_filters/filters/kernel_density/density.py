@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     LOG_TWO_PI,
@@ -41,7 +41,7 @@ _KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a v
 _LINE_FROM, _PLANE_FROM = 64, 256  # members from which a lattice is at least twice as fast
 
 
-@pasted
+@inline_always
 def _by_lattice(n_active, n_members):
     least = _LINE_FROM if n_active == 1 else _PLANE_FROM
     return 1 <= n_active <= 2 and n_members >= least
@@ -64,27 +64,27 @@ class Kernel(NamedTuple):
     active: np.ndarray
 
 
-@pasted
+@inline_always
 def kernel_workspace(n, n_free):
     """A kernel to be filled by ``scott_bandwidth``."""
     return Kernel(np.empty(n), np.empty((n_free, n_free)), np.empty(n_free, np.bool_))
 
 
-@compiled
-def density_workspace(own, n):
+@njit_contract
+def density_workspace(local, n):
     """Scratch of ``log_kernel_density`` for n directions.
 
     The members and their weights, the targets and the logs of the sums at them, of all ranks.
     """
-    n_ranks, width = own.share.n_ranks, BLOCK * own.sums.shape[1]
-    sources = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
-    targets = Points(np.empty((1 + n, width)), own.n_members, n_ranks == 1)
+    n_ranks, width = local.layout.n_ranks, BLOCK * local.sums.shape[1]
+    sources = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
+    targets = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
     exact, lattice = kernel_sum_workspace(width), lattice_workspace(n_ranks, width)
     return sources, targets, (exact, lattice, tilted_workspace(n_ranks, n, width))
 
 
-@compiled
-def scott_bandwidth(own, row, spread, n_effective, free, kernel):
+@njit_contract
+def scott_bandwidth(local, row, spread, n_effective, free, kernel):
     """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39); the mean is given.
 
     From completed rows of ``sum_products`` of all states, to be divided by ``spread``. Returns
@@ -95,7 +95,7 @@ def scott_bandwidth(own, row, spread, n_effective, free, kernel):
     for a in range(free.size):
         floor[a] = (_KNOWN * x_mean[free[a]]) ** 2
         for b in range(free.size):
-            H[a, b] = total(own, row + free[a] * x_mean.size + free[b]) / spread
+            H[a, b] = total(local, row + free[a] * x_mean.size + free[b]) / spread
     if not semidefinite_cholesky(H, floor, active):
         return False
     scott = n_effective ** (-1.0 / (count_true(active) + 4))
@@ -105,7 +105,7 @@ def scott_bandwidth(own, row, spread, n_effective, free, kernel):
     return True
 
 
-@compiled
+@njit_contract
 def _whiten(kernel, free, X, first, out):
     """Leave H^-1 (X - mean) / sqrt(2) of the active directions in rows of ``out``, from 1 on.
 
@@ -124,43 +124,43 @@ def _whiten(kernel, free, X, first, out):
             y[i] = (_SQRT_HALF * scale) * (x[i] - x_0)
         for b in range(a):
             if active[b]:
-                share, z = scale * H[a, b], out[before, first:last]
+                layout, z = scale * H[a, b], out[before, first:last]
                 for i in range(x.size):
-                    y[i] -= share * z[i]
+                    y[i] -= layout * z[i]
                 before += 1
         n_rows += 1
     return n_rows
 
 
-@pasted
-def _sum_exactly(share, sources, targets, n_dims, first, logs, work):
+@inline_always
+def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
     """Logs of the sums at a rank's own targets, which begin at the column ``first``."""
-    complete_points(share, sources, n_dims)
+    complete_points(layout, sources, n_dims)
     y, v = sources.rows[1:], targets.rows[1:]
     _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
     for i in range(logs.size):
         logs[i] = log_kernel_sum(y, n_dims, n_blocks, v, first + i, work)
 
 
-@compiled
-def log_kernel_density(own, w, X, V, free, kernel, work, out):
+@njit_contract
+def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 
     All are a rank's own; the density is that of the particles of all ranks. Members of zero weight
     are left out, and may be NaN. A target that is not finite gets -inf.
     """
     sources, targets, sums = work
-    first, last = own.first, own.first + own.size
+    first, last = local.first, local.first + local.size
     own_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
     for i in range(w.size):
         own_w[i] = w[i]
     n_dims = _whiten(kernel, free, X, first, sources.rows)
     _whiten(kernel, free, V, first, targets.rows)
     if not (
-        _by_lattice(n_dims, own.n_members)
-        and log_lattice_sums(own.share, sources, targets, n_dims, sums)
+        _by_lattice(n_dims, local.n_members)
+        and log_lattice_sums(local.layout, sources, targets, n_dims, sums)
     ):
-        _sum_exactly(own.share, sources, targets, n_dims, first, logs, sums[0])
+        _sum_exactly(local.layout, sources, targets, n_dims, first, logs, sums[0])
     log_kernel = 0.0
     for a in range(free.size):
         if kernel.active[a]:

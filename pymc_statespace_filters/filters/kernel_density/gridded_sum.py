@@ -24,15 +24,15 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
     MEMBERS,
-    Share,
-    complete,
-    part,
+    RankLayout,
+    allgather,
+    local_range,
 )
 from pymc_statespace_filters.filters.kernel_density.points import complete_points
 from pymc_statespace_filters.filters.kernel_density.simd_windows import (
@@ -69,7 +69,7 @@ _POINTS_PER_UNIT = math.sqrt(2.0) / SPACING  # coordinates come divided by the r
 _WITHIN = _FAR * math.sqrt(0.5)
 
 
-@compiled
+@njit_contract
 def lattice_workspace(n_ranks, width):
     """Scratch of ``lattice_sums`` for a padded number of members.
 
@@ -84,7 +84,7 @@ def lattice_workspace(n_ranks, width):
     return bells, lanes, ranges, (np.empty(2), np.empty(2)), (np.empty((1, room)), np.empty(room))
 
 
-@compiled
+@njit_contract
 def _range(y, w, least, lanes):
     """The smallest and the largest finite y of weights above ``least``."""
     low, high = lanes
@@ -103,24 +103,24 @@ def _range(y, w, least, lanes):
     return low[0], high[0]
 
 
-@pasted
-def _find_ranges(share, sources, targets, n_dims, lanes, ranges):
+@inline_always
+def _find_ranges(layout, sources, targets, n_dims, lanes, ranges):
     """Lowest and highest of members and of targets in each direction, as each rank finds them.
 
     The sums of the targets are zeros.
     """
-    y_first, y_last = part(share, sources.size, MEMBERS)
-    v_first, v_last = part(share, targets.size, MEMBERS)
+    y_first, y_last = local_range(layout, sources.size, MEMBERS)
+    v_first, v_last = local_range(layout, targets.size, MEMBERS)
     w, zeros = sources.rows[0, y_first:y_last], targets.rows[0, v_first:v_last]
     for a in range(n_dims):
         y, v = sources.rows[1 + a, y_first:y_last], targets.rows[1 + a, v_first:v_last]
-        found = ranges[4 * a : 4 * a + 4, share.rank]
+        found = ranges[4 * a : 4 * a + 4, layout.rank]
         found[0], found[1] = _range(y, w, _NEGLIGIBLE, lanes)
         found[2], found[3] = _range(v, zeros, -1.0, lanes)
-    complete(share, ranges[: 4 * n_dims], BLOCKS)
+    allgather(layout, ranges[: 4 * n_dims], BLOCKS)
 
 
-@pasted
+@inline_always
 def _extent(ranges):
     """Where the lattice must be: its first coordinate, and a number of points.
 
@@ -139,7 +139,7 @@ def _extent(ranges):
     return first, LANES * np.floor(steps / LANES + (1 + POINTS / LANES))
 
 
-@compiled
+@njit_contract
 def _place(y, first, n_points, cell, lead, ratio):
     """The windows at coordinates: first cell, lead and ratio. Outside the lead is zero."""
     last = n_points - POINTS
@@ -156,13 +156,13 @@ def _place(y, first, n_points, cell, lead, ratio):
         ratio[i] = exp(STEEPNESS * (r - 1.0))
 
 
-@pasted
+@inline_always
 def _weigh(w, lead):
     for i in range(w.size):
         lead[i] *= w[i] if w[i] > _NEGLIGIBLE else 0.0
 
 
-@pasted
+@inline_always
 def _add_members(bells, n, n_dims, stride, lattice):
     cell, lead, ratio = bells
     for i in range(n):
@@ -175,7 +175,7 @@ def _add_members(bells, n, n_dims, stride, lattice):
                 add_to_plane(lattice, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
 
 
-@pasted
+@inline_always
 def _choose_lattices(n_members, n_points):
     """How many lattices share the members: a power of two, as numbers of ranks often are."""
     n_lattices = 1
@@ -186,7 +186,7 @@ def _choose_lattices(n_members, n_points):
     return n_lattices
 
 
-@pasted
+@inline_always
 def _add_stretch(sources, i, j, n_dims, place, bells, lattice):
     """Make a lattice of the members from i on to before j."""
     (first, extent), (cell, lead, ratio) = place, bells
@@ -198,25 +198,25 @@ def _add_stretch(sources, i, j, n_dims, place, bells, lattice):
     _add_members(bells, j - i, n_dims, np.int64(extent[0]) + 2 * _BLUR, lattice)
 
 
-@pasted
-def _add_all(share, sources, n_dims, n_points, place, bells, lattices):
+@inline_always
+def _add_all(layout, sources, n_dims, n_points, place, bells, lattices):
     """The sum of the lattices of all members, of n_points each.
 
     The members of a lattice are those that a rank would have if there were as many ranks: where
     each rank has as many lattices, their members are its own.
     """
     n_lattices = _choose_lattices(sources.size, n_points)
-    if not sources.known and n_lattices % share.n_ranks != 0:
-        complete_points(share, sources, n_dims)
+    if not sources.known and n_lattices % layout.n_ranks != 0:
+        complete_points(layout, sources, n_dims)
     begin, end = np.int64(0), np.int64(1)
     if n_lattices > 1:
-        begin, end = part(share, n_lattices, BLOCKS)
+        begin, end = local_range(layout, n_lattices, BLOCKS)
     for m in range(begin, end):
-        i, j = part(Share(m, n_lattices, 0), sources.size, MEMBERS)
+        i, j = local_range(RankLayout(m, n_lattices, 0), sources.size, MEMBERS)
         lattice = lattices[0, m * n_points : (m + 1) * n_points]
         _add_stretch(sources, i, j, n_dims, place, bells, lattice)
     if n_lattices > 1:
-        complete(share, lattices[:, : n_lattices * n_points], n_points)
+        allgather(layout, lattices[:, : n_lattices * n_points], n_points)
     total = lattices[0]
     for m in range(1, n_lattices):
         lattice = lattices[0, m * n_points : (m + 1) * n_points]
@@ -225,7 +225,7 @@ def _add_all(share, sources, n_dims, n_points, place, bells, lattices):
     return total
 
 
-@pasted
+@inline_always
 def _sum_targets(bells, n_dims, start, stride, lattice, out):
     cell, lead, ratio = bells
     for i in range(out.size):
@@ -239,7 +239,7 @@ def _sum_targets(bells, n_dims, start, stride, lattice, out):
             )
 
 
-@pasted
+@inline_always
 def _blur(n_dims, columns, rows, lattice, other):
     """Blur ``lattice``, which has room for the taps beside its rows.
 
@@ -259,8 +259,8 @@ def _blur(n_dims, columns, rows, lattice, other):
     return lattice, 0
 
 
-@compiled
-def lattice_sums(share, sources, targets, n_dims, work):
+@njit_contract
+def lattice_sums(layout, sources, targets, n_dims, work):
     """sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
 
     Zero where it is not known. What a rank needs to know of others' members it learns here. Returns
@@ -268,11 +268,11 @@ def lattice_sums(share, sources, targets, n_dims, work):
     """
     bells, lanes, ranges, (first, extent), (lattices, other) = work
     cell, lead, ratio = bells
-    begin, end = part(share, targets.size, MEMBERS)
+    begin, end = local_range(layout, targets.size, MEMBERS)
     sums = targets.rows[0, begin:end]
     for i in range(sums.size):
         sums[i] = 0.0
-    _find_ranges(share, sources, targets, n_dims, lanes, ranges)
+    _find_ranges(layout, sources, targets, n_dims, lanes, ranges)
     extent[1] = 1.0
     for a in range(n_dims):
         first[a], extent[a] = _extent(ranges[4 * a : 4 * a + 4])
@@ -283,7 +283,7 @@ def lattice_sums(share, sources, targets, n_dims, work):
         return False
     columns, rows = np.int64(extent[0]), np.int64(extent[1])
     n_added, place = rows * (columns + 2 * _BLUR), (first, extent)
-    lattice = _add_all(share, sources, n_dims, n_added, place, bells, lattices)
+    lattice = _add_all(layout, sources, n_dims, n_added, place, bells, lattices)
     blurred, start = _blur(n_dims, columns, rows, lattice, other)
     for a in range(n_dims):
         v = targets.rows[1 + a, begin:end]

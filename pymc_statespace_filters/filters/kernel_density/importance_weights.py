@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.filters.ensemble.kalman_update import equal_weights
 from pymc_statespace_filters.filters.ensemble.reductions import (
     exchange,
@@ -41,17 +41,17 @@ class Scratch(NamedTuple):
     density: tuple
 
 
-@pasted
-def nudging_workspace(system, own):
+@inline_always
+def nudging_workspace(system, local):
     """Scratch of one update."""
-    n, p, N = system.n, system.p, own.size
+    n, p, N = system.n, system.p, local.size
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    density = density_workspace(own, system.free.size)
+    density = density_workspace(local, system.free.size)
     return Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
 
 
-@pasted
-def weigh_nudged(system, k, t, d, members, forecast, own, scratch, keeps_previous):
+@inline_always
+def weigh_nudged(system, k, t, d, members, forecast, local, scratch, keeps_previous):
     """Leave the unnormalised weights of X in log_w and p(d | x^a) in log_p.
 
     ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if
@@ -62,11 +62,11 @@ def weigh_nudged(system, k, t, d, members, forecast, own, scratch, keeps_previou
     free, n, n_alive = system.free, system.n, forecast.n_alive
     kernel_f, kernel_a = kernel_workspace(n, free.size), kernel_workspace(n, free.size)
     equal_weights(alive, n_alive, w_equal)
-    if not _set_bandwidths(members, w_equal, forecast, free, own, scratch, kernel_f, kernel_a):
+    if not _set_bandwidths(members, w_equal, forecast, free, local, scratch, kernel_f, kernel_a):
         return False
     log_density(system, k, t, d, X, log_p)
-    log_kernel_density(own, w, X_f, X, free, kernel_f, density, log_prior)
-    log_kernel_density(own, w_equal, X, X, free, kernel_a, density, log_proposal)
+    log_kernel_density(local, w, X_f, X, free, kernel_f, density, log_prior)
+    log_kernel_density(local, w_equal, X, X, free, kernel_a, density, log_proposal)
     for i in range(w.size):
         share = log_w[i] if keeps_previous else -math.log(n_alive)
         log_weight = share + log_p[i] + (log_prior[i] - log_proposal[i])
@@ -74,26 +74,26 @@ def weigh_nudged(system, k, t, d, members, forecast, own, scratch, keeps_previou
     return True
 
 
-@pasted
-def _set_bandwidths(members, w_equal, forecast, free, own, scratch, kernel_f, kernel_a):
+@inline_always
+def _set_bandwidths(members, w_equal, forecast, free, local, scratch, kernel_f, kernel_a):
     X, _, X_f, w, _, _, _ = members
     n, n_alive = X.shape[0], forecast.n_alive
-    sum_members(w_equal, X, own, 0)
-    exchange(own, n)
-    means(own, 0, 1.0, kernel_a.mean)
+    sum_members(w_equal, X, local, 0)
+    exchange(local, n)
+    means(local, 0, 1.0, kernel_a.mean)
     for a in range(n):
         kernel_f.mean[a] = scratch.moments[0][a]
-    sum_products(w_equal, X, kernel_a.mean, X, kernel_a.mean, own, 0)
-    sum_products(w, X_f, kernel_f.mean, X_f, kernel_f.mean, own, n * n)
-    exchange(own, 2 * n * n)
+    sum_products(w_equal, X, kernel_a.mean, X, kernel_a.mean, local, 0)
+    sum_products(w, X_f, kernel_f.mean, X_f, kernel_f.mean, local, n * n)
+    exchange(local, 2 * n * n)
     return (
-        scott_bandwidth(own, 0, 1.0 - 1.0 / n_alive, n_alive, free, kernel_a)  # Eq. 4.38
-        and scott_bandwidth(own, n * n, forecast.spread, forecast.n_effective, free, kernel_f)
+        scott_bandwidth(local, 0, 1.0 - 1.0 / n_alive, n_alive, free, kernel_a)  # Eq. 4.38
+        and scott_bandwidth(local, n * n, forecast.spread, forecast.n_effective, free, kernel_f)
         and _agree(kernel_a.active, kernel_f.active)
     )
 
 
-@compiled
+@njit_contract
 def _agree(spreads_a, spreads_f):
     """Whether two ensembles spread in the same directions."""
     for a in range(spreads_a.size):

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import pasted
-from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, complete
+from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
 
 
 class Points(NamedTuple):
@@ -20,7 +20,7 @@ class Points(NamedTuple):
     known: bool
 
 
-@pasted
-def complete_points(share, points, n_dims):
+@inline_always
+def complete_points(layout, points, n_dims):
     """Let all ranks know numbers and coordinates of all points."""
-    complete(share, points.rows[: 1 + n_dims], MEMBERS)
+    allgather(layout, points.rows[: 1 + n_dims], MEMBERS)

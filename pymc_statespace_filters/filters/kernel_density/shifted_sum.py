@@ -14,9 +14,14 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import compiled, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp, log
-from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, MEMBERS, complete, part
+from pymc_statespace_filters.filters.ensemble.partition import (
+    BLOCKS,
+    MEMBERS,
+    allgather,
+    local_range,
+)
 from pymc_statespace_filters.filters.kernel_density.direct_sum import compact, log_kernel_sum
 from pymc_statespace_filters.filters.kernel_density.gridded_sum import FLOOR, lattice_sums
 from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
@@ -25,7 +30,7 @@ _LOG_FLOOR = math.log(FLOOR)
 _FEW = 64  # exact sums that cost less than another lattice; both grow with the number of members
 
 
-@compiled
+@njit_contract
 def tilted_workspace(n_ranks, n, width):
     """Scratch of ``log_lattice_sums``.
 
@@ -35,10 +40,10 @@ def tilted_workspace(n_ranks, n, width):
     return missed, counts, np.empty((1 + n, width)), np.empty(n), np.empty((1, width))
 
 
-@pasted
-def _take_logs(share, targets):
+@inline_always
+def _take_logs(layout, targets):
     """Replace a rank's own sums by their logs; return how many are below the floor."""
-    begin, end = part(share, targets.size, MEMBERS)
+    begin, end = local_range(layout, targets.size, MEMBERS)
     sums, n_missed = targets.rows[0, begin:end], 0
     for i in range(sums.size):
         sums[i] = log(sums[i])
@@ -46,17 +51,17 @@ def _take_logs(share, targets):
     return n_missed
 
 
-@pasted
-def _total(share, counts, count):
-    counts[0, share.rank] = count
-    complete(share, counts, BLOCKS)
+@inline_always
+def _total(layout, counts, count):
+    counts[0, layout.rank] = count
+    allgather(layout, counts, BLOCKS)
     total = 0.0
     for rank in range(counts.size):
         total += counts[0, rank]
     return np.int64(total)
 
 
-@compiled
+@njit_contract
 def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, shift):
     """The shift for the targets ``missed``; False if none of them is finite."""
     n_sources, n_blocks = members
@@ -79,7 +84,7 @@ def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, 
     return np.isfinite(log_total)
 
 
-@pasted
+@inline_always
 def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
     """Leave w_l exp(2 t.y_l), normalised, in ``weights``; return the log of their sum."""
     largest = -np.inf
@@ -97,8 +102,8 @@ def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
     return largest + math.log(total)
 
 
-@pasted
-def _sum_shifted(share, members, sources, targets, n_missed, n_dims, works):
+@inline_always
+def _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works):
     """Sums at shifted targets; returns how many targets are still missed."""
     sum_work, lattice_work, (missed, _, shifted, shift, _) = works
     y, v, some = sources.rows[1:], targets.rows[1:], missed[:n_missed]
@@ -109,10 +114,10 @@ def _sum_shifted(share, members, sources, targets, n_missed, n_dims, works):
         for k in range(n_missed):
             shifted[1 + a, k] = v[a, some[k]] - shift[a]
     tilted, at = Points(sources.rows, members[0], True), Points(shifted, n_missed, True)
-    if not lattice_sums(share, tilted, at, n_dims, lattice_work):
+    if not lattice_sums(layout, tilted, at, n_dims, lattice_work):
         return n_missed
-    _take_logs(share, at)
-    complete(share, shifted[:1, :n_missed], MEMBERS)
+    _take_logs(layout, at)
+    allgather(layout, shifted[:1, :n_missed], MEMBERS)
     n_left = 0
     for k in range(n_missed):
         i, log_sum = some[k], shifted[0, k]
@@ -126,12 +131,12 @@ def _sum_shifted(share, members, sources, targets, n_missed, n_dims, works):
     return n_left
 
 
-@pasted
-def _sum_tails(share, sources, targets, n_dims, works):
+@inline_always
+def _sum_tails(layout, sources, targets, n_dims, works):
     """Sums at the targets that a lattice over the cloud has missed; all ranks know all of them."""
     sum_work, _, (missed, _, _, _, exact) = works
-    complete_points(share, sources, n_dims)
-    complete_points(share, targets, n_dims)
+    complete_points(layout, sources, n_dims)
+    complete_points(layout, targets, n_dims)
     logs, y, v = targets.rows[0], sources.rows[1:], targets.rows[1:]
     n_missed = 0
     for i in range(targets.size):
@@ -140,27 +145,27 @@ def _sum_tails(share, sources, targets, n_dims, works):
             n_missed += 1
     members = compact(sources.rows[0, : sources.size], y, n_dims, sum_work)
     if n_missed > _FEW:
-        n_missed = _sum_shifted(share, members, sources, targets, n_missed, n_dims, works)
+        n_missed = _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works)
     if n_missed == 0:
         return
-    begin, end = part(share, n_missed, BLOCKS)
+    begin, end = local_range(layout, n_missed, BLOCKS)
     for k in range(begin, end):
         exact[0, k] = log_kernel_sum(y, n_dims, members[1], v, missed[k], sum_work)
-    complete(share, exact[:, :n_missed], BLOCKS)
+    allgather(layout, exact[:, :n_missed], BLOCKS)
     for k in range(n_missed):
         logs[missed[k]] = exact[0, k]
 
 
-@pasted
-def log_lattice_sums(share, sources, targets, n_dims, works):
+@inline_always
+def log_lattice_sums(layout, sources, targets, n_dims, works):
     """log sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
 
     ``sources`` and ``targets`` are `Points`; the sums go to the latter. Returns False if the
     lattice would be too large.
     """
     _, lattice_work, (_, counts, _, _, _) = works
-    if not lattice_sums(share, sources, targets, n_dims, lattice_work):
+    if not lattice_sums(layout, sources, targets, n_dims, lattice_work):
         return False
-    if _total(share, counts, _take_logs(share, targets)) > 0:
-        _sum_tails(share, sources, targets, n_dims, works)
+    if _total(layout, counts, _take_logs(layout, targets)) > 0:
+        _sum_tails(layout, sources, targets, n_dims, works)
     return True

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import internal, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.filters.missing import is_missing
 from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.point_mass.recursion import (
@@ -27,12 +27,12 @@ _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-
 _PER_STEP = 1e-5  # of the tolerance, what one step's error is planned for
 
 
-@pasted
+@inline_always
 def keep_nothing(tape, k, grid, seen):
     """What a likelihood does with the grids."""
 
 
-@pasted
+@inline_always
 def first_lattice(system, steps, t0, tolerance):
     """Spacing and reach of the first attempt."""
     spacing = np.inf
@@ -41,7 +41,7 @@ def first_lattice(system, steps, t0, tolerance):
     return spacing, _SHORTEST_REACH
 
 
-@internal
+@njit_internal
 def _first_spacing(system, t0, n_steps, tolerance):
     """The spacing that the first step asks for around the start; see `_lattice.aliasing`."""
     spacing = np.inf
@@ -60,7 +60,7 @@ def _first_spacing(system, t0, n_steps, tolerance):
     return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
 
 
-@pasted
+@inline_always
 def next_lattice(code, spacing, reach):
     """After an attempt: (whether to begin again, spacing, reach)."""
     if code == TOO_COARSE:
@@ -70,7 +70,7 @@ def next_lattice(code, spacing, reach):
     return False, spacing, reach
 
 
-@pasted
+@inline_always
 def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep, tape):
     """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
     k = np.int64(0)

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import internal, pasted, reducing
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 
 MAX_POINTS = 8192
@@ -23,7 +23,7 @@ _LARGEST_INDEX = 2.0**50
 _BLOCK = 8  # the points that a source reaches are a multiple of this: no remainder in vector loops
 
 
-@pasted
+@inline_always
 def lattice(low, n, spacing):
     """The points, as the members of an ensemble: (1, n)."""
     X = np.empty((1, n))
@@ -32,7 +32,7 @@ def lattice(low, n, spacing):
     return X
 
 
-@internal
+@njit_internal
 def reached(mean, sd, mass, spacing, reach):
     """The lattice of all points within ``reach`` deviations of some mean: (low, number).
 
@@ -55,7 +55,7 @@ def reached(mean, sd, mass, spacing, reach):
     return low, np.int64(math.ceil(highest)) - low + 1 + _BLOCK
 
 
-@pasted
+@inline_always
 def _add_gaussian(first, spacing, mean, sd, mass, out):
     """Add what N(mean, sd^2) of this mass puts on the points of ``out``, from ``first`` on."""
     scale = spacing / sd
@@ -66,7 +66,7 @@ def _add_gaussian(first, spacing, mean, sd, mass, out):
         out[b] += height * exp(-0.5 * z * z)
 
 
-@internal
+@njit_internal
 def _target(mean, sd, spacing, reach):
     """Numbers of the first point, and of the one after the last, that a source reaches."""
     if not (np.isfinite(mean) and np.isfinite(sd)):
@@ -76,7 +76,7 @@ def _target(mean, sd, spacing, reach):
     return first, first + _BLOCK * max(blocks, 1.0)
 
 
-@internal
+@njit_internal
 def spread(low, n, spacing, mean, sd, mass, reach):
     """Masses on a lattice of the mixture sum_i mass_i N(mean_i, sd_i^2), cut at ``reach``."""
     out = np.zeros(n)
@@ -89,7 +89,7 @@ def spread(low, n, spacing, mean, sd, mass, reach):
     return out
 
 
-@pasted
+@inline_always
 def kernel(spacing, mean, sd, reach):
     """Where every source sends its mass, row after row: (first targets, ends of rows, masses)."""
     n = mean.size
@@ -106,7 +106,7 @@ def kernel(spacing, mean, sd, reach):
     return first, end, masses
 
 
-@pasted
+@inline_always
 def move(first, end, masses, mass, low, n):
     """The same as `spread`, with the rows of a kernel made before."""
     out = np.zeros(n)
@@ -120,7 +120,7 @@ def move(first, end, masses, mass, low, n):
     return out
 
 
-@reducing
+@njit_reassoc
 def _mean_over_gaussian(first, spacing, mean, sd, values):
     """What `_add_gaussian` would add of a unit mass, times ``values``, summed."""
     scale = spacing / sd
@@ -132,7 +132,7 @@ def _mean_over_gaussian(first, spacing, mean, sd, values):
     return scale * _ONE_OVER_ROOT_TWO_PI * result
 
 
-@internal
+@njit_internal
 def gather(low, spacing, values, mean, sd, reach):
     """Mean of ``values``, on a lattice, over N(mean_i, sd_i^2): the transpose of `spread`."""
     out = np.zeros(mean.size)
@@ -145,7 +145,7 @@ def gather(low, spacing, values, mean, sd, reach):
     return out
 
 
-@reducing
+@njit_reassoc
 def gather_rows(first, end, masses, low, values, n):
     """The same as `gather`, with the first ``n`` rows of a kernel made before."""
     out = np.empty(n)
@@ -160,7 +160,7 @@ def gather_rows(first, end, masses, low, values, n):
     return out
 
 
-@internal
+@njit_internal
 def significant(mass, share):
     """The range [first, last) outside of which masses are below a share of the largest."""
     largest = 0.0
@@ -174,7 +174,7 @@ def significant(mass, share):
     return first, last
 
 
-@pasted
+@inline_always
 def aliasing(mean, sd, source_spacing, spacing):
     """Share of each source's mass that the trapezoidal rule may misplace in one step.
 
@@ -198,7 +198,7 @@ def aliasing(mean, sd, source_spacing, spacing):
     return shares
 
 
-@reducing
+@njit_reassoc
 def total(mass, shares):
     """Sum of mass * share, in which a share without mass, infinite too, does not count."""
     result = 0.0
@@ -207,7 +207,7 @@ def total(mass, shares):
     return result
 
 
-@pasted
+@inline_always
 def weigh(mass, log_density):
     """Log of sum_i mass_i exp(log_density_i), and the terms over the largest; NaN, inf are zero."""
     terms = np.empty(mass.size)
@@ -225,7 +225,7 @@ def weigh(mass, log_density):
     return largest + math.log(whole), terms
 
 
-@pasted
+@inline_always
 def highest(log_density):
     """The largest value that is not infinite or NaN."""
     largest = -np.inf
@@ -235,7 +235,7 @@ def highest(log_density):
     return largest
 
 
-@pasted
+@inline_always
 def normalise(mass):
     """Make the sum one, in place."""
     whole = 0.0
@@ -245,7 +245,7 @@ def normalise(mass):
         mass[i] /= whole
 
 
-@pasted
+@inline_always
 def coarseness(mass):
     """How much the sums of every third point disagree: the spectrum at 2 pi / (3 spacing).
 

@@ -2,12 +2,12 @@
 
 import math
 
-from pymc_statespace_filters.compiler.native.jit import internal, pasted, reducing
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
 
 _HALVINGS = 40  # of a cell, in which a draw is looked for
 
 
-@internal
+@njit_internal
 def mean_and_sd(low, spacing, mass):
     """Mean and standard deviation, by the trapezoidal rule; masses need not sum to one."""
     whole = mass_of(mass)
@@ -16,7 +16,7 @@ def mean_and_sd(low, spacing, mass):
     return (low + centre) * spacing, abs(spacing) * math.sqrt(variance)
 
 
-@reducing
+@njit_reassoc
 def mass_of(mass):
     """Sum of the masses."""
     whole = 0.0
@@ -25,7 +25,7 @@ def mass_of(mass):
     return whole
 
 
-@reducing
+@njit_reassoc
 def _moment(mass, centre, power):
     """Sum of the masses times a power of the distance, in points, from point ``centre``."""
     result = 0.0
@@ -35,7 +35,7 @@ def _moment(mass, centre, power):
     return result
 
 
-@internal
+@njit_internal
 def draw(low, spacing, mass, u):
     """Draw by inversion of the distribution function at u, in (0, 1).
 
@@ -62,7 +62,7 @@ def draw(low, spacing, mass, u):
     return (low + i + _place(mass, i, wanted - before)) * spacing
 
 
-@pasted
+@inline_always
 def _place(mass, i, wanted):
     """The v in [-1/2, 1/2] up to which the parabola's integral over the cell is as wanted."""
     here = mass[i]

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import internal, pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.filters.ensemble.system_table import log_density
 from pymc_statespace_filters.filters.outcomes import (
     GRID_TOO_LARGE,
@@ -46,20 +46,20 @@ REFINEMENT = 0.7
 _KNOWN = 1e-15  # a deviation below this share of the mean is lost in the mean's rounding
 
 
-@internal
+@njit_internal
 def no_table():
     """A table of no points."""
     nothing, none = np.empty(0), np.empty(0, np.int64)
     return np.int64(0), nothing, nothing, nothing, (none, none, nothing)
 
 
-@pasted
+@inline_always
 def cut_of(reach):
     """The share of the largest mass below which masses are dropped."""
     return math.exp(-0.5 * reach * reach)
 
 
-@internal
+@njit_internal
 def begin(system, spacing, reach):
     """The grid at step 0, and the mixture (of one) that its masses are taken from."""
     mean, sd, one = system.mean, system.sd, np.full(1, 1.0)
@@ -75,7 +75,7 @@ def begin(system, spacing, reach):
     return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
 
 
-@internal
+@njit_internal
 def forecast(system, k, t, spacing, reach, grid, table):
     """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
     low, _, mass = grid
@@ -99,7 +99,7 @@ def forecast(system, k, t, spacing, reach, grid, table):
     return NONE, (target + i, spacing, out[i:j]), source, table, lost
 
 
-@pasted
+@inline_always
 def step_from(system, k, t, spacing, reach, grid, table):
     """What one step does to every point: (is it in the table?, mean, sd, shares, table)."""
     low, here, mass = grid
@@ -117,14 +117,14 @@ def step_from(system, k, t, spacing, reach, grid, table):
     return tabled, mean[here_on], sd[here_on], shares[here_on], table
 
 
-@pasted
+@inline_always
 def rows_from(low, table):
     """The rows of a table's kernel from point ``low`` on."""
     first, _, _, _, (starts, ends, masses) = table
     return starts[low - first :], ends[low - first :], masses
 
 
-@pasted
+@inline_always
 def _moments(system, k, t, X, source_spacing, spacing):
     """Mean and deviation of the next state from every point, and what a step may misplace."""
     M = np.empty((2, X.shape[1]))
@@ -135,7 +135,7 @@ def _moments(system, k, t, X, source_spacing, spacing):
     return mean, sd, aliasing(mean, sd, source_spacing, spacing)
 
 
-@internal
+@njit_internal
 def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
     """Take the mass off exploding points, the fastest first, until a lattice holds the rest.
 
@@ -158,7 +158,7 @@ def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
     return low, n
 
 
-@internal
+@njit_internal
 def see(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
     """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
 

@@ -20,8 +20,8 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import COUNTS, NUMBERS, Entry
-from pymc_statespace_filters.compiler.native.jit import internal, pasted
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.filters.ensemble.system_table import log_density
@@ -50,13 +50,13 @@ _ARGUMENTS = (
     types.intp, types.intp, types.intp,  # addresses of the system's functions
     types.intp, types.intp, types.intp, types.float64,  # p, inputs, same every step?, time step
     types.float64, types.intp,  # tolerance, moment
-    NUMBERS, types.intp,  # theta
-    COUNTS, types.intp, NUMBERS,  # steps and record
-    NUMBERS, types.intp,  # rows of inputs
+    F64_PTR, types.intp,  # theta
+    I64_PTR, types.intp, F64_PTR,  # steps and record
+    F64_PTR, types.intp,  # rows of inputs
     types.float64,  # t0
-    COUNTS, types.intp, types.int64,  # rows wanted, seed of the draws
-    NUMBERS, NUMBERS, NUMBERS,  # mean, deviation, draw
-    NUMBERS, NUMBERS,  # terms, health
+    I64_PTR, types.intp, types.int64,  # rows wanted, seed of the draws
+    F64_PTR, F64_PTR, F64_PTR,  # mean, deviation, draw
+    F64_PTR, F64_PTR,  # terms, health
 )  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def _grid_states(
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
-@pasted
+@inline_always
 def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     """Write rows and terms: (NONE, J), or (a reason, the observation that failed)."""
     if not system.is_valid:
@@ -125,7 +125,7 @@ def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     return code, j
 
 
-@internal
+@njit_internal
 def _keep(tape, k, grid, seen):
     """Put a grid on the tape, or in the place of the forecast what was seen there made of it."""
     grids, kept, moment = tape
@@ -138,7 +138,7 @@ def _keep(tape, k, grid, seen):
         grids[n - 1] = low, spacing, mass.copy()
 
 
-@internal
+@njit_internal
 def _write_all(rows, grids):
     """Write the law of each grid; rows that were not reached are NaN."""
     for i in range(rows.at.size):
@@ -150,7 +150,7 @@ def _write_all(rows, grids):
             rows.drawn[i] = draw(low, spacing, mass, u)
 
 
-@internal
+@njit_internal
 def _back(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows):
     """The pass back, which writes the smoothed rows: (NONE, J), or (why it stopped, where)."""
     grids, kept, _ = tape
@@ -183,7 +183,7 @@ def _back(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, r
     return NONE, steps.size
 
 
-@internal
+@njit_internal
 def _step_back(system, k, t, spacing, reach, grid, table, later, ratio):
     """From the ratio on the grid ``later`` to that one step before: (mean, sd, ratio, table)."""
     low, _, mass = grid
@@ -196,7 +196,7 @@ def _step_back(system, k, t, spacing, reach, grid, table, later, ratio):
     return mean, sd, ratio, table
 
 
-@internal
+@njit_internal
 def _given_next(mass, mean, sd, x):
     """Masses times the densities of the state x one step later."""
     out = np.empty(mass.size)
@@ -207,7 +207,7 @@ def _given_next(mass, mean, sd, x):
     return out
 
 
-@pasted
+@inline_always
 def _holds(smoothed, tolerance):
     """Whether a grid holds the smoothed density, and has not lost it beyond an end."""
     whole = mass_of(smoothed)
@@ -216,7 +216,7 @@ def _holds(smoothed, tolerance):
     return smoothed.size == 1 or smoothed[0] + smoothed[-1] <= tolerance * whole
 
 
-@internal
+@njit_internal
 def _see_back(system, k, t, d, grid, term, ratio):
     """Multiply by p(d | x) / p(d | d_1 ..), in place; what has no mass has no ratio."""
     low, spacing, mass = grid
@@ -227,4 +227,4 @@ def _see_back(system, k, t, d, grid, term, ratio):
         ratio[i] *= math.exp(log_likelihood[i] - term) if is_seen else 0.0
 
 
-GRID_STATES = Entry(_grid_states, _ARGUMENTS, "grid_states", digest("grid_states"))
+GRID_STATES = EntryPoint(_grid_states, _ARGUMENTS, "grid_states", digest("grid_states"))

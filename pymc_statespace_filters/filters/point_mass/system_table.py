@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import pasted
+from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.filters.ensemble.system_table import NOTHING, call_members
 
 
@@ -28,7 +28,7 @@ class OneStateSystem(NamedTuple):
     log_density: int
 
 
-@pasted
+@inline_always
 def read_one_state(start, move, log_density, dt, same_every_step, theta, inputs):
     """Give names to what the entry of the filter was called with, and ask for the start."""
     first = np.zeros(3)
@@ -39,7 +39,7 @@ def read_one_state(start, move, log_density, dt, same_every_step, theta, inputs)
     )
 
 
-@pasted
+@inline_always
 def move_points(system, k, t, X, M):
     """Write the mean and the variance of the state one step later, for each point."""
     call_members(system.move, system, k, t, NOTHING, NOTHING, X, M)

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import kept
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import AdaptationSettings, learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
@@ -85,7 +85,7 @@ _SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCE
 def _kept(function):
     """Compile for Python, once for all processes."""
     key = digest(function.__name__, _SOURCE)
-    return kept(njit(function, error_model="numpy", nogil=True), key)
+    return cached_on_disk(njit(function, error_model="numpy", nogil=True), key)
 
 
 @_kept

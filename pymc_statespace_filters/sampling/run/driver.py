@@ -10,7 +10,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.parallel.communicator import Ranks, ranks_of
+from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.parallel.cpu_affinity import core_numbers, share_of_cores
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import join_checkpoint, open_checkpoint
 from pymc_statespace_filters.sampling.run.model_task import Asked, ModelRun
@@ -64,7 +64,7 @@ def sample_models(
         As in ``sample_dram``.
     """
     _check(how)
-    with ranks_of(how.comm, in_lockstep=how.ranks_per_chain > 1) as ranks:
+    with communicator_of(how.comm, in_lockstep=how.ranks_per_chain > 1) as ranks:
         if ranks.size > 1:
             _check_agreement(ranks, models, asked, how, bool(checkpoints))
         asked = asked._replace(entropy=ranks.broadcast(asked.entropy))
@@ -84,16 +84,16 @@ def sample_models(
 
 def _lead(
     runs: Sequence[ModelRun],
-    ranks: Ranks,
+    ranks: Communicator,
     how: How,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
     """Run all chains; ``ranks`` are those that run some."""
-    place, cores = ranks.of_this_computer(core_numbers())
+    place, cores = ranks.node_local(core_numbers())
     # Each model is compiled by one rank of a computer, the others find the code on disk; rank 0
     # needs all models, the others those of their chains.
     for mine in (runs[place :: len(cores)], runs if ranks.rank == 0 else ()):
-        ranks.together(partial(_prepare, mine))
+        ranks.run_collectively(partial(_prepare, mine))
     n_threads = 1  # where others evaluate with us, for one chain at a time
     if not runs[0].is_shared:
         n_threads = how.cores or share_of_cores(place, cores)
@@ -114,7 +114,7 @@ def _lead(
         checks = how.compute_convergence_checks
         return {run.name: run.tree(*o, checks) for run, o in zip(runs, outcomes, strict=True)}
 
-    return ranks.together(trees) if how.gather == "all" else trees()
+    return ranks.run_collectively(trees) if how.gather == "all" else trees()
 
 
 def _prepare(runs: Sequence[ModelRun]) -> None:
@@ -147,7 +147,7 @@ def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
 
 
 def _check_agreement(
-    ranks: Ranks, models: Mapping[str, Model], asked: Asked, how: How, stores: bool
+    ranks: Communicator, models: Mapping[str, Model], asked: Asked, how: How, stores: bool
 ) -> None:
     """Raise, on all ranks, unless all were asked for the same."""
     of_all: list[dict[str, Any]] = [
@@ -158,7 +158,7 @@ def _check_agreement(
     def in_words() -> list[dict]:
         return [*of_all, *(asked.in_words(model, strictly=False) for model in models.values())]
 
-    first, *others = ranks.gather(ranks.together(in_words))
+    first, *others = ranks.allgather(ranks.run_collectively(in_words))
     for rank, theirs in enumerate(others, start=1):
         pairs = zip(first, theirs, strict=False)  # of other numbers the first differ already
         differing = [key for a, b in pairs for key in a if a[key] != b[key]]
@@ -174,7 +174,7 @@ def _check_agreement(
 def _open_checkpoints(
     runs: Sequence[ModelRun],
     folders: Sequence[str | os.PathLike],
-    ranks: Ranks,
+    ranks: Communicator,
     stack: ExitStack,
 ) -> None:
     """Rank 0 opens the folders, the others join."""
@@ -193,4 +193,4 @@ def _open_checkpoints(
             for run, ticket in zip(runs, tickets, strict=True):
                 run.checkpoint = stack.enter_context(join_checkpoint(ticket))
 
-    ranks.together(partial(join, ranks.broadcast(ranks.together(begin))))
+    ranks.run_collectively(partial(join, ranks.broadcast(ranks.run_collectively(begin))))

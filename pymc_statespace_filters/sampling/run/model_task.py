@@ -14,7 +14,7 @@ from pytensor.graph.basic import Variable
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     data_fingerprint,
@@ -115,7 +115,9 @@ class ModelRun:
         If the log-density draws random numbers of its own.
     """
 
-    def __init__(self, model: Model, asked: Asked, name: str = "", group: Ranks | None = None):
+    def __init__(
+        self, model: Model, asked: Asked, name: str = "", group: Communicator | None = None
+    ):
         check_no_generators(model)
         self.model, self.asked, self.name = model, asked, name
         self._group = group

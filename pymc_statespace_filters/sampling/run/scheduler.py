@@ -18,7 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.errors import ParallelError
-from pymc_statespace_filters.parallel.communicator import LAST_WORDS_SECONDS, Ranks, described
+from pymc_statespace_filters.parallel.communicator import (
+    LAST_WORDS_SECONDS,
+    Communicator,
+    describe_error,
+)
 from pymc_statespace_filters.parallel.signals import (
     interrupts_left_to_another_rank,
     noticed_interrupts,
@@ -48,7 +52,7 @@ class Outcome(NamedTuple):
 
 
 def run_chains(
-    models: Sequence[ModelRun], ranks: Ranks, *, n_threads: int, progressbar: bool | str
+    models: Sequence[ModelRun], ranks: Communicator, *, n_threads: int, progressbar: bool | str
 ) -> "list[Outcome]":
     """Run all chains of all models to their end, or until the user interrupts.
 
@@ -87,18 +91,18 @@ def run_chains(
 
 
 @contextmanager
-def _dismissing(ranks: Ranks) -> Iterator[None]:
+def _dismissing(ranks: Communicator) -> Iterator[None]:
     """Whatever becomes of rank 0: let the others go in the end."""
     try:
         yield
     except BaseException as error:
-        own = f"rank 0 of {ranks.size} has stopped the run: {described(error)}"
+        own = f"rank 0 of {ranks.size} has stopped the run: {describe_error(error)}"
         _tell_all(ranks, _OVER, str(error) if isinstance(error, ParallelError) else own)
         raise
     _tell_all(ranks, _OVER)
 
 
-def _tell_all(ranks: Ranks, kind: str, value: str | None = None) -> None:
+def _tell_all(ranks: Communicator, kind: str, value: str | None = None) -> None:
     for rank in range(1, ranks.size):
         ranks.send(rank, kind, value)
 
@@ -107,7 +111,7 @@ class _Dealer:
     """Rank 0."""
 
     def __init__(
-        self, models: Sequence[ModelRun], ranks: Ranks, crew: Crew, progressbar: bool | str
+        self, models: Sequence[ModelRun], ranks: Communicator, crew: Crew, progressbar: bool | str
     ):
         self._models, self._ranks, self._crew = models, ranks, crew
         self._places = {
@@ -219,7 +223,7 @@ class _StoppedByOthers(Exception):
 class _Player:
     """Any other rank."""
 
-    def __init__(self, models: Sequence[ModelRun], ranks: Ranks, crew: Crew):
+    def __init__(self, models: Sequence[ModelRun], ranks: Communicator, crew: Crew):
         self._models, self._ranks, self._crew = models, ranks, crew
         self._there_is_more = True
         self._has_asked = self._has_left = self._is_over = False
@@ -239,7 +243,7 @@ class _Player:
             raise ParallelError(str(stopped)) from None
         except BaseException as error:
             self._crew.halt()
-            self._ranks.send(0, _FAILED, described(error))
+            self._ranks.send(0, _FAILED, describe_error(error))
             self._wait_for_answer()
             error.add_note(f"on rank {self._ranks.rank} of {self._ranks.size}")
             raise

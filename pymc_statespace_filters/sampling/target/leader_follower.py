@@ -20,15 +20,15 @@ from pymc_statespace_filters.errors import ModelError, ParallelError
 from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, shared_evaluator
 from pymc_statespace_filters.parallel.communicator import (
     LAST_WORDS_SECONDS,
+    Communicator,
     Message,
-    Ranks,
-    described,
+    describe_error,
 )
 from pymc_statespace_filters.parallel.signals import (
     interrupts_left_to_another_rank,
     noticed_interrupts,
 )
-from pymc_statespace_filters.pymc_model.inspection import Delegate, noisy_filters
+from pymc_statespace_filters.pymc_model.inspection import PythonCallback, noisy_filters
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 
 # What the leader sends: what is to be evaluated, that it is, that all is over.
@@ -90,13 +90,13 @@ class Leader:
         What is evaluated together, by number, see `inspection.delegable_likelihoods`.
     """
 
-    def __init__(self, ranks: Ranks, likelihoods: Sequence[tuple[Any, Any]]):
+    def __init__(self, ranks: Communicator, likelihoods: Sequence[tuple[Any, Any]]):
         self._ranks = ranks
         self._name = next(_leader_numbers)  # a group may have several leaders, one for each model
         self._likelihoods = likelihoods
         self._evaluators = [shared_evaluator(*of, ranks) for of in likelihoods]
         self._sent: dict[int, bytes] = {}
-        self._delegate = Delegate(self._evaluate)
+        self._delegate = PythonCallback(self._evaluate)
 
     @property
     def address(self) -> np.ndarray:
@@ -155,19 +155,19 @@ def own_errors(leader: Leader | None) -> Iterator[None]:
 
 
 @contextmanager
-def leading(ranks: Ranks) -> Iterator[None]:
+def leading(ranks: Communicator) -> Iterator[None]:
     """Whatever becomes of the leader, the first of the ranks: let the followers go in the end."""
     try:
         yield
     except BaseException as error:
-        _tell(ranks, _END, f"the leader of the chain has stopped: {described(error)}")
+        _tell(ranks, _END, f"the leader of the chain has stopped: {describe_error(error)}")
         if not _is_heard(ranks):
             ranks.abort(error)
         raise
     _tell(ranks, _END)
 
 
-def follow(ranks: Ranks) -> None:
+def follow(ranks: Communicator) -> None:
     """Evaluate with the leader, rank 0, whatever it comes to, until it says that it is over.
 
     Parameters
@@ -198,7 +198,7 @@ def follow(ranks: Ranks) -> None:
                 ranks.send(message.source, _READY)
             except Exception as error:
                 failure = error
-                ranks.send(message.source, _FAILED, described(error))
+                ranks.send(message.source, _FAILED, describe_error(error))
     if message.value is None:
         return
     ranks.send(message.source, _HEARD)
@@ -208,7 +208,7 @@ def follow(ranks: Ranks) -> None:
     raise ParallelError(message.value)
 
 
-def _evaluate_or_abort(ranks: Ranks, evaluate: Callable, *arguments: Any) -> None:
+def _evaluate_or_abort(ranks: Communicator, evaluate: Callable, *arguments: Any) -> None:
     try:
         evaluate(*arguments)
     except BaseException as error:
@@ -217,7 +217,7 @@ def _evaluate_or_abort(ranks: Ranks, evaluate: Callable, *arguments: Any) -> Non
         raise
 
 
-def _is_heard(ranks: Ranks) -> bool:
+def _is_heard(ranks: Communicator) -> bool:
     """Wait until all followers have heard that it is over; False if they do not."""
     until = time.monotonic() + _ANSWER_SECONDS
     missing = ranks.size - 1
@@ -228,13 +228,13 @@ def _is_heard(ranks: Ranks) -> bool:
     return not missing
 
 
-def _tell(ranks: Ranks, kind: str, value: Any = None) -> None:
+def _tell(ranks: Communicator, kind: str, value: Any = None) -> None:
     """Send to all followers."""
     for rank in range(1, ranks.size):
         ranks.send(rank, kind, value)
 
 
-def _next(ranks: Ranks) -> Message:
+def _next(ranks: Communicator) -> Message:
     """Wait for a message."""
     began = time.monotonic()
     while (message := ranks.receive()) is None:

@@ -20,14 +20,14 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import (
-    delegable_likelihoods,
+    autoregressive_noise,
     health_outputs,
     log_density_terms,
-    move_noise,
     state_space_names,
     with_filter,
+    with_likelihood_callback,
 )
 from pymc_statespace_filters.sampling.kernel.state import RAISED, Density, Evaluation
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
@@ -77,7 +77,7 @@ class LogDensity:
         holds_noise: bool = False,
         correlation: float | None = None,
         graph: TensorVariable | None = None,
-        group: Ranks | None = None,
+        group: Communicator | None = None,
     ):
         not_held = [v for v in model.value_vars if v not in held]
         self.others = tuple(v.name for v in not_held)
@@ -92,12 +92,12 @@ class LogDensity:
         self._is_delegable = False
         self._moves_noise = correlation is not None and bool(seeds) and not holds_noise
         if self._moves_noise:
-            graphs, moved = move_noise(outputs, seeds)
+            graphs, moved = autoregressive_noise(outputs, seeds)
             outputs = [*graphs, *moved.moved]
             noise_inputs, noise = [moved.correlation, *moved.normals], list(moved.sizes)
         else:
             # Where there is one rank too: the same machine code gives the same bits.
-            outputs, delegable = delegable_likelihoods(outputs, seeds if holds_noise else {})
+            outputs, delegable = with_likelihood_callback(outputs, seeds if holds_noise else {})
             noise_inputs, noise = list(delegable.normals), list(delegable.normals.values())
             if delegable.kinds:
                 self._is_delegable = True

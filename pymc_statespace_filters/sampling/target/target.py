@@ -7,7 +7,7 @@ from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Ranks
+from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_names
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import Random
@@ -71,7 +71,7 @@ class Target:
         compile_kwargs: dict | None = None,
         *,
         graph: TensorVariable | None = None,
-        group: Ranks | None = None,
+        group: Communicator | None = None,
     ):
         group = None if group is None or group.size == 1 else group
         if group is not None:

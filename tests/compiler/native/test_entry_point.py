@@ -10,11 +10,11 @@ from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native import entry_point as entries
 from pymc_statespace_filters.compiler.native.entry_point import (
-    NUMBERS,
-    Entry,
+    F64_PTR,
+    EntryPoint,
     address_of,
+    cached_on_disk,
     call_address,
-    kept,
 )
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
@@ -25,7 +25,7 @@ def scale(x, n, factor):
         values[i] *= factor
 
 
-SCALE = Entry(scale, (NUMBERS, types.intp, types.float64), "scale", None)
+SCALE = EntryPoint(scale, (F64_PTR, types.intp, types.float64), "scale", None)
 by_name, symbol = SCALE.external, SCALE.symbol
 
 
@@ -66,10 +66,12 @@ def test_an_array_is_handed_over_by_its_address():
 
 
 def test_a_second_entry_under_the_same_key_is_the_first():
-    one, two = (Entry(scale, (NUMBERS, types.intp, types.float64), "s", "key") for _ in range(2))
+    one, two = (
+        EntryPoint(scale, (F64_PTR, types.intp, types.float64), "s", "key") for _ in range(2)
+    )
     assert one.symbol == two.symbol
-    unnamed = Entry(scale, (NUMBERS, types.intp, types.float64), "s", None)
-    assert unnamed.symbol != Entry(scale, (), "s", None).symbol
+    unnamed = EntryPoint(scale, (F64_PTR, types.intp, types.float64), "s", None)
+    assert unnamed.symbol != EntryPoint(scale, (), "s", None).symbol
 
 
 def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
@@ -109,5 +111,5 @@ def test_code_is_kept_for_its_module():
     keys = []
     for module in ("here", "there"):
         moved = FunctionType(function.__code__, {"__name__": module})
-        keys.append(CACHED_SRC_FUNCTIONS[kept(njit(moved), "key").py_func])
+        keys.append(CACHED_SRC_FUNCTIONS[cached_on_disk(njit(moved), "key").py_func])
     assert keys[0] != keys[1]

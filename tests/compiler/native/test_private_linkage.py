@@ -6,8 +6,8 @@ import numpy as np
 from llvmlite.binding import Linkage
 from numba import njit
 
-from pymc_statespace_filters.compiler.native.entry_point import NUMBERS, Entry, _compiled
-from pymc_statespace_filters.compiler.native.private_linkage import closed
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, _compiled
+from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 
 _LINES = "\n".join(f"    total += math.sin({i} * x)" for i in range(300))
 _NAMESPACE = {"math": math, "__name__": __name__}
@@ -28,7 +28,7 @@ def linkages_of_helpers(library):
 
 
 def test_functions_that_are_called_are_a_librarys_own():
-    ordinary, kept_to_itself = njit(twice), closed(njit(twice))
+    ordinary, kept_to_itself = njit(twice), with_internal_linkage(njit(twice))
     assert ordinary(0.5) == kept_to_itself(0.5)
     found = [
         linkages_of_helpers(next(iter(f.overloads.values())).library)
@@ -43,7 +43,7 @@ def test_entries_are_closed():
         out[0] = twice_jitted(out[0])
 
     twice_jitted = njit(twice)
-    entry = Entry(evaluate, (NUMBERS,), "evaluate", None)
+    entry = EntryPoint(evaluate, (F64_PTR,), "evaluate", None)
     entry.compile()
     assert linkages_of_helpers(_compiled[entry.symbol]._library) == [Linkage.internal]
     result = np.array([0.5])
