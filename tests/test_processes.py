@@ -15,6 +15,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import cache_key
 from tests.small_systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
 
@@ -52,6 +53,7 @@ SCRIPT = """
 import json, sys
 import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native import entry_point as entries
 from pymc_statespace_filters.ops.base import cache_key
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
@@ -66,7 +68,7 @@ for system, observed in json.loads(sys.argv[1]):
     results.append(model.compile_logp([model["d"]], sum=False)({"a": np.array(0.6)})[0].tolist())
 record = dict(observed=FORCED_DATA, steps=STEPS, inputs=FORCE)
 value = psf.log_likelihood(forced(), psf.EnKF(20), {"a": 0.6}, **record).tolist()
-key = cache_key(forced(), psf.EnKF(20).compile(forced()))
+key = cache_key(forced(), psf.EnKF(20).compile(compile_system(forced())))
 found = [entry.cache_hits for entry in entries._compiled.values()]
 print(json.dumps([results, value, key, found]))
 """
@@ -107,7 +109,7 @@ def test_machine_code_is_found_again_and_never_mixed_up(run):
     *warm, found_again, same_machine_code = run([{}, data])
     assert same_machine_code == machine_code
     assert found_again == [1] * len(found)
-    assert key == cache_key(FORCED, psf.EnKF(20).compile(FORCED))
+    assert key == cache_key(FORCED, psf.EnKF(20).compile(compile_system(FORCED)))
     assert warm == cold
 
     others, *_ = run([{}, other_data], [{"observation_noise": [[0.6]]}, data])

@@ -9,8 +9,8 @@ import numpy as np
 
 import pymc_statespace_filters as psf
 from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, STEPS, simulated, theta_of
-from pymc_statespace_filters.evaluation.log_likelihood import shared_evaluator
 from pymc_statespace_filters.filters.kernel_density import density as _kernel_density
+from pymc_statespace_filters.ops.distributed import distributed_evaluator
 
 EXACT, FAST, BOOTSTRAP, ENKF = "PFEnKF, exact kernels", "PFEnKF", "BootstrapPF", "EnKF"
 FILTERS = {EXACT: psf.PFEnKF, FAST: psf.PFEnKF, BOOTSTRAP: psf.BootstrapPF, ENKF: psf.EnKF}
@@ -47,7 +47,7 @@ class Case:
         return STEPS.size / self.n_seen
 
     def fits(self, n_ranks: int) -> bool:
-        return n_ranks <= FILTERS[self.kind](self.n).most_ranks()
+        return n_ranks <= FILTERS[self.kind](self.n).max_ranks()
 
 
 def cases(exact: bool) -> list[Case]:
@@ -81,7 +81,7 @@ def evaluation(case: Case, ranks: Ranks) -> Callable[[int], float]:
     theta = theta_of(DOUBLE_WELL, DOUBLE_WELL_TRUTH)
     seen = (steps, observed[: case.n_seen], inputs, np.asarray(0.0))
 
-    evaluate = shared_evaluator(DOUBLE_WELL, filter, ranks)
+    evaluate = distributed_evaluator(DOUBLE_WELL, filter, ranks)
 
     def total(seed: int) -> float:
         terms, _ = evaluate(theta, *seen, np.asarray(seed))

@@ -1,19 +1,19 @@
 """Log-likelihoods without PyMC: numbers in, numbers out."""
 
 import hashlib
-import warnings
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.errors import DataMismatchError, FilterWarning, ModelError
-from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
+from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.shared import DistributedLogLikelihood
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -110,7 +110,7 @@ def log_likelihood(
             _check_agreement(ranks, filter, (points, *record, seeds))
         terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
         if ranks.rank == 0:
-            warn_of(filter, health)
+            warn_about(filter, health)
     return terms.reshape(*shape, record.steps.size)
 
 
@@ -141,7 +141,7 @@ def _evaluate(
     if len(points) > 1 and has_batch(LogLikelihood(system, filter)):
         # Such a filter draws nothing: any seed will do.
         return evaluator(BatchLogLikelihood(system, filter))(points, *record, seeds[0])
-    evaluate = shared_evaluator(system, filter, ranks)
+    evaluate = distributed_evaluator(system, filter, ranks)
     terms = np.empty((len(points), record[0].size))
     health = np.empty((len(points), HEALTH_SIZE))
     for i, point in enumerate(points):
@@ -149,77 +149,8 @@ def _evaluate(
     return terms, health
 
 
-def shared_evaluator(system: StateSpaceModel, filter: Filter, ranks: Communicator) -> Callable:
-    """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
-
-    All call it with the same arguments, each moves its own members, and all get the same result, to
-    the bit that of one rank.
-
-    Raises
-    ------
-    ModelError
-        If the filter has no members for so many ranks.
-    """
-    check_ranks(filter, ranks.size)
-    if ranks.size == 1:
-        return evaluator(LogLikelihood(system, filter))
-    evaluate = evaluator(DistributedLogLikelihood(system, filter))
-
-    def evaluate_together(*record: Any) -> tuple[np.ndarray, np.ndarray]:
-        results = evaluate(*record, ranks.rank, ranks.size, ranks.exchange)
-        ranks.check_exchange()
-        return results
-
-    return evaluate_together
-
-
-def check_ranks(filter: Filter, n_ranks: int) -> None:
-    """Raise unless a filter has members for so many ranks."""
-    if n_ranks == 1:
-        return
-    if not filter.noisy:
-        raise ModelError(
-            f"{filter} has no members to spread over {n_ranks} ranks; take one rank for each "
-            f"evaluation, or a filter with members: EnKF, BootstrapPF or PFEnKF"
-        )
-    most = filter.most_ranks()  # type: ignore[union-attr]
-    if n_ranks > most:
-        raise ModelError(
-            f"{filter} has members for {most} of {n_ranks} ranks alone: a rank takes whole blocks "
-            f"of 64 members"
-        )
-
-
-def warn_of(filter: Filter, health: np.ndarray, *, stacklevel: int = 3) -> None:
-    """One warning for what went wrong in some evaluations, given their health (n, 3)."""
-    failed = health[:, 1] != 0
-    if failed.any():
-        reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
-        listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
-        warnings.warn(
-            f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
-            FilterWarning,
-            stacklevel=stacklevel,
-        )
-    collapsed = ~failed & (health[:, 0] < COLLAPSED)
-    if collapsed.any():
-        warnings.warn(
-            f"{filter}: at some observation fewer than {COLLAPSED:g} particles carried all the "
-            f"weight, in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
-            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be tens of nats too "
-            f"low, by a different amount for every seed; more particles lessen this only slowly. "
-            f"EKF() and EnKF(n, likelihood='gaussian') do not collapse, but have a bias of their "
-            f"own where the state is not Gaussian.",
-            FilterWarning,
-            stacklevel=stacklevel,
-        )
-
-
 def check_kinds(system: Any, filter: Any) -> None:
     """Raise unless these are a system and a filter that can treat it."""
     check_system(system)
-    if not isinstance(filter, Filter.__value__):
-        raise ModelError(
-            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
-        )
-    filter.check(system)
+    check_filter(filter)
+    filter.check(compile_system(system))

@@ -7,10 +7,11 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.log_likelihood import check_kinds, warn_of
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
+from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.run import FilterRun
+from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_at, check_seed, checked_record, rows_at
@@ -112,7 +113,7 @@ def run_filter(
     rows = rows_at(at, record.steps)
     evaluate = evaluator(FilterRun(system, filter))
     terms, health, *states = evaluate(theta, *record, noise, rows)
-    warn_of(filter, health[None])
+    warn_about(filter, health[None])
     dataset = _dataset(system, *states).assign(log_likelihood=("obs_time", terms))
     seen = {"time": rows, "obs_time": record.steps}
     times_of = {name: record.t0 + at_steps * system.dt for name, at_steps in seen.items()}

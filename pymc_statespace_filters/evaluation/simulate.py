@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.observation_sampler import observation_sampler
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
@@ -31,9 +31,9 @@ def continuation(system: StateSpaceModel) -> CompiledFunction:
     It goes on from the state x (n,) of step ``first`` and keeps what it meets at ``steps``, which
     increase from there on.
     """
-    machine, sampler = ensemble_machine(system), _sampler(system)
-    prepare, propagate, observe = machine.prepare, machine.propagate, sampler.function
-    dt, n, m, p = system.dt, system.n, machine.m, system.p
+    compiled, sampler = compile_system(system), _sampler(system)
+    prepare, propagate = compiled.prepare.function, compiled.propagate.function
+    observe, dt, n, m, p = sampler.function, system.dt, system.n, compiled.m, system.p
 
     def go_on(rng, theta, x, first, steps, inputs, t0):
         c = prepare(theta)
@@ -47,7 +47,8 @@ def continuation(system: StateSpaceModel) -> CompiledFunction:
             observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
         return states, observations
 
-    return _kept(go_on, key_of("go on", machine.key, sampler.key))
+    keys = compiled.prepare.key, compiled.propagate.key, sampler.key
+    return _cached(go_on, key_of(f"continuation {dt!r} {n} {m} {p}", *keys))
 
 
 @lru_cache(maxsize=256)
@@ -56,8 +57,8 @@ def observer(system: StateSpaceModel) -> CompiledFunction:
 
     ``states`` (R, n) are those at ``steps`` (R,).
     """
-    machine, sampler = ensemble_machine(system), _sampler(system)
-    prepare, observe, dt, p = machine.prepare, sampler.function, system.dt, system.p
+    constants, sampler = compile_system(system).prepare, _sampler(system)
+    prepare, observe, dt, p = constants.function, sampler.function, system.dt, system.p
 
     def look(rng, theta, states, steps, inputs, t0):
         c, observations = prepare(theta), np.empty((steps.size, p))
@@ -66,11 +67,11 @@ def observer(system: StateSpaceModel) -> CompiledFunction:
             observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
         return observations
 
-    return _kept(look, key_of("look", machine.key, sampler.key))
+    return _cached(look, key_of(f"observer {dt!r} {p}", constants.key, sampler.key))
 
 
-def _kept(function: Callable, key: str | None) -> CompiledFunction:
-    """Compiled, from disk if any process did so before."""
+def _cached(function: Callable, key: str | None) -> CompiledFunction:
+    """Compile a function, or load it from disk if any process compiled it before."""
     compiled = jit(function)
     return CompiledFunction(compiled if key is None else cached_on_disk(compiled, key), key)
 
@@ -87,10 +88,10 @@ def _sampler(system: StateSpaceModel) -> CompiledFunction:
 @lru_cache(maxsize=256)
 def simulator(system: StateSpaceModel) -> CompiledFunction:
     """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
-    machine = ensemble_machine(system)
-    prepare, initialise, propagate = machine.prepare, machine.initialise, machine.propagate
-    sampler = _sampler(system)
-    observe, dt, n, m, p = sampler.function, system.dt, system.n, machine.m, system.p
+    compiled, sampler = compile_system(system), _sampler(system)
+    parts = compiled.prepare, compiled.initialise, compiled.propagate, sampler
+    prepare, initialise, propagate, observe = (part.function for part in parts)
+    dt, n, m, p = system.dt, system.n, compiled.m, system.p
 
     def simulate(rng, theta, steps, inputs, t0):
         c = prepare(theta)
@@ -109,7 +110,8 @@ def simulator(system: StateSpaceModel) -> CompiledFunction:
                 propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), x)
         return states, observations
 
-    return _kept(simulate, key_of("simulate", machine.key, sampler.key))
+    keys = (part.key for part in parts)
+    return _cached(simulate, key_of(f"simulate {dt!r} {n} {m} {p}", *keys))
 
 
 def simulate(

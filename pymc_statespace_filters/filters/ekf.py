@@ -6,6 +6,7 @@ of the filter is one vector: the mean, then the lower triangle of the covariance
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
@@ -16,10 +17,9 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.lowering.gaussian import log_normal
-from pymc_statespace_filters.compiler.lowering.structure import is_linear
-from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
+from pymc_statespace_filters.compiler.lowering.symbols import call, process_noise_cov, symbols_of
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_reverse
+from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_pullback
 from pymc_statespace_filters.filters.gaussian.batch import compile_batch
 from pymc_statespace_filters.filters.gaussian.linearization import (
     Symbols,
@@ -35,7 +35,18 @@ from pymc_statespace_filters.filters.gaussian.recursion import (
     compile_value,
 )
 from pymc_statespace_filters.filters.gaussian.run import compile_run
-from pymc_statespace_filters.filters.gaussian.states import ForwardPass, compile_states, states_pass
+from pymc_statespace_filters.filters.gaussian.states import (
+    ForwardPass,
+    compile_states,
+    forward_pass,
+)
+from pymc_statespace_filters.filters.protocol import (
+    GradientFunction,
+    LogLikelihoodFunction,
+    RunFunction,
+    StatesFunction,
+    System,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -61,11 +72,11 @@ class EKF:
     EKF()
     """
 
-    noisy = False
-    has_gradient = True
+    noisy: ClassVar[bool] = False
+    has_gradient: ClassVar[bool] = True
 
-    def check(self, system: StateSpaceModel) -> None:
-        """Raise if the system is not one that this filter can treat."""
+    def check(self, system: System) -> None:
+        """Raise if the observation is not Gaussian or a state is carried."""
         if not system.gaussian_observation:
             raise ModelError(
                 "EKF needs an observation function with Gaussian noise; observation_dist and "
@@ -74,52 +85,43 @@ class EKF:
         if system.carried:
             raise ModelError(
                 f"EKF cannot treat the carried states {list(system.carried)}, which no Kalman "
-                f"update may touch; use EnKF, BootstrapPF or PFEnKF"
+                f"update may move; use EnKF, BootstrapPF or PFEnKF"
             )
 
-    def is_exact_for(self, system: StateSpaceModel) -> bool:
-        """Whether the system is linear; False too where that cannot be seen."""
-        return is_linear(system)
+    def is_exact_for(self, system: System) -> bool:
+        """Whether the system is linear; False too where that cannot be decided."""
+        return system.is_linear
 
-    def compile(self, system: StateSpaceModel) -> CompiledFunction:
-        """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
-        return compile_value(_recursion(system))
+    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+        """Compile the log-likelihood."""
+        return compile_value(_functions(system.model))
 
-    def compile_batch(self, system: StateSpaceModel) -> CompiledFunction:
-        """The same of many points: theta (B, k) -> terms (B, J) and health (B, 3)."""
-        return compile_batch(_recursion(system))
+    def compile_batch(self, system: System) -> CompiledFunction:
+        """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
+        return compile_batch(_functions(system.model))
 
-    def compile_taped(self, system: StateSpaceModel) -> CompiledFunction:
-        """That of one point with a third result: the tape, which `compile_reverse` reads."""
-        return compile_taped(_recursion(system))
+    def compile_taped(self, system: System) -> CompiledFunction:
+        """Compile the pass forwards, with a third result: the tape."""
+        return compile_taped(_functions(system.model))
 
-    def compile_reverse(self, system: StateSpaceModel) -> CompiledFunction:
-        """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
-        return compile_reverse(_recursion(system))
+    def compile_pullback(self, system: System) -> CompiledFunction:
+        """Compile the pass back along the tape."""
+        return compile_pullback(_functions(system.model))
 
-    def compile_gradient(self, system: StateSpaceModel) -> CompiledFunction:
-        """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""
-        return compile_gradient(_recursion(system))
+    def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
+        """Compile both passes as one function."""
+        return compile_gradient(_functions(system.model))
 
-    def compile_states(self, system: StateSpaceModel, moment: str) -> CompiledFunction:
-        """The states at some steps, by their mean and standard deviation, and a draw of them.
+    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+        """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+        return compile_states(_forward_pass(system.model), moment)
 
-        The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> (mean (R, n),
-        sd (R, n), drawn (R, n), n_effective (R,), health (3,)); ``moment`` is "predicted",
-        "filtered" or "smoothed". The draws of one ``draw_seed`` belong together: if smoothed, they
-        are a path. See `_bryson_frazier` for how both are made.
-        """
-        return compile_states(_states_pass(system), moment)
+    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+        """Compile one run with all that it computes."""
+        return compile_run(_functions(system.model))
 
-    def compile_run(self, system: StateSpaceModel) -> CompiledFunction:
-        """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
-
-        See `filters`, the room, for what it returns.
-        """
-        return compile_run(_recursion(system))
-
-    def smoothing_method(self, system: StateSpaceModel) -> str:
-        """What smoothed states are made by."""
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
         return "modified Bryson-Frazier"
 
 
@@ -131,28 +133,24 @@ def _start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
 def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     """Eqs. 4.8-4.11: A and B are taken at the analysis of this step."""
     mean, cov = unpack(values["s"], system.n)
-    move = linearize_transition(system, values, mean)
-    forecast_cov = move.state_jac @ cov @ move.state_jac.T
+    step = linearize_transition(system, values, mean)
+    forecast_cov = step.state_jac @ cov @ step.state_jac.T
     if system.m:
-        if system.equations.process_noise is not None:
-            noise_cov = call(system.equations.process_noise, system, values)
-            forecast_cov += move.noise_jac @ noise_cov @ move.noise_jac.T
-        else:
-            forecast_cov += move.noise_jac @ move.noise_jac.T
-    return pack(move.mean, forecast_cov)
+        forecast_cov += process_noise_cov(system, values, step.noise_jac)
+    return pack(step.mean, forecast_cov)
 
 
 def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
     mean, cov = unpack(values["s"], system.n)
-    sight = innovation_moments(system, values, mean, cov)
-    gain, kept = sight.gain, sight.kept
-    analysis_cov = kept @ cov @ kept.T + gain @ sight.noise_cov @ gain.T
-    increment = log_normal(sight.residual, sight.innovation_cov, sight.seen)
-    return pack(mean + gain @ sight.residual, analysis_cov), increment
+    innovation = innovation_moments(system, values, mean, cov)
+    gain, complement = innovation.gain, innovation.kept
+    analysis_cov = complement @ cov @ complement.T + gain @ innovation.noise_cov @ gain.T
+    increment = log_normal(innovation.residual, innovation.innovation_cov, innovation.seen)
+    return pack(mean + gain @ innovation.residual, analysis_cov), increment
 
 
-def _recursion(system: StateSpaceModel) -> GaussianFilterFunctions:
+def _functions(system: StateSpaceModel) -> GaussianFilterFunctions:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
     s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
     values = symbols_of(system) | {"s": s}
@@ -177,5 +175,5 @@ def _recursion(system: StateSpaceModel) -> GaussianFilterFunctions:
 
 
 @lru_cache(maxsize=256)
-def _states_pass(system: StateSpaceModel) -> ForwardPass:
-    return states_pass(_recursion(system))
+def _forward_pass(system: StateSpaceModel) -> ForwardPass:
+    return forward_pass(_functions(system))

@@ -5,48 +5,29 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.lowering.ensemble import Machine
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
     forecast_moments,
     kalman_update,
     mark_finite,
 )
-from pymc_statespace_filters.filters.ensemble.loop import filter_entry
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
-from pymc_statespace_filters.filters.ensemble.particle_filter import (
-    particle_smoother,
-    particle_smoothing_method,
-)
-from pymc_statespace_filters.filters.ensemble.reductions import (
-    exchange,
-    means,
-    sum_members,
-    sum_spread,
-    sum_values,
-    total,
-)
-from pymc_statespace_filters.filters.ensemble.resampling import (
-    SCHEMES,
-    check_sortable,
-    n_normals,
-    smooth_resampling,
-)
-from pymc_statespace_filters.filters.ensemble.system_table import log_density, observe
-from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
+from pymc_statespace_filters.filters.ensemble.reductions import count, weight_spread
+from pymc_statespace_filters.filters.ensemble.weights import log_sum, normalise_weights
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.importance_weights import (
     Forecast,
-    nudging_workspace,
-    weigh_nudged,
+    proposal_workspace,
+    weigh_proposal,
 )
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
-from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.filters.protocol import System
+from pymc_statespace_filters.filters.settings import check_choice
+from pymc_statespace_filters.filters.system_table import log_density, observe
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 
@@ -56,109 +37,81 @@ _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 @inline_always
 def _workspace(system, local, settings):
-    return np.int64(settings[2]), nudging_workspace(system, local)
+    return int(settings[2]), proposal_workspace(system, local)
 
 
 @inline_always
 def _update(system, j, k, t, d, noise, members, local, work):
-    X, D, X_f, w, log_w, log_p, alive = members
+    X, log_w = members.X, members.log_w
     likelihood, scratch = work
 
-    # Simulated observations and previous weights, of the particles that are alive
-    observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)  # Eq. 4.29
-    mark_finite(X, D, alive)
-    n_alive, n_effective, log_alive = _weigh_alive(members, local)
+    # Simulated observations (Eq. 4.29), and previous weights of the particles that are alive
+    observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, members.D)
+    mark_finite(X, members.D, members.alive)
+    n_alive = count(members.alive, local)
     if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
+    for i in range(log_w.size):
+        log_w[i] = log_w[i] if members.alive[i] else -np.inf
+    log_alive, n_effective = normalise_weights(log_w, members.w, local)
     if log_alive == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
 
-    # Predicted density of the observation, then proposal and weights
-    log_density(system, k, t, d, X, log_p)
-    copy_members(X, X_f)
-    forecast = _forecast(n_alive, n_effective, members, local, scratch)
+    # Predicted density of the observation: previous weights on the forecast particles
+    log_density(system, k, t, d, X, members.log_p)
+    log_predicted = _log_weighted_density(members, local, scratch)
+
+    # Proposal (Eqs. 4.30-4.35) and weights (Eq. 4.36); without a proposal those of Eq. 4.28
+    copy_members(X, members.X_f)
+    forecast = Forecast(n_alive, n_effective, weight_spread(members.w, local))
     as_printed = likelihood == _AS_PRINTED
     if not (
-        forecast.spread > _ONE_PARTICLE
-        and _nudge(system, d, members, forecast, local, scratch)  # Eqs. 4.30-4.35
-        and weigh_nudged(system, k, t, d, members, forecast, local, scratch, as_printed)  # Eq. 4.36
+        _propose(d, members, forecast, system.free, local, scratch)
+        and weigh_proposal(system, k, t, d, members, forecast, local, scratch, as_printed)
     ):
-        copy_members(X_f, X)
-        log_density(system, k, t, d, X, log_p)
-        for i in range(w.size):
-            log_w[i] += log_p[i]  # Eq. 4.28
-    n_effective, log_total, log_printed = _normalise(members, local, scratch)  # Eqs. 4.37, 4.43
+        copy_members(members.X_f, X)
+        log_density(system, k, t, d, X, members.log_p)
+        for i in range(log_w.size):
+            log_w[i] += members.log_p[i]
+    log_printed = _log_weighted_density(members, local, scratch) if as_printed else 0.0
+    log_total, n_effective = normalise_weights(log_w, members.w, local)  # Eqs. 4.37, 4.43
+
+    # Increment of the log-likelihood
     if likelihood == _PREDICTIVE:
-        increment = log_alive + forecast.log_mean  # Eq. 4.42 without its double count
+        increment = log_alive + log_predicted  # Eq. 4.42 without its double count
     elif likelihood == _WEIGHTS:
         increment = log_alive + log_total  # of the mean unnormalised weight: importance sampling
     else:
-        increment = log_printed  # Eq. 4.42 to the letter
+        increment = log_printed - log_total  # Eq. 4.42 as printed
     if not (np.isfinite(increment) and np.isfinite(log_total)):
         return -np.inf, 0.0, ZERO_WEIGHTS
     return increment, n_effective, NONE
 
 
 @inline_always
-def _weigh_alive(members, local):
-    """Normalise the weights of who is alive; return how many are, N_eff, and the log of the sum."""
-    _, _, _, w, log_w, _, alive = members
-    for i in range(w.size):
-        log_w[i] = log_w[i] if alive[i] else -np.inf
-    weigh(log_w, w, local, 0)
-    sum_values(alive, local, 3)
-    exchange(local, 4)
-    log_alive, n_effective = total_weight(local, 0)
-    if log_alive > -np.inf:
-        normalise_own(log_alive, log_w, w, local, 0)
-    return total(local, 3), n_effective, log_alive
+def _log_weighted_density(members, local, scratch):
+    """Log of the sum of w_i p(d | x_i)."""
+    for i in range(members.log_w.size):
+        scratch.log_prior[i] = members.log_w[i] + members.log_p[i]
+    return log_sum(scratch.log_prior, scratch.w_equal, local)[0]
 
 
 @inline_always
-def _forecast(n_alive, n_effective, members, local, scratch):
-    """Means of the forecast, and its p(d | x)."""
-    X, D, _, w, log_w, log_p, _ = members
-    x_mean, d_mean, _, _ = scratch.moments
-    n, p = X.shape[0], D.shape[0]
-    for i in range(w.size):
-        scratch.log_prior[i] = log_w[i] + log_p[i]
-    sum_spread(w, local, 0)
-    sum_members(w, X, local, 1)
-    sum_members(w, D, local, 1 + n)
-    weigh(scratch.log_prior, scratch.w_equal, local, 1 + n + p)
-    exchange(local, 1 + n + p + 3)
-    means(local, 1, 1.0, x_mean)
-    means(local, 1 + n, 1.0, d_mean)
-    return Forecast(n_alive, n_effective, total(local, 0), total_weight(local, 1 + n + p)[0])
-
-
-@inline_always
-def _nudge(system, d, members, forecast, local, scratch):
-    """Move X by the Kalman gain; False if its covariance is singular or not finite."""
-    X, D, _, w, _, _, alive = members
-    if not forecast_moments(w, X, D, d, forecast.spread, local, scratch.moments):  # Eqs. 4.30-4.33
+def _propose(d, members, forecast, free, local, scratch):
+    """Move X by the Kalman gain; False if the covariance is singular or not finite."""
+    if not (
+        forecast.spread > _ONE_PARTICLE
+        and forecast_moments(
+            members.w, members.X, members.D, d, 1.0, forecast.spread, local, scratch.moments
+        )
+    ):
         return False
-    kalman_update(d, D, alive, system.free, scratch.moments, X)  # Eqs. 4.34-4.35
+    kalman_update(d, members.D, members.alive, free, scratch.moments, members.X)
     return True
 
 
-@inline_always
-def _normalise(members, local, scratch):
-    """Normalise the weights; return N_eff, the log of their sum, and Eq. 4.42 to the letter."""
-    _, _, _, w, log_w, log_p, _ = members
-    weigh(log_w, w, local, 0)
-    for i in range(w.size):
-        scratch.log_prior[i] = log_w[i] + log_p[i]
-    weigh(scratch.log_prior, scratch.w_equal, local, 3)
-    exchange(local, 6)
-    log_total, n_effective = total_weight(local, 0)
-    if log_total > -np.inf:
-        normalise_own(log_total, log_w, w, local, 0)
-    return n_effective, log_total, total_weight(local, 3)[0] - log_total
-
-
 @dataclass(frozen=True)
-class PFEnKF(EnsembleFilter):
+class PFEnKF(ParticleFilter):
     """Particle filter whose particles an ensemble Kalman update nudges before they are weighted.
 
     Parameters
@@ -204,25 +157,17 @@ class PFEnKF(EnsembleFilter):
     'predictive'
     """
 
-    n_particles: int
     _: KW_ONLY
-    resample_below: float = 1 / 3
-    resampling: str = "systematic"
     likelihood: str = "predictive"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = filter_entry(
-        "pf_enkf", _workspace, _update, n_settings=3, resamples=True
-    )
+    entry: ClassVar[EntryPoint] = particle_filter("pf_enkf", _workspace, _update, n_settings=1)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "n_particles", check_count("n_particles", self.n_particles))
-        fraction = check_fraction("resample_below", self.resample_below)
-        object.__setattr__(self, "resample_below", fraction)
-        check_choice("resampling", self.resampling, SCHEMES)
+        super().__post_init__()
         check_choice("likelihood", self.likelihood, _LIKELIHOODS)
 
-    def density_method(self, system: StateSpaceModel) -> str:
+    def density_method(self, system: Any) -> str:
         """How the kernel densities are summed for a system whose free states all spread.
 
         Parameters
@@ -254,40 +199,14 @@ class PFEnKF(EnsembleFilter):
             return "none"
         return density_method(n_free, self.n_particles)
 
-    def size(self) -> int:
-        """Return the number of particles."""
-        return self.n_particles
-
     def settings(self) -> tuple[float, ...]:
-        """Return the threshold of resampling and the numbers of its scheme and the likelihood."""
-        likelihood = _LIKELIHOODS.index(self.likelihood)
-        return self.resample_below, SCHEMES.index(self.resampling), likelihood
+        """Return the settings of the resampling and the number of the likelihood."""
+        return (*super().settings(), _LIKELIHOODS.index(self.likelihood))
 
-    def check(self, system: StateSpaceModel) -> None:
-        """Raise if particles of so many states cannot be ordered and are to be."""
-        super().check(system)
-        check_sortable(self.resampling, system.n)
-
-    def smooth(self, system: StateSpaceModel) -> EnsembleFilter:
-        """Return this filter with an estimate that changes little when its normals do."""
-        return smooth_resampling(self, system.n)
-
-    def resampling_normals(self) -> int:
-        """Return how many normals a resampling takes."""
-        return n_normals(self.resampling, self.n_particles)
-
-    def algorithm(self, machine: Machine) -> EnsembleFilter:
-        """Return the bootstrap filter if there is nothing to nudge by, or nothing to nudge."""
-        if machine.observe is not None and machine.free.size > 0:
+    def algorithm(self, system: System) -> ParticleFilter:
+        """Return the bootstrap filter where no Kalman gain exists or it would move nothing."""
+        if system.gaussian_observation and system.free.size > 0:
             return self
         return BootstrapPF(
             self.n_particles, resample_below=self.resample_below, resampling=self.resampling
         )
-
-    def smoother(self, system: StateSpaceModel, machine: Machine) -> Any:
-        """Bind the smoother of this filter to one system."""
-        return particle_smoother(self, system, machine, nudges=True)
-
-    def smoothing_method(self, system: StateSpaceModel) -> str:
-        """Name the method of the smoothed states."""
-        return particle_smoothing_method(system)

@@ -18,10 +18,14 @@ from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.lowering.compiled_system import (
+    CompiledSystem,
+    compile_system,
+)
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 HEALTH_SIZE = 3
@@ -53,8 +57,8 @@ class FilterOp(Op):
         # The default would print every equation of the system.
         return f"{type(self).__name__}{{{self.filter}}}"
 
-    def compile(self) -> CompiledFunction:
-        """The machine code, a function of the inputs."""
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """Compile the function of the inputs."""
         raise NotImplementedError
 
     def results(self) -> list[Variable]:
@@ -148,8 +152,8 @@ def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None
 
 @cache
 def kernel(op: FilterOp) -> CompiledFunction:
-    """The machine code of an operation, compiled once."""
-    return op.compile()
+    """The compiled function of an operation, made once."""
+    return op.compile(compile_system(op.system))
 
 
 class ThetaDerivative(FilterOp):

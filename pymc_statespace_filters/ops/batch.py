@@ -9,24 +9,26 @@ from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.blockwise import Blockwise
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.filters.protocol import BatchFilter
 from pymc_statespace_filters.ops.base import (
     HEALTH_SIZE,
     RECORD_INPUTS,
     FilterOp,
     theta_cotangent_only,
 )
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 
 
 class BatchLogLikelihood(FilterOp):
     """`LogLikelihood` of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
 
+    filter: BatchFilter
     input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
 
-    def compile(self) -> CompiledFunction:
-        """The filter's machine code for many points."""
-        return self.filter.compile_batch(self.system)  # type: ignore[union-attr]
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's log-likelihood of many points."""
+        return self.filter.compile_batch(system)
 
     def results(self) -> list[Variable]:
         """Terms and health of every point."""
@@ -53,7 +55,7 @@ class BatchLogLikelihood(FilterOp):
 
 def has_batch(op: LogLikelihood) -> bool:
     """Whether the operation's filter moves many points side by side."""
-    return hasattr(op.filter, "compile_batch")
+    return isinstance(op.filter, BatchFilter)
 
 
 def vectorized(op: LogLikelihood, theta: Variable, *record: Variable) -> list[Variable]:

@@ -1,8 +1,10 @@
-"""The log-likelihood of a record, by the filter or by a Python function in its place.
+"""Log-likelihoods that several ranks evaluate together.
 
-For what machine code cannot do alone: several processes evaluate together, and talk to each other.
-Who evaluates is an argument, so that the machine code around is the same in both cases, and so are
-its numbers, to the bit.
+`DistributedLogLikelihood` is called by all ranks at once. In a chain that ranks share, one of them
+runs the sampler: there the log-likelihood is a `CallbackLogLikelihood`, which calls a Python
+function, a `PythonCallback`, that makes all ranks evaluate. The address of the callback is an
+argument, so that the surrounding machine code is the same with and without it, and so are its
+numbers, to the bit.
 """
 
 import ctypes
@@ -12,34 +14,100 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS, evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
-_DELEGATE = (("number", "int64", 0), ("delegate", "int64", 0))
+_CALLBACK = (("number", "int64", 0), ("callback", "int64", 0))
+
+
+class DistributedLogLikelihood(LogLikelihood):
+    """`LogLikelihood` of an ensemble, called by all ranks at once; the same numbers on each.
+
+    Three more inputs: ``rank``, ``n_ranks``, and the address of their ``exchange``.
+    """
+
+    filter: EnsembleFilter
+    input_types = (
+        *RECORD_INPUTS,
+        ("rank", "int64", 0),
+        ("n_ranks", "int64", 0),
+        ("exchange", "int64", 0),
+    )
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
+    argument_code: ClassVar[Mapping[str, str]] = {}
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's log-likelihood for the members of one rank."""
+        return self.filter.compile_distributed(system)
+
+
+def distributed_evaluator(system: StateSpaceModel, filter: Filter, comm: Communicator) -> Callable:
+    """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
+
+    All ranks call it with the same arguments. Each moves its local members, and all get the same
+    result, to the bit that of one rank.
+
+    Raises
+    ------
+    ModelError
+        If the filter has no members for so many ranks.
+    """
+    check_ranks(filter, comm.size)
+    if comm.size == 1:
+        return evaluator(LogLikelihood(system, filter))
+    evaluate = evaluator(DistributedLogLikelihood(system, filter))
+
+    def evaluate_together(*record: Any) -> tuple[np.ndarray, np.ndarray]:
+        results = evaluate(*record, comm.rank, comm.size, comm.exchange)
+        comm.check_exchange()
+        return results
+
+    return evaluate_together
+
+
+def check_ranks(filter: Filter, n_ranks: int) -> None:
+    """Raise unless a filter has members for so many ranks."""
+    if n_ranks == 1:
+        return
+    if not isinstance(filter, EnsembleFilter):
+        raise ModelError(
+            f"{filter} has no members to distribute over {n_ranks} ranks; take one rank for each "
+            f"evaluation, or a filter with members: EnKF, BootstrapPF or PFEnKF"
+        )
+    if n_ranks > (most := filter.max_ranks()):
+        raise ModelError(
+            f"{filter} has members for {most} of {n_ranks} ranks only: a rank takes whole blocks "
+            f"of 64 members"
+        )
 
 
 class CallbackLogLikelihood(LogLikelihood):
-    """`LogLikelihood` by the filter or, where its address is not 0, by a `PythonCallback`.
+    """`LogLikelihood` by the filter or, if its address is not 0, by a `PythonCallback`.
 
-    Two inputs more: a ``number``, by which the delegate knows the record, and the address.
+    Two more inputs: a ``number``, by which the callback identifies the record, and its address.
     """
 
-    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (*RECORD_INPUTS, *_DELEGATE)
+    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (*RECORD_INPUTS, *_CALLBACK)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str]] = {"seed": "seed.item(), no_normals.copy()"}
 
-    def compile(self) -> CompiledFunction:
-        """The filter's machine code and the call."""
-        of_filter = super().compile()
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's log-likelihood and the call."""
+        of_filter = super().compile(system)
         by_filter = of_filter.function
 
         @jit
-        def run(theta, steps, observed, inputs, t0, seed, normals, number, delegate):
-            if delegate == 0:
+        def run(theta, steps, observed, inputs, t0, seed, normals, number, callback):
+            if callback == 0:
                 return by_filter(theta, steps, observed, inputs, t0, (seed, normals))
             sizes = np.empty(6, np.int64)
             sizes[0], sizes[1] = theta.size, steps.size
@@ -48,25 +116,25 @@ class CallbackLogLikelihood(LogLikelihood):
             terms, health = np.empty(steps.size), np.empty(HEALTH_SIZE)
             raised = np.zeros(1, np.int64)
             call_address(
-                delegate,
+                callback,
                 (number, theta, steps, observed, inputs, t0, seed, sizes, terms, health, raised),
             )
             if raised[0]:
-                raise RuntimeError("the delegate of a likelihood raised an error")
+                raise RuntimeError("the callback of a likelihood raised an error")
             return terms, health
 
-        return CompiledFunction(run, key_of("by the filter or a delegate", of_filter.key))
+        return CompiledFunction(run, key_of("by the filter or a callback", of_filter.key))
 
 
 class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
     """The same with a vector of `StoredNoise` that is read in place of the seed, or is empty.
 
-    A delegate is given the seed alone.
+    The callback gets the seed only.
     """
 
-    input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_DELEGATE)
+    input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_CALLBACK)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(z),(),()->(j),(h)"
-    # Not copied: they are many.
+    # Not copied: there may be millions.
     argument_code: ClassVar[Mapping[str, str]] = {"normals": "np.ascontiguousarray(normals)"}
 
 
@@ -76,8 +144,7 @@ class PythonCallback:
     Parameters
     ----------
     evaluate : callable
-        ``(number, theta, steps, observed, inputs, t0, seed) -> (terms, health)``. It is given
-        copies.
+        ``(number, theta, steps, observed, inputs, t0, seed) -> (terms, health)``. It gets copies.
 
     Attributes
     ----------

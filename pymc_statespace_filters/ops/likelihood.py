@@ -1,4 +1,9 @@
-"""The log-likelihood of a record as a PyTensor operation."""
+"""The log-likelihood of a record as a PyTensor operation, and its gradient as a second one.
+
+`LogLikelihood` and `LogLikelihoodGradient` are complete by themselves, so that a graph may hold
+either alone. Where one graph holds both at the same inputs, a rewrite replaces them by one pass
+forwards that leaves a tape, `TapedLogLikelihood`, and one pass back over it, `TapePullback`.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -6,11 +11,21 @@ from typing import ClassVar
 import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.rewriting.basic import node_rewriter
+from pytensor.tensor.rewriting.basic import register_specialize
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
 from pymc_statespace_filters.errors import GradientUnavailableError
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, FilterOp, theta_cotangent_only
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.filters.protocol import DifferentiableFilter
+from pymc_statespace_filters.ops.base import (
+    HEALTH_SIZE,
+    RECORD_INPUTS,
+    FilterOp,
+    ThetaDerivative,
+    theta_cotangent_only,
+)
 
 
 class LogLikelihood(FilterOp):
@@ -24,9 +39,9 @@ class LogLikelihood(FilterOp):
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
 
-    def compile(self) -> CompiledFunction:
-        """The filter's machine code."""
-        return self.filter.compile(self.system)
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's log-likelihood."""
+        return self.filter.compile(system)
 
     def results(self) -> list[Variable]:
         """Terms and health."""
@@ -57,3 +72,63 @@ class LogLikelihood(FilterOp):
         else:
             theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
         return theta_cotangent_only(self, inputs, theta_bar)
+
+
+class LogLikelihoodGradient(ThetaDerivative):
+    """Vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,).
+
+    It runs the filter forwards and then backwards. A graph that holds the likelihood too runs it
+    forwards only once: see `fuse_value_and_gradient`.
+    """
+
+    input_types = (*RECORD_INPUTS, ("terms_bar", "float64", 1))
+    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
+
+    filter: DifferentiableFilter
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """Both passes of the filter."""
+        return self.filter.compile_gradient(system)
+
+
+class TapedLogLikelihood(FilterOp):
+    """`LogLikelihood` with a third output, the tape: a state of the filter in each row."""
+
+    filter: DifferentiableFilter
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The pass forwards."""
+        return self.filter.compile_taped(system)
+
+    def results(self) -> list[Variable]:
+        """Terms, health and tape."""
+        return [pt.dvector(), pt.dvector(), pt.dmatrix()]
+
+
+class TapePullback(ThetaDerivative):
+    """Vector-Jacobian product of `TapedLogLikelihood`: inputs, tape and terms_bar -> theta_bar."""
+
+    filter: DifferentiableFilter
+    input_types = (*RECORD_INPUTS, ("tape", "float64", 2), ("terms_bar", "float64", 1))
+    # The tape was made by the other operation, which checked the record.
+    checks_record = False
+    argument_code: ClassVar[Mapping[str, str]] = {"tape": "tape"}
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The pass back."""
+        return self.filter.compile_pullback(system)
+
+
+@register_specialize
+@node_rewriter([LogLikelihoodGradient])
+def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
+    """Where value and gradient are wanted at the same inputs, run the filter forwards once."""
+    *inputs, terms_bar = node.inputs
+    system, filter = node.op.system, node.op.filter
+    for value, _ in fgraph.clients[inputs[0]]:
+        is_value = value.op in (LogLikelihood(system, filter), TapedLogLikelihood(system, filter))
+        if is_value and value.inputs == inputs:
+            terms, health, tape = TapedLogLikelihood(system, filter)(*inputs)
+            theta_bar = TapePullback(system, filter)(*inputs, tape, terms_bar)
+            return {value.outputs[0]: terms, value.outputs[1]: health, node.outputs[0]: theta_bar}
+    return None

@@ -1,7 +1,7 @@
-"""The log-likelihood of an estimating filter as a function of its normals instead of their seed.
+"""The log-likelihood of a noisy filter as a function of its normals instead of their seed.
 
-Reading a normal is many times cheaper than making it. Whoever evaluates again and again on the same
-noise (common random numbers), or moves it a little at a time, makes the normals once.
+Reading a normal is many times cheaper than making it. A sampler that holds the noise (common random
+numbers), or moves it a little at a time, makes the normals once.
 """
 
 from collections.abc import Mapping
@@ -11,6 +11,8 @@ import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.filters.protocol import EnsembleFilter
 from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
@@ -18,12 +20,13 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 class StoredNoise(FilterOp):
     """The normals that a noisy filter uses with a seed: ``steps`` (J,), ``seed`` -> a vector."""
 
+    filter: EnsembleFilter
     input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
     checks_record = False
 
-    def compile(self) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's own layout of its normals."""
-        return self.filter.stored_noise(self.system)  # type: ignore[union-attr]
+        return self.filter.stored_noise(system)
 
     def results(self) -> list[Variable]:
         """One vector."""

@@ -1,10 +1,11 @@
-"""States along a record, by a filter: an operation without a derivative."""
+"""States along a record, and whole runs of a filter: operations without a derivative."""
 
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.filters.protocol import RunFilter, StatesFilter
 from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -19,14 +20,43 @@ class States(FilterOp):
     __props__ = ("system", "filter", "moment")  # type: ignore[assignment]
     input_types = (*RECORD_INPUTS, ("rows", "int64", 1), ("draw_seed", "int64", 0))
 
-    def __init__(self, system: StateSpaceModel, filter: Filter, moment: str) -> None:
+    filter: StatesFilter
+
+    def __init__(self, system: StateSpaceModel, filter: StatesFilter, moment: str) -> None:
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self) -> CompiledFunction:
-        """The filter's machine code."""
-        return self.filter.compile_states(self.system, self.moment)
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's states."""
+        return self.filter.compile_states(system, self.moment)
 
     def results(self) -> list[Variable]:
         """Three matrices and two vectors."""
         return [pt.dmatrix(), pt.dmatrix(), pt.dmatrix(), pt.dvector(), pt.dvector()]
+
+
+class FilterRun(FilterOp):
+    """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``rows``.
+
+    The latter as mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0
+    without members.
+    """
+
+    input_types = (*RECORD_INPUTS, ("rows", "int64", 1))
+
+    filter: RunFilter
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's run."""
+        return self.filter.compile_run(system)
+
+    def results(self) -> list[Variable]:
+        """Two vectors, and an array for each property of the state."""
+        return [
+            pt.dvector(),
+            pt.dvector(),
+            pt.dmatrix(),
+            pt.dtensor3(),
+            pt.dtensor3(),
+            pt.dmatrix(),
+        ]

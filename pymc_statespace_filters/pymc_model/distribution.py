@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import (

@@ -12,9 +12,11 @@ from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
-from pymc_statespace_filters.filters import COLLAPSED, FAILURES, Filter
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,
@@ -98,10 +100,10 @@ def noisy_filters(model: pm.Model) -> dict[str, Filter]:
 
 def is_filter(value: object) -> bool:
     """Whether a value is the settings of a filter."""
-    return isinstance(value, Filter.__value__)
+    return isinstance(value, Filter) and not isinstance(value, type)
 
 
-def resized(filter: Filter, n_members: int) -> Filter:
+def resized(filter: Any, n_members: int) -> Filter:
     """The same noisy filter with another number of members, the first of its settings."""
     count: dict[str, Any] = {fields(filter)[0].name: n_members}
     return replace(filter, **count)
@@ -203,13 +205,14 @@ def autoregressive_noise(
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
-            filter: Any = noisy.smooth(system)
-            filter.check(system)
+            compiled = compile_system(system)
+            filter = noisy.smooth(compiled)
+            filter.check(compiled)
             normals = pt.dvector(f"{names[seed]}_normals")
             fresh = StoredNoise(system, filter)(steps, seed)
             moved = correlation * normals + innovation * fresh
             # The sum of one element, or of none: the last step of an empty record is 0.
-            size = filter.n_normals(system, pt.sum(steps[-1:]), steps.shape[0])
+            size = filter.n_normals(compiled, pt.sum(steps[-1:]), steps.shape[0])
             outputs = LogLikelihoodOfNoise(system, filter)(*arguments, moved)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
             noises.append((normals, moved, size))
@@ -270,10 +273,10 @@ def smooth_filters(model: pm.Model) -> dict[str, Filter]:
     """The filters that `autoregressive_noise` uses, by the names of the noisy variables."""
     nodes = state_space_nodes(model)
     ops = {name: nodes[name].op for name in noisy_filters(model)}
-    return {name: op.filter.smooth(op.system) for name, op in ops.items()}
+    return {name: op.filter.smooth(compile_system(op.system)) for name, op in ops.items()}
 
 
 def exactness(model: pm.Model) -> bool:
     """Whether sampling the model targets its posterior itself, without the bias of a filter."""
     ops = [node.op for node in state_space_nodes(model).values()]
-    return all(op.filter.is_exact_for(op.system) for op in ops)
+    return all(op.filter.is_exact_for(compile_system(op.system)) for op in ops)

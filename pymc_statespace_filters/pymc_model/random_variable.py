@@ -12,7 +12,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.evaluation.simulate import simulator
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import cache_key, check_record
 from pymc_statespace_filters.ops.batch import vectorized
 from pymc_statespace_filters.ops.likelihood import LogLikelihood

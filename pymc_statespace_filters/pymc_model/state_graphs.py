@@ -7,8 +7,9 @@ import pymc as pm
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
-from pymc_statespace_filters.filters import Filter
+from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -32,7 +33,7 @@ class StateSpaceVariable(NamedTuple):
 
     name: str
     system: StateSpaceModel
-    filter: Filter
+    filter: StatesFilter
     dims: tuple[str, str]
     theta: TensorVariable
     steps: TensorVariable
@@ -55,16 +56,22 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
     return found
 
 
+def smoothing_method(variable: StateSpaceVariable) -> str:
+    """The name of the method by which the variable's filter smooths."""
+    return variable.filter.smoothing_method(compile_system(variable.system))
+
+
 def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpaceVariable:
     """The same record read by another filter."""
     check_kinds(variable.system, filter)
-    return variable._replace(filter=filter)
+    return variable._replace(filter=check_states_filter(filter))
 
 
 def states_of(
     variable: StateSpaceVariable, moment: str, rows: Variable, draw_seed: Variable
 ) -> Sequence[TensorVariable]:
     """Mean, sd and a draw of the state at steps `rows`, effective number, health."""
+    check_states_filter(variable.filter)
     record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
     operation = States(variable.system, variable.filter, moment)
     return operation(variable.theta, *record, rows, draw_seed, return_list=True)

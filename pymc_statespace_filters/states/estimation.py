@@ -6,8 +6,8 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.evaluation.log_likelihood import warn_of
-from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, smoothing_method
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.groups import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
@@ -190,7 +190,7 @@ def _add_states(
         )
         part[f"{name}_states"].attrs = {"filter": repr(variable.filter)}
         if moment == "smoothed":
-            part[f"{name}_states"].attrs["smoothing"] = variable.filter.smoothing_method(system)
+            part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)
-        warn_of(variable.filter, states.health, stacklevel=4)
+        warn_about(variable.filter, states.health, stacklevel=4)
     return with_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

@@ -9,8 +9,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.log_likelihood import warn_of
 from pymc_statespace_filters.evaluation.simulate import continuation
+from pymc_statespace_filters.filters.outcomes import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.groups import state_dims, with_group
@@ -127,7 +127,7 @@ def forecast(
                 },
             )
         )
-        warn_of(variable.filter, begin.health, stacklevel=3)
+        warn_about(variable.filter, begin.health, stacklevel=3)
     return with_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.compiler.codegen.array_fallback import _frontier, array_code
 from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 
 
 def vector(name, size):
@@ -158,23 +158,27 @@ def test_what_has_no_machine_code_is_named():
         initial_cov=np.eye(2),
     )
     with pytest.raises(psf.LoweringError, match=r"_black_box.*pytensor.tensor operations"):
-        ensemble_machine(system)
+        compile_system(system).propagate  # noqa: B018
     with pytest.raises(psf.LoweringError, match=r"_black_box|[Nn]o|gradient"):
         psf.log_likelihood(system, psf.EnKF(10), {}, [0.0], steps=[1])
 
 
 def test_keys_tell_settings_apart():
     keys = {
-        ensemble_machine(
-            psf.StateSpaceModel(
-                transition=lambda x, a: [a * x[0]],
-                observation=lambda x: [x[0]],
-                observation_noise=[[noise]],
-                initial_mean=[0.0],
-                initial_cov=[[1.0]],
-                dt=dt,
+        psf.EnKF(10)
+        .compile(
+            compile_system(
+                psf.StateSpaceModel(
+                    transition=lambda x, a: [a * x[0]],
+                    observation=lambda x: [x[0]],
+                    observation_noise=[[noise]],
+                    initial_mean=[0.0],
+                    initial_cov=[[1.0]],
+                    dt=dt,
+                )
             )
-        ).key
+        )
+        .key
         for noise in (1.0, 2.0)
         for dt in (0.1, 0.2)
     }

@@ -7,10 +7,8 @@ from scipy import stats
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
-from pymc_statespace_filters.compiler.lowering.ensemble import (
-    ensemble_machine,
-    semidefinite_cholesky,
-)
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.covariances import semidefinite_cholesky
 
 N = 5
 INPUTS = np.array([[0.3], [0.7], [-0.2]])
@@ -40,9 +38,9 @@ def pendulum(observed_with_e):
 def machine_of(request, monkeypatch):
     if not request.param:
         monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 0)
-    ensemble_machine.cache_clear()
-    yield ensemble_machine
-    ensemble_machine.cache_clear()
+    compile_system.cache_clear()
+    yield compile_system
+    compile_system.cache_clear()
 
 
 def states():
@@ -51,10 +49,10 @@ def states():
 
 def test_members_move_and_are_seen_as_written(machine_of):
     machine, rng = machine_of(pendulum(False)), np.random.default_rng(1)
-    c, Z, X = machine.prepare(THETA), rng.normal(size=(2, 64)), np.empty((2, N))
+    c, Z, X = machine.prepare.function(THETA), rng.normal(size=(2, 64)), np.empty((2, N))
     a, s, r = THETA
 
-    machine.initialise(c, Z, X)
+    machine.initialise.function(c, Z, X)
     np.testing.assert_allclose(X, [a + np.sqrt(0.5) * Z[0, :N], np.zeros(N)], rtol=1e-12)
 
     X = states()
@@ -64,27 +62,27 @@ def test_members_move_and_are_seen_as_written(machine_of):
         X[1] + 0.1 * (-a * X[0] + force) + np.sqrt(0.1) * s * Z[0, :N],
     ]
     moved = X.copy()
-    machine.propagate(c, INPUTS, 1, 0.25, Z[:1], moved)
+    machine.propagate.function(c, INPUTS, 1, 0.25, Z[:1], moved)
     np.testing.assert_allclose(moved, expected, rtol=1e-12)
 
     D, root = np.empty((2, N)), np.linalg.cholesky([[0.4, 0.1], [0.1, 0.3]])
-    machine.observe(c, INPUTS, 2, 0.0, Z, X, D)
+    machine.observe.function(c, INPUTS, 2, 0.0, Z, X, D)
     seen = np.array([X[0] + INPUTS[2, 0], r * X[1]])
     np.testing.assert_allclose(D, seen + root @ Z[:, :N], rtol=1e-12)
 
     out, d = np.empty(N), np.array([0.2, -0.4])
-    machine.log_density(c, INPUTS, 2, 0.0, d, X, out)
+    machine.log_density.function(c, INPUTS, 2, 0.0, d, X, out)
     true = stats.multivariate_normal([0, 0], [[0.4, 0.1], [0.1, 0.3]]).logpdf((d[:, None] - seen).T)
     np.testing.assert_allclose(out, true, rtol=1e-12)
-    machine.log_density(c, INPUTS, 2, 0.0, np.array([np.nan, -0.4]), X, out)
+    machine.log_density.function(c, INPUTS, 2, 0.0, np.array([np.nan, -0.4]), X, out)
     np.testing.assert_allclose(out, stats.norm(seen[1], np.sqrt(0.3)).logpdf(-0.4), rtol=1e-12)
 
 
 def test_general_noise_has_the_covariance_d_gamma_d():
-    machine = ensemble_machine(pendulum(True))
-    c, X, r = machine.prepare(THETA), states(), THETA[2]
+    machine = compile_system(pendulum(True))
+    c, X, r = machine.prepare.function(THETA), states(), THETA[2]
     out, d = np.empty(N), np.array([0.2, -0.4])
-    machine.log_density(c, INPUTS, 0, 0.0, d, X, out)
+    machine.log_density.function(c, INPUTS, 0, 0.0, d, X, out)
     gamma = np.array([[0.4, 0.1], [0.1, 0.3]])
     for i in range(N):
         D = np.diag([X[0, i], r])

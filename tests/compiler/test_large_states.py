@@ -8,7 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 N_STATES = 40

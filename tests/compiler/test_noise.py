@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 
 
 def system(diffusion, dt=0.25, substeps=1):
@@ -23,13 +23,13 @@ def correlated(sigma):
 
 def test_one_step_has_the_mean_and_covariance_of_all_noises():
     merged = system(correlated)
-    machine = ensemble_machine(merged)
+    machine = compile_system(merged)
     assert (merged.m, machine.m) == (3, 2)
-    c = machine.prepare(np.array([0.7, 0.3]))
+    c = machine.prepare.function(np.array([0.7, 0.3]))
     # The rows of the identity as noise read the square root off the step.
     X = np.repeat([[1.0], [2.0]], 3, axis=1)
     Z = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    machine.propagate(c, np.zeros((0, 0)), 0, 0.0, Z, X)
+    machine.propagate.function(c, np.zeros((0, 0)), 0, 0.0, Z, X)
     assert X[:, 0] == pytest.approx([1.0 + 0.25 * 0.7 * 2.0, 2.0 - 0.25])
     root = X[:, 1:] - X[:, :1]
     gain = np.array([[0.6, 0.3, 0.0], [0.0, 0.5, 2.0]])
@@ -46,16 +46,18 @@ def test_one_step_has_the_mean_and_covariance_of_all_noises():
     ids=["of the state", "of time", "fewer"],
 )
 def test_other_noises_stay_as_they_are(kept):
-    assert ensemble_machine(kept).m == kept.m
+    assert compile_system(kept).m == kept.m
 
 
 def test_substeps_of_a_linear_system_are_one_noise_too():
-    assert ensemble_machine(system(correlated, substeps=2)).m == 2
+    assert compile_system(system(correlated, substeps=2)).m == 2
 
 
 def test_no_spread_in_one_direction_is_no_failure():
-    machine = ensemble_machine(system(lambda sigma: [[0.0, 0.0, 0.0], [0.6, sigma, 1.0]]))
+    machine = compile_system(system(lambda sigma: [[0.0, 0.0, 0.0], [0.6, sigma, 1.0]]))
     X, Z = np.ones((2, 4)), np.arange(8.0).reshape(2, 4)
-    machine.propagate(machine.prepare(np.array([1.0, 0.0])), np.zeros((0, 0)), 0, 0.0, Z, X)
+    machine.propagate.function(
+        machine.prepare.function(np.array([1.0, 0.0])), np.zeros((0, 0)), 0, 0.0, Z, X
+    )
     assert np.ptp(X[0]) == 0.0
     assert X[1] == pytest.approx(0.75 + 0.5 * np.hypot(0.6, 1.0) * Z[1])

@@ -14,7 +14,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 
 EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
@@ -45,10 +45,10 @@ gaussian = psf.StateSpaceModel(
 counted = psf.StateSpaceModel(observation_dist=counts, **common)
 for system in (gaussian, counted):
     print(system.fingerprint)
-    machine = ensemble_machine(system)
-    print(machine.key)
-print(psf.EKF().compile_gradient(gaussian).key)
-print(psf.EnKF(100).compile(gaussian).key)
+    machine = compile_system(system)
+    print(machine.propagate.key, machine.log_density.key)
+print(psf.EKF().compile_gradient(compile_system(gaussian)).key)
+print(psf.EnKF(100).compile(compile_system(gaussian)).key)
 print(*sources, sep="\\n")
 """
 

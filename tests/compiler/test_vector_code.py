@@ -12,7 +12,7 @@ from pytensor.compile.mode import Mode
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import member_function
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 
 N = 61  # vectors, and a rest
 C = np.array([0.7, 0.3])
@@ -122,9 +122,11 @@ def test_densities_of_observations_are_vector_code(observed):
         initial_cov=[[1.0]],
         **OBSERVED[observed],
     )
-    machine = ensemble_machine(system)
+    machine = compile_system(system)
     X, out = np.random.default_rng(0).normal(size=(1, N)), np.empty(N)
     inputs = np.zeros((1, 0))
-    machine.log_density(machine.prepare(C[:1]), inputs, 0, 0.0, np.array([2.0]), X, out)
-    assert vector_arithmetic(machine.log_density)
+    machine.log_density.function(
+        machine.prepare.function(C[:1]), inputs, 0, 0.0, np.array([2.0]), X, out
+    )
+    assert vector_arithmetic(machine.log_density.function)
     assert np.isfinite(out).all()

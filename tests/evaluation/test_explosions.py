@@ -10,7 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters import FAILURES
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 
 STEPS = [0, 10, 20, 40]
 RECORD = [1.0, -0.5, np.nan, 0.8]

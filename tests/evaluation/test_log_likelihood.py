@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 
@@ -141,8 +141,8 @@ def test_carried_states_are_not_nudged():
             carried=carried,
         )
 
-    assert ensemble_machine(system(["branch"])).free.tolist() == [0]
-    assert ensemble_machine(system([])).free.tolist() == [0, 1]
+    assert compile_system(system(["branch"])).free.tolist() == [0]
+    assert compile_system(system([])).free.tolist() == [0, 1]
     terms = psf.log_likelihood(system(["branch"]), psf.EnKF(50), {}, [0.3, 0.3], steps=[0, 1])
     assert np.isfinite(terms).all()
     with pytest.raises(psf.ModelError, match="branch"):

@@ -1,13 +1,22 @@
-"""Hand-made lowered systems for unit tests, and the exact Kalman likelihood of the linear ones.
+"""Hand-made compiled systems for unit tests, and the exact Kalman likelihood of the linear ones.
 
-A machine has the attributes that a filter captures from a lowered system: sizes, free states and
-njit functions.
+A machine has the attributes of `filters.protocol.System` that a filter reads.
 """
-
-from types import SimpleNamespace
 
 import numpy as np
 from numba import njit
+
+from pymc_statespace_filters.filters import CompiledFunction
+
+
+class Machine:
+    """Sizes, free states and njit functions; hashable by identity."""
+
+    def __init__(self, functions, **values):
+        self.__dict__ |= {f.__name__: CompiledFunction(f) for f in functions} | values
+        self.carried, self.states = (), tuple(f"x{i}" for i in range(self.n))
+        self.gaussian_observation = self.additive_noise = True
+        self.has_exact_observation_density = True
 
 
 def _additive_observation(H, R):
@@ -69,11 +78,10 @@ def linear_machine(F, G, H, R, m0, L0, free=None):
             for a in range(n):
                 X[a, i] = new[a]
 
-    return SimpleNamespace(
-        n=n, m=m, p=H.shape[0], r=H.shape[0], n_inputs=0, n_constants=1, dt=0.1, key=None,
+    return Machine(
+        (prepare, initialise, propagate, observe, log_density),
+        n=n, m=m, p=H.shape[0], r=H.shape[0], n_inputs=0, n_theta=1, n_constants=1, dt=0.1,
         free=np.arange(n) if free is None else np.array(free, dtype=np.int64),
-        prepare=prepare, initialise=initialise, propagate=propagate,
-        observe=observe, log_density=log_density,
         matrices=(F, G, H, R, m0, L0),
     )  # fmt: skip
 
@@ -167,10 +175,9 @@ def double_well_machine():
         for i in range(x.size):
             x[i] = linear * x[i] + cubic * x[i] * x[i] * x[i] + sd * z[i]
 
-    return SimpleNamespace(
-        n=1, m=1, p=1, r=1, n_inputs=0, n_constants=4, dt=dt, key=None, free=np.arange(1),
-        prepare=prepare, initialise=initialise, propagate=propagate,
-        observe=observe, log_density=log_density,
+    return Machine(
+        (prepare, initialise, propagate, observe, log_density),
+        n=1, m=1, p=1, r=1, n_inputs=0, n_theta=4, n_constants=4, dt=dt, free=np.arange(1),
     )  # fmt: skip
 
 

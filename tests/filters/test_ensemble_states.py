@@ -13,6 +13,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
 from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
@@ -194,7 +195,7 @@ def test_ancestries_are_settled_after_a_lag(name):
     assert (several[0].mean[1] != shorter[0].mean[1]).all()
     truth = exact_swing("smoothed", rows[1:], LONG_STEPS[:until], LONG_DATA[:until])
     assert_right([s._replace(mean=s.mean[1:], sd=s.sd[1:]) for s in several], truth, 2 * slack)
-    assert f"{LAG} observations" in filter.smoothing_method(SWING)
+    assert f"{LAG} observations" in filter.smoothing_method(compile_system(SWING))
 
 
 def test_distinct_ancestors_are_counted():
@@ -240,9 +241,9 @@ def test_carried_states_have_no_past_to_nudge():
 
 
 def test_smoothing_methods():
-    assert psf.EnKF(50).smoothing_method(PAIR) == "ensemble Kalman smoother"
+    assert psf.EnKF(50).smoothing_method(compile_system(PAIR)) == "ensemble Kalman smoother"
     for filter in (psf.BootstrapPF(50), psf.PFEnKF(50)):
-        assert filter.smoothing_method(PAIR) == "backward simulation"
+        assert filter.smoothing_method(compile_system(PAIR)) == "backward simulation"
 
 
 def double_well_errors(filter, moment, n_seeds):

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters import FAILURES
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
@@ -298,7 +299,7 @@ def refused(**changes):
     }
     system = psf.StateSpaceModel(**settings | changes)
     with pytest.raises(psf.ModelError) as error:
-        psf.GridFilter().check(system)
+        psf.GridFilter().check(compile_system(system))
     return str(error.value)
 
 
@@ -357,11 +358,13 @@ def test_exact_means_smooth_equations_and_a_density_without_approximation():
         )
 
     grid = psf.GridFilter()
-    assert grid.is_exact_for(system())
-    assert grid.is_exact_for(COUNTED)
-    assert grid.is_exact_for(DOUBLE_WELL_SYSTEM)
-    assert not grid.is_exact_for(system(lambda x, q: [0.9 * abs(x[0]) + q[0]]))
-    assert not grid.is_exact_for(system(observation=lambda x, e: [x[0] * pt.exp(e[0])]))
+    assert grid.is_exact_for(compile_system(system()))
+    assert grid.is_exact_for(compile_system(COUNTED))
+    assert grid.is_exact_for(compile_system(DOUBLE_WELL_SYSTEM))
+    assert not grid.is_exact_for(compile_system(system(lambda x, q: [0.9 * abs(x[0]) + q[0]])))
+    assert not grid.is_exact_for(
+        compile_system(system(observation=lambda x, e: [x[0] * pt.exp(e[0])]))
+    )
 
 
 def test_tails_that_a_surprise_asks_for_were_not_cut_off_before():

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.jit import compiled as compiled_code
 from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.point_mass.moments import draw
@@ -41,7 +42,7 @@ class States(NamedTuple):
 
 @cache
 def compiled(system, moment):
-    return psf.GridFilter().compile_states(system, moment).function
+    return psf.GridFilter().compile_states(compile_system(system), moment).function
 
 
 def states(system, parameters, steps, observed, rows, moment, *, draw_seed=0, inputs=None):
@@ -345,7 +346,7 @@ def test_no_rows():
 
 def test_what_identifies_the_code_and_the_words_for_it():
     filter = psf.GridFilter()
-    keys = {filter.compile_states(FORCED, moment).key for moment in MOMENTS}
-    assert len(keys | {filter.compile(FORCED).key}) == 4
+    keys = {filter.compile_states(compile_system(FORCED), moment).key for moment in MOMENTS}
+    assert len(keys | {filter.compile(compile_system(FORCED)).key}) == 4
     assert None not in keys
-    assert filter.smoothing_method(FORCED) == "point masses, forwards and back"
+    assert filter.smoothing_method(compile_system(FORCED)) == "point masses, forward and backward"

@@ -5,8 +5,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
-from pymc_statespace_filters.filters.ensemble.reductions import local_partition, sum_products
+from pymc_statespace_filters.filters.ensemble.reductions import local_partition, weighted_cov
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     kernel_workspace,
@@ -15,6 +16,11 @@ from pymc_statespace_filters.filters.kernel_density.density import (
 )
 
 ALONE = RankLayout(0, 1, 0)
+
+
+@njit_contract
+def covariance(w, X, kernel, divisor, local):
+    weighted_cov(w, X, kernel.mean, X, kernel.mean, divisor, local, kernel.cov)
 
 
 def all_members(n_members, n):
@@ -26,8 +32,8 @@ def bandwidth(X, w, free=None):
     free = np.arange(n) if free is None else np.array(free)
     local, kernel = all_members(N, n), kernel_workspace.py_func(n, free.size)
     kernel.mean[:] = np.where(w > 0, X, 0) @ w
-    sum_products(w, X, kernel.mean, X, kernel.mean, local, 0)
-    ok = scott_bandwidth(local, 0, 1 - w @ w, 1 / (w @ w), free, kernel)
+    covariance(w, X, kernel, 1 - w @ w, local)
+    ok = scott_bandwidth(1 / (w @ w), free, kernel)
     return ok, kernel, free
 
 

@@ -35,7 +35,7 @@ MACHINES = {"line": LINE[0], "plane": OSCILLATOR[0], "space": SPACE[0], "well": 
 
 @cache
 def compiled(filter_, name):
-    return filter_.shared_kernel(MACHINES[name])
+    return filter_.compile_distributed(MACHINES[name]).function
 
 
 def assert_same(filter_, name, steps, observed, theta=(1.0,), sizes=SIZES):

@@ -9,7 +9,6 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS, fill_normals
-from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, shared_evaluator
 from pymc_statespace_filters.filters import BootstrapPF, EnKF
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
@@ -18,16 +17,15 @@ from pymc_statespace_filters.filters.ensemble.partition import (
     local_range,
 )
 from pymc_statespace_filters.filters.ensemble.reductions import (
-    exchange,
+    count,
     local_partition,
-    sum_members,
-    sum_products,
-    sum_spread,
-    sum_values,
-    total,
+    weight_spread,
+    weighted_cov,
+    weighted_mean,
 )
 from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
-from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
+from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
@@ -44,17 +42,17 @@ IN_THE_WELL = [EnKF(N), EnKF(N, likelihood="gaussian"), BootstrapPF(N)]
 _shared = {}
 
 
-def shared_kernel(filter_, machine):
+def distributed_function(filter_, machine):
     """Compiled once for all tests of this file."""
     key = filter_, id(machine)
     if key not in _shared:
-        _shared[key] = filter_.shared_kernel(machine), machine
+        _shared[key] = filter_.compile_distributed(machine).function, machine
     return _shared[key][0]
 
 
 def evaluations(filter_, machine, steps, observed, theta=(1.0,), seed=3, numbers=NUMBERS):
     """Terms and health on every rank, for several numbers of ranks."""
-    run = shared_kernel(filter_, machine)
+    run = distributed_function(filter_, machine)
     record = (
         np.array(theta, dtype=float),
         np.asarray(steps, dtype=np.int64),
@@ -107,24 +105,17 @@ def test_normals_of_a_part_are_those_of_the_whole():
 
 @njit_contract
 def all_sums(rank, n_ranks, address, w, X, log_w):
-    """Sums of our part of w, X and log_w, by way of the ranks' exchange."""
+    """Sums of the local part of w, X and log_w, by way of the ranks' exchange."""
     local = local_partition(RankLayout(rank, n_ranks, address), w.size, 12)
     mine = slice(local.first, local.first + local.size)
     v, Y, out, log_v = w[mine].copy(), X[:, mine].copy(), np.empty(9), log_w[mine].copy()
-    relative, zeros = np.empty(v.size), np.zeros(2)
-    sum_values(v, local, 0)
-    sum_spread(v, local, 1)
-    sum_members(v, Y, local, 2)
-    sum_products(v, Y, zeros, Y[:1], zeros, local, 4)
-    weigh(log_v, relative, local, 6)
-    exchange(local, 9)
-    for row in range(6):
-        out[row] = total(local, row)
-    out[6], out[7] = total_weight(local, 6)
-    normalise_own(out[6], log_v, relative, local, 6)
-    sum_values(relative, local, 0)
-    exchange(local, 1)
-    out[8] = total(local, 0)
+    relative, zeros, products = np.empty(v.size), np.zeros(2), np.empty((2, 1))
+    out[0], out[1] = count(v, local), weight_spread(v, local)
+    weighted_mean(v, Y, 1.0, local, out[2:4])
+    weighted_cov(v, Y, zeros, Y[:1], zeros, 1.0, local, products)
+    out[4], out[5] = products[0, 0], products[1, 0]
+    out[6], out[7] = normalise_weights(log_v, relative, local)
+    out[8] = count(relative, local)
     return out
 
 
@@ -150,9 +141,9 @@ def test_sums_are_those_of_exact_arithmetic_and_the_same_on_any_number_of_ranks(
     exact += [math.fsum(v * y * Y[0]) for y in Y]
     assert sums[0][:6] == pytest.approx(exact, rel=1e-13, abs=1e-15)
     finite = log_w[np.isfinite(log_w)]
-    layout = np.exp(finite - finite.max())
-    assert sums[0][6] == pytest.approx(finite.max() + math.log(math.fsum(layout)), rel=1e-14)
-    assert sums[0][7] == pytest.approx(math.fsum(layout) ** 2 / math.fsum(layout**2), rel=1e-13)
+    weights = np.exp(finite - finite.max())
+    assert sums[0][6] == pytest.approx(finite.max() + math.log(math.fsum(weights)), rel=1e-14)
+    assert sums[0][7] == pytest.approx(math.fsum(weights) ** 2 / math.fsum(weights**2), rel=1e-13)
     assert sums[0][8] == pytest.approx(1, rel=1e-13)
 
 
@@ -206,7 +197,9 @@ def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filte
     results = [
         result
         for size in (1, 2, 3)
-        for result in on_ranks(size, lambda ours: shared_evaluator(FORCED, filter_, ours)(*record))
+        for result in on_ranks(
+            size, lambda ours: distributed_evaluator(FORCED, filter_, ours)(*record)
+        )
     ]
     terms, _ = assert_all_the_same(results)
     alone = psf.log_likelihood(
@@ -219,7 +212,7 @@ def test_a_likelihood_has_few_exchanges():
     """They cost more than the sums: two an update, one in a particle filter, one to resample."""
     for filter_, each in ((EnKF(N), 2), (BootstrapPF(N, resample_below=1), 2)):
         machine, steps, observed = OSCILLATOR
-        run = shared_kernel(filter_, machine)
+        run = distributed_function(filter_, machine)
         arguments = np.ones(1), steps, observed, np.zeros((0, 0)), 0.0, 3
 
         def count(ours, run=run, arguments=arguments):

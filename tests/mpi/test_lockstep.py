@@ -41,10 +41,10 @@ def fail(rank):
     """Share a chain, of which one rank runs out of memory in the midst of an evaluation."""
     from mpi4py import MPI
 
-    shared_evaluator = lockstep.shared_evaluator
+    distributed_evaluator = lockstep.distributed_evaluator
 
     def failing(system, filter, ranks):
-        evaluate, calls = shared_evaluator(system, filter, ranks), []
+        evaluate, calls = distributed_evaluator(system, filter, ranks), []
 
         def evaluate_or_fail(*arguments):
             calls.append(arguments)
@@ -54,7 +54,7 @@ def fail(rank):
 
         return evaluate_or_fail
 
-    lockstep.shared_evaluator = failing
+    lockstep.distributed_evaluator = failing
     lockstep._ANSWER_SECONDS = 1.0
     with Communicator(MPI.COMM_WORLD) as ranks:
         led(ranks, chain, ranks)

@@ -13,8 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.simd import LANES
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))

@@ -12,11 +12,11 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.blockwise import Blockwise
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.base import cache_key, evaluator
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from tests.small_systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
 
 PF = psf.BootstrapPF(20)
@@ -64,8 +64,8 @@ def test_pickling(dumps):
     restored = pickle.loads(dumps(op))
     assert restored == op
     assert hash(restored) == hash(op)
-    assert cache_key(PAIR, restored.filter.compile(restored.system)) == cache_key(
-        PAIR, PF.compile(PAIR)
+    assert cache_key(PAIR, restored.filter.compile(compile_system(restored.system))) == cache_key(
+        PAIR, PF.compile(compile_system(PAIR))
     )
 
 
@@ -95,10 +95,10 @@ def test_machine_code_on_disk_is_named_by_all_that_is_compiled_in(filter, monkey
     timed = {"transition": CHANGES[-2]["transition"]}  # dt matters where time is asked for
     systems = [PAIR, *(pair(**c) for c in CHANGES if filter.noisy or "carried" not in c)]
     systems += [pair(**timed, dt=0.5), FORCED]
-    keys = [cache_key(s, filter.compile(s)) for s in systems]
+    keys = [cache_key(s, filter.compile(compile_system(s))) for s in systems]
     assert None not in keys
     assert len(set(keys)) == len(systems)
-    assert cache_key(pair(), filter.compile(pair())) == keys[0]
+    assert cache_key(pair(), filter.compile(compile_system(pair()))) == keys[0]
 
 
 def test_filters_and_their_settings_have_machine_code_of_their_own():
@@ -109,8 +109,8 @@ def test_filters_and_their_settings_have_machine_code_of_their_own():
         psf.BootstrapPF(20, resampling="multinomial"),
         *(psf.PFEnKF(20, likelihood=w) for w in ("predictive", "weights", "as_printed")),
     ]
-    keys = [cache_key(PAIR, filter.compile(PAIR)) for filter in filters]
-    keys.append(cache_key(PAIR, psf.EKF().compile_gradient(PAIR)))
+    keys = [cache_key(PAIR, filter.compile(compile_system(PAIR))) for filter in filters]
+    keys.append(cache_key(PAIR, psf.EKF().compile_gradient(compile_system(PAIR))))
     assert None not in keys
     assert len(set(keys)) == len(filters) + 1
 

@@ -10,9 +10,12 @@ from pytensor.graph.basic import Apply
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import FilterOp, evaluator
-from pymc_statespace_filters.ops.gradient import LogLikelihoodGradient
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.tape import TapedLogLikelihood, TapePullback
+from pymc_statespace_filters.ops.likelihood import (
+    LogLikelihood,
+    LogLikelihoodGradient,
+    TapedLogLikelihood,
+    TapePullback,
+)
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 THETA = np.array([0.6, 0.2])

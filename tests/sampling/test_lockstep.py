@@ -208,10 +208,10 @@ class Unlucky(RuntimeError):
 
 def fail_on(rank, monkeypatch, *, at_call=3):
     """Let a rank raise in the midst of its evaluations, where the others need it."""
-    shared_evaluator = lockstep.shared_evaluator
+    distributed_evaluator = lockstep.distributed_evaluator
 
     def failing(system, filter, ranks):
-        evaluate, calls = shared_evaluator(system, filter, ranks), []
+        evaluate, calls = distributed_evaluator(system, filter, ranks), []
 
         def evaluate_or_fail(*arguments):
             calls.append(arguments)
@@ -221,7 +221,7 @@ def fail_on(rank, monkeypatch, *, at_call=3):
 
         return evaluate_or_fail
 
-    monkeypatch.setattr(lockstep, "shared_evaluator", failing)
+    monkeypatch.setattr(lockstep, "distributed_evaluator", failing)
 
 
 def test_followers_that_do_not_hear_are_not_left_behind(monkeypatch):
@@ -288,14 +288,14 @@ def test_followers_hear_of_the_leaders_error():
 
 def test_a_follower_that_cannot_is_named_and_not_waited_for(monkeypatch):
     """All raise in time: the follower what it met, the leader who it was."""
-    shared_evaluator = lockstep.shared_evaluator
+    distributed_evaluator = lockstep.distributed_evaluator
 
     def unable(system, filter, ranks):
         if ranks.rank == 1 and filter == PARTICLES:
             raise Unlucky("no compiler")
-        return shared_evaluator(system, filter, ranks)
+        return distributed_evaluator(system, filter, ranks)
 
-    monkeypatch.setattr(lockstep, "shared_evaluator", unable)
+    monkeypatch.setattr(lockstep, "distributed_evaluator", unable)
     leader, first, second = outcomes(3, evaluate_ten)
     assert isinstance(leader, ParallelError)
     assert "rank 1 of the 3" in str(leader)

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
@@ -119,7 +120,7 @@ def test_smoothed_states_know_the_whole_record(at):
     assert_exact(group, laws_of(partial(pair_law, "smoothed", rows), A))
     assert group.attrs["at"] == at
     attrs = group["d_states"].attrs
-    assert attrs == {"filter": "EKF()", "smoothing": EKF.smoothing_method(PAIR)}
+    assert attrs == {"filter": "EKF()", "smoothing": EKF.smoothing_method(compile_system(PAIR))}
 
 
 def test_at_observations_by_default():

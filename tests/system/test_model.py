@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import call
 
 
@@ -44,12 +44,12 @@ def double_well(**changes):
 
 def moved(system, params, x, q=None, inputs=None, k=0, t=0.0):
     """One transition of one member, by the compiled code."""
-    machine = ensemble_machine(system)
+    machine = compile_system(system)
     theta = np.concatenate([np.ravel(params[name]).astype(float) for name in system.parameters])
     X, Z = np.array(x, dtype=float)[:, None], np.zeros((system.m, 64))
     Z[:, 0] = 0.0 if q is None else q
     inputs = np.zeros((k + 1, 0)) if inputs is None else np.asarray(inputs, dtype=float)
-    machine.propagate(machine.prepare(theta), inputs, k, t, Z, X)
+    machine.propagate.function(machine.prepare.function(theta), inputs, k, t, Z, X)
     return X[:, 0]
 
 
@@ -141,13 +141,13 @@ def test_functions_of_parameters_for_every_covariance():
         shapes={"L": (2, 2)},
     )
     assert system.parameters == ("a", "g", "s", "r", "m", "L")  # in the order of the arguments
-    machine = ensemble_machine(system)
-    c = machine.prepare(np.array([0.9, 4.0, 1.0, 0.5, 3.0, 1.0, 0.0, 0.5, 2.0]))
+    machine = compile_system(system)
+    c = machine.prepare.function(np.array([0.9, 4.0, 1.0, 0.5, 3.0, 1.0, 0.0, 0.5, 2.0]))
     X, Z = np.empty((2, 1)), np.zeros((2, 64))
     Z[:, 0] = [1.0, -1.0]
-    machine.initialise(c, Z, X)
+    machine.initialise.function(c, Z, X)
     np.testing.assert_allclose(X[:, 0], [3 + 1, 6 + 0.5 - 2], rtol=1e-14)
-    machine.propagate(c, np.zeros((1, 0)), 0, 0.0, Z, X)
+    machine.propagate.function(c, np.zeros((1, 0)), 0, 0.0, Z, X)
     root = np.linalg.cholesky([[1.0, 0.5], [0.5, 2.0]])
     np.testing.assert_allclose(X[:, 0], 0.9 * np.array([4, 4.5]) + root @ [1, -1], rtol=1e-14)
 
@@ -199,7 +199,7 @@ def test_equal_equations_make_equal_systems():
     assert one == two
     assert hash(one) == hash(two)
     assert one.fingerprint == two.fingerprint
-    assert ensemble_machine(one) is ensemble_machine(two)  # compiled once
+    assert compile_system(one) is compile_system(two)  # compiled once
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,14 @@ MEMBER_INPUTS = frozenset({"x", "z"})
 
 
 @dataclass(frozen=True)
-class CompiledFunction:
-    """A compiled function and the key that identifies its code (None: not cacheable)."""
+class CompiledFunction[F]:
+    """A compiled function of the type F, and the key that identifies its code.
 
-    function: Any
-    key: str | None
+    Without a key the code cannot be cached on disk.
+    """
+
+    function: F
+    key: str | None = None
 
 
 @dataclass(frozen=True)

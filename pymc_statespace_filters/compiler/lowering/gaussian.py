@@ -1,9 +1,14 @@
 """Gaussian log-densities as graphs, with components left out."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.lowering.symbols import call, observation_moments
+from pymc_statespace_filters.system.model import StateSpaceModel
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -32,3 +37,13 @@ def log_normal(
     standardised = solve_triangular(chol, residual, lower=True, b_ndim=1)
     log_det = pt.sum(pt.log(pt.diagonal(chol)))
     return -0.5 * pt.sum(standardised**2) - log_det - 0.5 * LOG_2PI * pt.sum(seen)
+
+
+def observation_log_density(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> TensorVariable:
+    """log p(d | x); Gaussian noise through D Gamma D^T at e = 0 (Eqs. 4.4, 4.12)."""
+    if system.equations.observation_logp is not None:
+        return call(system.equations.observation_logp, system, symbols)
+    mean, cov = observation_moments(system, symbols)
+    return log_normal(*without_missing(symbols["d"], mean, cov))

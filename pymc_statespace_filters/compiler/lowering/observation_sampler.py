@@ -7,7 +7,7 @@ from pytensor.graph.fg import FrozenFunctionGraph
 
 from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.ensemble import ensemble_machine
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -17,13 +17,13 @@ def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
     """``observe(rng, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1) to out (p,)."""
     if (draw := system.equations.observation_draw) is not None:
         return _distribution_sampler(system, draw)
-    machine = ensemble_machine(system)
-    observe_members, p, r = machine.simulate, system.p, system.r
+    simulated, p, r = compile_system(system).observe, system.p, system.r
+    observe_members = simulated.function
 
     def observe(rng, c, inputs, k, t, x, out):
         observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))
 
-    return CompiledFunction(jit(observe), machine.key)
+    return CompiledFunction(jit(observe), simulated.key)
 
 
 def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:

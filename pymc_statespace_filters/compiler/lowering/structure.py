@@ -1,10 +1,10 @@
 """What the Jacobians of a system tell: noises that can be drawn as one, and linearity."""
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 
 import numpy as np
 import pytensor
+import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
@@ -13,10 +13,20 @@ from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import unrolled
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
 from pymc_statespace_filters.compiler.codegen.source import depends_on
-from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, call, jacobian_of, symbols_of
+from pymc_statespace_filters.compiler.lowering.symbols import (
+    SYMBOLS,
+    call,
+    jacobian_of,
+    process_noise_cov,
+    symbols_of,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 _N_TRIALS = 5
+_KINKED = (
+    ps.Switch, ps.Abs, ps.ScalarMaximum, ps.ScalarMinimum, ps.Clip, ps.Sign, ps.Floor, ps.Ceil,
+    ps.Mod, ps.IntDiv, ps.Cast,
+)  # fmt: skip
 
 
 def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
@@ -31,10 +41,8 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
     if not is_free_of(("x", "q", "u", "t"), gain, symbols):
         return None
-    cov = pt.as_tensor(np.eye(system.m))
-    if system.equations.process_noise is not None:
-        cov = call(system.equations.process_noise, system, symbols)
-    return FrozenFunctionGraph.from_io([symbols[s] for s in SYMBOLS], [gain @ cov @ gain.T])
+    cov = process_noise_cov(system, symbols, gain)
+    return FrozenFunctionGraph.from_io([symbols[s] for s in SYMBOLS], [cov])
 
 
 def is_linear(system: StateSpaceModel) -> bool:
@@ -51,7 +59,33 @@ def is_linear(system: StateSpaceModel) -> bool:
     return all(is_free_of(variables, jac, symbols) for jac in jacobians)
 
 
-@lru_cache(maxsize=256)
+def has_additive_process_noise(system: StateSpaceModel) -> bool:
+    """Whether g(x, q) = g(x, 0) + G(x) q; False where that cannot be decided."""
+    symbols = symbols_of(system)
+    transition = call(system.equations.transition, system, symbols)
+    return is_free_of(("q",), jacobian_of(transition, symbols["q"]), symbols)
+
+
+def has_smooth_transition(system: StateSpaceModel) -> bool:
+    """Whether no part of the transition has a kink or a jump; False where undecided."""
+    symbols = symbols_of(system)
+    transition = call(system.equations.transition, system, symbols)
+    try:
+        (values,) = unrolled(Graph(symbols, [transition]))
+    except NotUnrollableError:
+        return False
+    return not any(isinstance(e.op, _KINKED) for e in depends_on(values, frozenset({"x.0"})))
+
+
+def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:
+    """(g(x, 0), G Q G^T) of a system of one state with additive noise."""
+    q = pt.zeros((system.m,))
+    mean = call(system.equations.transition, system, {**symbols, "q": q})
+    gain = jacobian_of(mean, q)
+    cov = process_noise_cov(system, symbols, gain)
+    return pt.specify_shape(pt.concatenate([mean, cov.ravel()]), (2,))
+
+
 def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
     """Whether the noise of one step has a covariance of full rank, at a state somewhere.
 
@@ -62,13 +96,9 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
         return False
     symbols = symbols_of(system)
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
-    cov = pt.as_tensor(np.eye(system.m))
-    if system.equations.process_noise is not None:
-        cov = call(system.equations.process_noise, system, symbols)
+    cov = process_noise_cov(system, symbols, gain)
     inputs = [symbols[name] for name in ("theta", "x", "q", "u", "t")]
-    noise_cov = pytensor.function(
-        inputs, gain @ cov @ gain.T, mode="FAST_COMPILE", on_unused_input="ignore"
-    )
+    noise_cov = pytensor.function(inputs, cov, mode="FAST_COMPILE", on_unused_input="ignore")
     rng = np.random.default_rng(0)
     for _ in range(_N_TRIALS):
         point = [np.abs(rng.normal(size=value.type.shape)) for value in inputs]

@@ -40,6 +40,15 @@ def call(
     return output
 
 
+def process_noise_cov(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable], gain: TensorVariable
+) -> TensorVariable:
+    """G Q G^T, for the covariance Q of q and a gain G (n, m); an integrator's Q is the identity."""
+    if system.equations.process_noise is None:
+        return gain @ gain.T
+    return gain @ call(system.equations.process_noise, system, symbols) @ gain.T
+
+
 def observation_moments(
     system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
 ) -> tuple[TensorVariable, TensorVariable]:

@@ -8,7 +8,9 @@ process. So a filter is compiled once per installation, and a model once for all
 Arguments of an entry are numbers and addresses of contiguous float64 or int64 data.
 """
 
-from collections.abc import Callable, Sequence
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 from typing import Any
 from uuid import uuid4
 
@@ -67,26 +69,38 @@ class EntryPoint:
     ----------
     function : callable
         Returns nothing and raises nothing. It may close over compiled functions.
-    arguments : tuple of numba types
-        ``F64_PTR`` and ``I64_PTR`` are addresses, which ``numba.carray`` makes arrays of.
+    arguments : mapping of str to numba type
+        The parameters of the function, by name and in order. ``F64_PTR`` and ``I64_PTR`` are
+        addresses, of which ``numba.carray`` makes arrays.
     name : str
         Part of the symbol, for the reader of a profile.
     key : str or None
-        Identifies the code, see ``keys.digest``; None if it cannot be kept on disk.
-    needs : sequence of Entry
+        Identifies the code, see `digest`; None if it cannot be cached on disk.
+    needs : sequence of EntryPoint
         What the function calls by symbol.
+
+    Raises
+    ------
+    TypeError
+        If the names or the order of the arguments are not those of the function: machine code
+        would read one argument as another.
     """
 
     def __init__(
         self,
         function: Callable,
-        arguments: tuple,
+        arguments: Mapping[str, Any],
         name: str,
         key: str | None,
         needs: Sequence["EntryPoint"] = (),
     ):
+        if (parameters := list(signature(function).parameters)) != list(arguments):
+            raise TypeError(
+                f"the arguments of entry point {name!r} must be {parameters}, the parameters of "
+                f"its function, got {list(arguments)}"
+            )
         self._function = function
-        self._arguments = arguments
+        self._arguments = tuple(arguments.values())
         self._needs = needs
         self.key = key
         self.symbol = f"psf_{name}_{key or uuid4().hex}"
@@ -122,6 +136,11 @@ class EntryPoint:
         pointer = types.CPointer
         arguments = (types.intp if isinstance(a, pointer) else a for a in self._arguments)
         return types.ExternalFunction(self.symbol, types.void(*arguments))
+
+
+def arguments_class(name: str, arguments: Mapping[str, Any], module: str) -> Any:
+    """Make the named tuple with which a caller gives the arguments of an entry point by name."""
+    return namedtuple(name, list(arguments), module=module)
 
 
 @intrinsic(prefer_literal=True)

@@ -173,7 +173,7 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
     key = digest("adapter", Path(__file__).read_text(), source, str(signature), str(results))
-    entry = EntryPoint(namespace["adapter"], (I64_PTR, F64_PTR), "adapter", key)
+    entry = EntryPoint(namespace["adapter"], {"table": I64_PTR, "out": F64_PTR}, "adapter", key)
     entry.compile()
     return entry.address
 

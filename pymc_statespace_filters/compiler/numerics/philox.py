@@ -136,9 +136,14 @@ def _fill(seed, purpose, step, first_block, z, n_rows, width):
     fill_normals(seed, np.uint64(purpose), step, carray(z, (n_rows, width)), first_block)
 
 
+_ARGUMENTS = {
+    "seed": types.int64, "purpose": types.int64, "step": types.int64, "first_block": types.int64,
+    "z": F64_PTR, "n_rows": types.intp, "width": types.intp,
+}  # fmt: skip
+
 FILL_NORMALS = EntryPoint(
     _fill,
-    (types.int64, types.int64, types.int64, types.int64, F64_PTR, types.intp, types.intp),
+    _ARGUMENTS,
     "fill_normals",
     digest("fill_normals"),
 )

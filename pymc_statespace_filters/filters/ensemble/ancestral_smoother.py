@@ -1,30 +1,34 @@
-"""Smoothing by carrying the past along: what befalls the members befalls their past states too.
+"""Ensemble Kalman and fixed-lag ancestral smoothing: past states change with the present ones.
 
-Where members are nudged, past states are nudged by the same innovations with gains of their own,
+Where members are updated, past states are updated by the same innovations with their own gains,
 
     x_i(k) <- x_i(k) + P_xd P_dd^-1 (d - d_i),   P_xd the covariance of x(k) with the observation,
 
 which is the ensemble Kalman smoother (Evensen and van Leeuwen 2000). Where members are resampled,
-past states go the way of their members: a particle's ancestry. Ancestries meet: the longer ago, the
-fewer distinct ones. So a state is settled once a fixed lag of later observations is behind it
-(Kitagawa 1996), with the weights of that moment; members that are never resampled have no such
-lag.
+past states are resampled with them: a particle's ancestry. Ancestries coalesce: the further back,
+the fewer distinct ones. So a state is settled a fixed lag of observations later (Kitagawa 1996),
+with the weights of that moment; members that are never resampled have no such lag.
 
-A particle filter that nudges weights the states of the present alone; its past, nudged like an
-ensemble's and weighted like its present, is exact for linear systems as its number grows, and else
-an approximation.
+A particle filter with Kalman updates weights present states alone. Its past states, updated like
+those of an ensemble and weighted like the present ones, are exact for linear systems as the number
+of particles grows, and otherwise an approximation.
 """
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import (
+    inline_always,
+    keep_alive,
+    njit_contract,
+    njit_reassoc,
+)
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
@@ -44,70 +48,112 @@ from pymc_statespace_filters.filters.ensemble.summaries import (
     results,
     summarise_row,
 )
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import NONE
+from pymc_statespace_filters.filters.outcomes import NONE, is_missing
+from pymc_statespace_filters.filters.protocol import StatesFunction, System
 
 LAG = 10
 """Observations after which the past of a resampled particle is settled."""
 
-# Whole numbers of the witness: the first ten below; then the free states, the steps of the rows, at
-# which observation each is settled, and a slot of first ancestors (N,) for every row kept.
-# Real ones: results as `summarise_row` has them, the last weights (N,), and slots of states (n, N).
-_N_COUNTS = 10
-_N, _MEMBERS, _P, _ROWS, _SLOTS, _SEED, _NUDGES, _FREE, _STORED, _SETTLED = range(_N_COUNTS)
+NO_LAG = np.iinfo(np.int64).max // 2
+"""For members that are never resampled: their past is settled when the record ends."""
+
+# Integers of the callback: the header below; then the free states, the steps of the rows, the
+# observation at which each is settled, and a slot of first ancestors (N,) for every row kept.
+# Reals: results as `summarise_row` writes them, the last weights (N,), and slots of states (n, N).
+_N_HEADER = 10
+_N, _MEMBERS, _P, _ROWS, _SLOTS, _SEED, _UPDATES, _FREE, _STORED, _SETTLED = range(_N_HEADER)
 
 
-def _carry(counts, numbers, event, j, k, members, log_weights, d, simulated, ancestors):
-    of = carray(counts, (_N_COUNTS,))
-    n, N, p, R, S, n_free = of[_N], of[_MEMBERS], of[_P], of[_ROWS], of[_SLOTS], of[_FREE]
-    whole = carray(counts, (_N_COUNTS + n_free + 2 * R + S * N,))
-    free, rows = whole[_N_COUNTS : _N_COUNTS + n_free], whole[_N_COUNTS + n_free :]
-    settled_at, origins = rows[R:], rows[2 * R :].reshape(S, N)
-    real = carray(numbers, ((3 * n + 1) * R + N + S * n * N,))
-    last_log_w = real[(3 * n + 1) * R : (3 * n + 1) * R + N]
-    past = real[(3 * n + 1) * R + N :].reshape(S, n, N)
-    X, log_w = carray(members, (n, N)), carray(log_weights, (N,))
+class _Past(NamedTuple):
+    """The two vectors of the callback, by name."""
+
+    header: np.ndarray
+    free: np.ndarray
+    rows: np.ndarray
+    settled_at: np.ndarray
+    origins: np.ndarray
+    results: np.ndarray
+    last_log_w: np.ndarray
+    states: np.ndarray
+
+
+@inline_always
+def _n_integers(header):
+    n_rows, slots = 2 * header[_ROWS], header[_SLOTS] * header[_MEMBERS]
+    return _N_HEADER + header[_FREE] + n_rows + slots
+
+
+@inline_always
+def _n_reals(header):
+    n, N = header[_N], header[_MEMBERS]
+    return (3 * n + 1) * header[_ROWS] + N + header[_SLOTS] * n * N
+
+
+@inline_always
+def _past_of(integers, reals):
+    """Name the parts of the two vectors."""
+    header, whole = integers[:_N_HEADER], integers[_N_HEADER:]
+    n, N, R = header[_N], header[_MEMBERS], header[_ROWS]
+    S, n_free, n_results = header[_SLOTS], header[_FREE], (3 * n + 1) * R
+    return _Past(
+        header=header,
+        free=whole[:n_free],
+        rows=whole[n_free : n_free + R],
+        settled_at=whole[n_free + R : n_free + 2 * R],
+        origins=whole[n_free + 2 * R :].reshape(S, N),
+        results=reals[:n_results],
+        last_log_w=reals[n_results : n_results + N],
+        states=reals[n_results + N :].reshape(S, n, N),
+    )
+
+
+def _carry_past(integers, reals, event, j, k, X, log_w, d, D, ancestors):
+    header = carray(integers, (_N_HEADER,))
+    past = _past_of(carray(integers, (_n_integers(header),)), carray(reals, (_n_reals(header),)))
+    n, N, p, S = header[_N], header[_MEMBERS], header[_P], header[_SLOTS]
+    members, log_weights = carray(X, (n, N)), carray(log_w, (N,))
 
     if event == FORECAST:
-        if of[_STORED] < R and rows[of[_STORED]] == k:
-            slot = of[_STORED] % S
+        if header[_STORED] < header[_ROWS] and past.rows[header[_STORED]] == k:
+            slot = header[_STORED] % S
             for i in range(N):
-                origins[slot, i] = i
+                past.origins[slot, i] = i
                 for a in range(n):
-                    past[slot, a, i] = X[a, i]
-            of[_STORED] += 1
+                    past.states[slot, a, i] = members[a, i]
+            header[_STORED] += 1
     elif event == UPDATED:
-        if of[_NUDGES]:
-            datum, D = carray(d, (p,)), carray(simulated, (p, N))
-            _nudge_past(past, of[_SETTLED], of[_STORED], last_log_w, datum, D, free)
-        last_log_w[:] = log_w
-        while of[_SETTLED] < of[_STORED] and settled_at[of[_SETTLED]] <= j:
-            _settle(of, real, past, origins, log_w)
+        if header[_UPDATES]:
+            _update_past(past, carray(d, (p,)), carray(D, (p, N)))
+        past.last_log_w[:] = log_weights
+        while header[_SETTLED] < header[_STORED] and past.settled_at[header[_SETTLED]] <= j:
+            _settle(past, log_weights)
     elif event == RESAMPLED:
         parents = carray(ancestors, (N,))
-        for row in range(of[_SETTLED], of[_STORED]):
-            _follow(parents, past[row % S], origins[row % S])
-        last_log_w[:] = log_w
+        for row in range(header[_SETTLED], header[_STORED]):
+            _resample_past(parents, past.states[row % S], past.origins[row % S])
+        past.last_log_w[:] = log_weights
     elif event == ENDED:
-        while of[_SETTLED] < of[_STORED]:
-            _settle(of, real, past, origins, log_w)
+        while header[_SETTLED] < header[_STORED]:
+            _settle(past, log_weights)
 
 
 @njit_contract
-def _settle(of, real, past, origins, log_w):
-    """Write down what is known of the oldest row that is kept."""
-    row = of[_SETTLED]
-    slot = row % of[_SLOTS]
-    w = finite_weights(past[slot], log_w)
+def _settle(past, log_w):
+    """Write the summary of the oldest row that is kept."""
+    header = past.header
+    row, R = header[_SETTLED], header[_ROWS]
+    slot = row % header[_SLOTS]
+    states = past.states[slot]
+    w = finite_weights(states, log_w)
     # One number for all rows: neighbours choose the same ancestry while it lives.
-    summarise_row(real, of[_ROWS], row, past[slot], w, of[_SEED], 0)
-    real[3 * of[_N] * of[_ROWS] + row] = _count_distinct(w, origins[slot])
-    of[_SETTLED] += 1
+    summarise_row(past.results, R, row, states, w, header[_SEED], 0)
+    past.results[3 * header[_N] * R + row] = _count_distinct(w, past.origins[slot])
+    header[_SETTLED] += 1
 
 
 @njit_contract
 def _count_distinct(w, origins):
-    """How many ancestors the members that have weight come from."""
+    """Number of distinct ancestors of the members that have weight."""
     seen, count = np.zeros(w.size, np.bool_), 0
     for i in range(w.size):
         if w[i] > 0.0 and not seen[origins[i]]:
@@ -117,7 +163,7 @@ def _count_distinct(w, origins):
 
 
 @njit_contract
-def _follow(parents, past, origins):
+def _resample_past(parents, past, origins):
     """Give every member the past of its parent."""
     old_past, old_origins = past.copy(), origins.copy()
     for i in range(parents.size):
@@ -127,16 +173,17 @@ def _follow(parents, past, origins):
 
 
 @njit_contract
-def _nudge_past(past, first, end, log_w, d, D, free):
-    """Move the free states of rows first to end as `_ensemble.nudge` moves the present ones."""
+def _update_past(past, d, D):
+    """Move the free states of all rows kept as `kalman_update` moves the present ones."""
+    first, end = past.header[_SETTLED], past.header[_STORED]
     p, N = D.shape
     A, V = np.zeros((p, N)), np.zeros((p, N))
-    if first == end or not _innovations(log_w, d, D, A, V):
+    if first == end or not _innovations(past.last_log_w, d, D, A, V):
         return
     gain = np.empty(p)
     for row in range(first, end):
-        for a in free:
-            x = past[row % past.shape[0], a]
+        for a in past.free:
+            x = past.states[row % past.states.shape[0], a]
             for b in range(p):
                 gain[b] = _product(A[b], x)
             for b in range(p):
@@ -192,64 +239,70 @@ def _innovations(log_w, d, D, A, V):
                 P_dd[b, e] = total / (1.0 - squares)
     if not cholesky(P_dd):
         return False
+    _solve_innovations(P_dd, w, 1.0 - squares, A, V)
+    return True
+
+
+@inline_always
+def _solve_innovations(P_dd_chol, w, spread, A, V):
+    """Weight A for a covariance, and make V the solutions P_dd^-1 V, in place."""
+    p, N = V.shape
     v = np.empty(p)
     for i in range(N):
         for b in range(p):
             v[b] = V[b, i]
-            A[b, i] *= w[i] / (1.0 - squares)
-        solve_lower(P_dd, v)
-        solve_lower_transposed(P_dd, v)
+            A[b, i] *= w[i] / spread
+        solve_lower(P_dd_chol, v)
+        solve_lower_transposed(P_dd_chol, v)
         for b in range(p):
             V[b, i] = v[b]
-    return True
 
 
-CARRY = EntryPoint(_carry, CALLBACK_ARGUMENTS, "carry_past", digest("carry_past"))
+CARRY_PAST = EntryPoint(_carry_past, CALLBACK_ARGUMENTS, "carry_past", digest("carry_past"))
 
 
-def past_kernel(evaluate: Any, machine: Machine, n_members: int, *, nudges: bool, lag: int) -> Any:
-    """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
+def ancestral_smoother(
+    evaluate: CompiledFunction, system: System, n_members: int, *, updates: bool, lag: int
+) -> CompiledFunction[StatesFunction]:
+    """Compile the smoother of a likelihood with callback that carries past states along.
 
     Parameters
     ----------
-    evaluate : njit function
-        Of a filter and a system, see `EnsembleFilter.with_callback`.
-    machine : Machine
+    evaluate : CompiledFunction
+        See `EnsembleFilterBase.with_callback`.
+    system : System
     n_members : int
-    nudges : bool
-        Whether the filter nudges its members.
+    updates : bool
+        Whether the filter moves its members by a Kalman gain.
     lag : int
         After how many further observations a state is settled.
     """
-    CARRY.compile()
-    witness, free, n, p, N = CARRY.symbol, machine.free, machine.n, machine.p, n_members
+    CARRY_PAST.compile()
+    callback, likelihood = CARRY_PAST.symbol, evaluate.function
+    free, n, p, N = system.free, system.n, system.p, n_members
 
     @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R = rows.size
         settled_at, S = _settlement(rows, steps, observed, lag)
-        start = _N_COUNTS + free.size
-        counts = np.empty(start + 2 * R + S * N, np.int64)
-        counts[_N], counts[_MEMBERS], counts[_P], counts[_ROWS] = n, N, p, R
-        counts[_SLOTS], counts[_SEED], counts[_NUDGES], counts[_FREE] = (
-            S, draw_seed, np.int64(nudges), free.size,
-        )  # fmt: skip
-        counts[_STORED], counts[_SETTLED] = 0, 0
-        counts[_N_COUNTS:start] = free
-        counts[start : start + R] = rows
-        counts[start + R : start + 2 * R] = settled_at
-        numbers = np.empty((3 * n + 1) * R + N + S * n * N)
-        numbers[: (3 * n + 1) * R] = np.nan
-        numbers[(3 * n + 1) * R : (3 * n + 1) * R + N] = -math.log(N)
-        watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(numbers.ctypes.data))
-        _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep_alive(counts)
+        header = np.empty(_N_HEADER, np.int64)
+        header[_N], header[_MEMBERS], header[_P], header[_ROWS] = n, N, p, R
+        header[_SLOTS], header[_FREE], header[_SEED] = S, free.size, draw_seed
+        header[_UPDATES], header[_STORED], header[_SETTLED] = np.int64(updates), 0, 0
+        integers, reals = np.empty(_n_integers(header), np.int64), np.empty(_n_reals(header))
+        integers[:_N_HEADER] = header
+        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(reals.ctypes.data))
+        past = _past_of(integers, reals)
+        past.free[:], past.rows[:], past.settled_at[:] = free, rows, settled_at
+        past.results[:], past.last_log_w[:] = np.nan, -math.log(N)
+        _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
+        keep_alive(integers)
         if health[1] != NONE:
             for row in range(R):
-                forget_row(numbers, n, R, row)
-        return results(numbers, n, R, health)
+                forget_row(reals, n, R, row)
+        return results(reals, n, R, health)
 
-    return run
+    return CompiledFunction(run, key_of(f"ancestral {updates} {lag}", evaluate.key, CARRY_PAST.key))
 
 
 @njit_contract

@@ -4,8 +4,8 @@ A state at step k is drawn among the particles there with weights
 
     w_i N(x_{k+1}; g(x_i, 0), B(x_i) B(x_i)^T),
 
-where x_{k+1} is the state already drawn (Godsill, Doucet and West 2004). What was resampled, or
-nudged, does not matter: only the weighted particles of each step do. The process noise must be
+where x_{k+1} is the state already drawn (Godsill, Doucet and West 2004). Resampling and Kalman
+updates do not matter: only the weighted particles of each step do. The process noise must be
 additive, g(x, q) = g(x, 0) + B(x) q, and reach every state.
 
 Particles are proposed with their weights alone and accepted by their density over the largest
@@ -14,18 +14,18 @@ weights are computed.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
     EntryPoint,
     address_of,
+    arguments_class,
 )
 from pymc_statespace_filters.compiler.native.jit import inline_always, keep_alive, njit_contract
 from pymc_statespace_filters.compiler.numerics.philox import STATES, key_words, open_unit, philox
@@ -38,71 +38,72 @@ from pymc_statespace_filters.filters.ensemble.summaries import (
     forget_row,
     results,
 )
-from pymc_statespace_filters.filters.ensemble.system_table import propagate, read_system
 from pymc_statespace_filters.filters.ensemble.weights import normalise
 from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NONE
+from pymc_statespace_filters.filters.protocol import StatesFunction, System
+from pymc_statespace_filters.filters.system_table import (
+    SYSTEM_ARGUMENTS,
+    propagate,
+    read_system,
+    system_table,
+)
 
 PARTICLES_PER_PATH = 16
 _LEAST_PATHS = 16
 _TRIES_PER_PARTICLE = 1 / 4  # a try costs about four times what a particle costs in a full sweep
 
-_N_COUNTS = 2
 
-
-def _store(counts, numbers, event, j, k, members, log_weights, d, simulated, ancestors):
+def _store(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     """Keep the particles (n, N) of every step and their log weights (N,), updated or not."""
-    of = carray(counts, (_N_COUNTS,))
-    n, N = of[0], of[1]
+    n, N = carray(integers, (2,))
     if event == FORECAST or event == UPDATED:
         size = (n + 1) * N
-        at = carray(numbers, ((k + 1) * size,))[k * size :]
-        X, log_w = carray(members, (n * N,)), carray(log_weights, (N,))
-        at[: n * N] = X
-        at[n * N :] = log_w
+        at = carray(reals, ((k + 1) * size,))[k * size :]
+        at[: n * N] = carray(X, (n * N,))
+        at[n * N :] = carray(log_w, (N,))
 
 
 STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles", digest("store_particles"))
 
-_ARGUMENTS = (
-    I64_PTR, types.float64,  # table of the system and its time step
-    types.intp, types.intp, types.intp, types.intp,  # particles, noises, paths, steps
-    F64_PTR, types.intp,  # theta
-    F64_PTR, types.intp,  # rows of inputs
-    types.float64, types.int64,  # t0, seed of the draws
-    F64_PTR,  # what was stored
-    I64_PTR, types.intp,  # rows
-    F64_PTR, F64_PTR,  # results, and whether all went well
-)  # fmt: skip
+BACKWARD_ARGUMENTS = SYSTEM_ARGUMENTS | {
+    "N": types.intp, "m": types.intp, "M": types.intp,  # particles, normals of a step, paths
+    "n_steps": types.intp, "t0": types.float64, "seed": types.int64,  # of the draws
+    "stored": F64_PTR,  # by `_store`
+    "rows": I64_PTR, "R": types.intp, "reals": F64_PTR,  # results at these steps
+    "succeeded": F64_PTR,
+}  # fmt: skip
+
+BackwardArguments = arguments_class("BackwardArguments", BACKWARD_ARGUMENTS, __name__)
 
 
-def _walk_back(
-    table, dt, N, m, M, n_steps, theta, n_theta, inputs, n_rows, t0, seed,
-    stored, rows, R, numbers, succeeded,
+def _simulate_backward(
+    table, dt, theta, n_theta, inputs, n_rows, N, m, M, n_steps, t0, seed, stored, rows, R, reals,
+    succeeded,
 ):  # fmt: skip
     system = read_system(table, dt, theta, n_theta, inputs, n_rows)
     n, width = system.n, -(-N // 64) * 64
     size = (n + 1) * N
     tape = carray(stored, ((n_steps + 1) * size,))
-    at, out = carray(rows, (R,)), carray(numbers, ((3 * n + 1) * R,))
+    at, out = carray(rows, (R,)), carray(reals, ((3 * n + 1) * R,))
     paths, chosen = np.empty((M, n)), np.empty(M, np.int64)
     kernel = (np.empty((n, N)), np.empty((N, n, n)), np.empty(N))
     noise, scratch = np.zeros((m, width)), np.empty((n, N))
-    shares = (np.empty(N), np.empty(N, np.int64))
+    intervals = (np.empty(N), np.empty(N, np.int64))
     row = R - 1
     carray(succeeded, (1,))[0] = 0.0
     for k in range(n_steps, -1, -1):
         here = tape[k * size : (k + 1) * size]
         X = here[: n * N].reshape(n, N)
         w = finite_weights(X, here[n * N :])
-        _share_out(w, shares)
+        _fill_intervals(w, intervals)
         if k == n_steps:
             for path in range(M):
                 u, _ = _uniforms(seed, 0, path, k)
-                chosen[path] = _find(shares, u)
+                chosen[path] = _find(intervals, u)
         else:
             if not _kernels(system, k, t0 + k * dt, X, w, noise, scratch, kernel):
                 return
-            _choose_particles(seed, k, w, shares, kernel, paths, chosen)
+            _choose_particles(seed, k, w, intervals, kernel, paths, chosen)
         for path in range(M):
             for a in range(n):
                 paths[path, a] = X[a, chosen[path]]
@@ -143,7 +144,7 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
 
 
 @njit_contract
-def _choose_particles(seed, k, w, shares, kernel, paths, chosen):
+def _choose_particles(seed, k, w, intervals, kernel, paths, chosen):
     """Draw for every path the particle from which it came."""
     log_constants, N = kernel[2], w.size
     residual, log_w, weights = np.empty(paths.shape[1]), np.empty(N), np.empty(N)
@@ -153,7 +154,7 @@ def _choose_particles(seed, k, w, shares, kernel, paths, chosen):
         found = False
         for attempt in range(n_tries):
             u, v = _uniforms(seed, attempt, path, k)
-            i = _find(shares, u)
+            i = _find(intervals, u)
             if v < exp(_log_density(kernel, i, paths[path], residual) - highest):
                 chosen[path], found = i, True
                 break
@@ -166,7 +167,7 @@ def _choose_particles(seed, k, w, shares, kernel, paths, chosen):
             if normalise(log_w, weights) > -np.inf:
                 chosen[path] = choose(weights, u)
             else:  # too far from all to tell
-                chosen[path] = _find(shares, u)
+                chosen[path] = _find(intervals, u)
 
 
 @inline_always
@@ -191,9 +192,9 @@ def _uniforms(seed, attempt, path, k):
 
 
 @njit_contract
-def _share_out(w, shares):
+def _fill_intervals(w, intervals):
     """Cumulative weights, and for each of N equal parts of them the particle where it begins."""
-    cumulative, begins = shares
+    cumulative, begins = intervals
     N, total = w.size, 0.0
     for i in range(N):
         total += w[i]
@@ -206,9 +207,9 @@ def _share_out(w, shares):
 
 
 @inline_always
-def _find(shares, u):
-    """The particle in whose share of the weight a number of (0, 1) falls, after a step or two."""
-    cumulative, begins = shares
+def _find(intervals, u):
+    """The particle in whose interval a number of (0, 1) falls, in O(1) on average."""
+    cumulative, begins = intervals
     N = cumulative.size
     i, place = begins[min(N - 1, int(u * N))], u * cumulative[N - 1]
     while i < N - 1 and cumulative[i] <= place:
@@ -237,45 +238,59 @@ def _summarise_paths(out, n_rows, row, paths, chosen, N):
     out[3 * n * n_rows + row] = count
 
 
-WALK_BACK = EntryPoint(_walk_back, _ARGUMENTS, "walk_back", digest("walk_back"))
+SIMULATE_BACKWARD = EntryPoint(
+    _simulate_backward, BACKWARD_ARGUMENTS, "simulate_backward", digest("simulate_backward")
+)
 
 
-def backward_kernel(evaluate: Any, make_table: Any, machine: Machine, n_particles: int) -> Any:
-    """The function (theta, steps, observed, inputs, t0, seed, rows, draw_seed) -> states.
-
-    Parameters
-    ----------
-    evaluate, make_table : njit functions
-        Of a filter and a system, see `EnsembleFilter.with_callback` and `EnsembleFilter.table`.
-    machine : Machine
-    n_particles : int
-    """
-    for entry in (STORE, WALK_BACK):
+def backward_simulation(
+    evaluate: CompiledFunction, system: System, n_particles: int
+) -> CompiledFunction[StatesFunction]:
+    """Compile the smoother of a likelihood with callback, by backward simulation."""
+    for entry in (STORE, SIMULATE_BACKWARD):
         entry.compile()
-    witness, walk_back = STORE.symbol, WALK_BACK.external
-    n, m, dt, N = machine.n, machine.m, machine.dt, n_particles
+    callback, simulate_backward = STORE.symbol, SIMULATE_BACKWARD.external
+    table = system_table(system, ("propagate",))
+    likelihood, make_table = evaluate.function, table.make
+    n, m, dt, N = system.n, system.m, system.dt, n_particles
     M = max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
 
     @njit_contract
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R, n_steps = rows.size, steps[-1] if steps.size else np.int64(0)
-        counts, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
-        numbers, succeeded = np.full((3 * n + 1) * R, np.nan), np.zeros(1)
-        watch = (address_of(witness), np.int64(counts.ctypes.data), np.int64(stored.ctypes.data))
-        _, health = evaluate(theta, steps, observed, inputs, t0, (seed, np.empty(0)), watch)
-        keep_alive(counts)
+        integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
+        reals, succeeded = np.full((3 * n + 1) * R, np.nan), np.zeros(1)
+        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(stored.ctypes.data))
+        _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
+        keep_alive(integers)
         if health[1] == NONE:
             table = make_table()
-            walk_back(
-                table.ctypes.data, dt, N, m, M, n_steps, theta.ctypes.data, theta.size,
-                inputs.ctypes.data, inputs.shape[0], t0, draw_seed, stored.ctypes.data,
-                rows.ctypes.data, R, numbers.ctypes.data, succeeded.ctypes.data,
-            )  # fmt: skip
+            arguments = BackwardArguments(
+                table=table.ctypes.data,
+                dt=dt,
+                theta=theta.ctypes.data,
+                n_theta=theta.size,
+                inputs=inputs.ctypes.data,
+                n_rows=inputs.shape[0],
+                N=N,
+                m=m,
+                M=M,
+                n_steps=n_steps,
+                t0=t0,
+                seed=draw_seed,
+                stored=stored.ctypes.data,
+                rows=rows.ctypes.data,
+                R=R,
+                reals=reals.ctypes.data,
+                succeeded=succeeded.ctypes.data,
+            )
+            simulate_backward(*arguments)
             keep_alive(table)
             if succeeded[0] == 0.0:
                 health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
                 for row in range(R):
-                    forget_row(numbers, n, R, row)
-        return results(numbers, n, R, health)
+                    forget_row(reals, n, R, row)
+        return results(reals, n, R, health)
 
-    return run
+    keys = evaluate.key, table.key, STORE.key, SIMULATE_BACKWARD.key
+    return CompiledFunction(run, key_of("backward simulation", *keys))

@@ -1,49 +1,63 @@
-"""Who watches an ensemble filter at work: called at every event, with the members of that moment.
+"""Optional callback of an ensemble filter, run after each forecast, update and resampling.
 
-A witness is an entry, found by its address, with two vectors of its own, one of whole numbers and
-one of real ones: what it reads and what it writes.
-So what is to be known of the states (moments, a draw, all members for a smoother) is no matter of
-the filters, and whoever wants the likelihood alone has no witness and pays nothing.
+A callback is an entry point with two vectors, one of integers and one of reals, which it reads and
+writes. Smoothers, summaries of states and stored particles are callbacks; a likelihood-only run
+passes a null address.
 """
 
 import numpy as np
 from numba import types
 
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, call_address
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    arguments_class,
+    call_address,
+)
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 
 FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
-"""Events at step k: members are there (at step 0, or moved there from step k - 1), an observation
-has updated members and weights, members have been resampled (``ancestors`` tells from whom), the
-record is over."""
+"""Events at step k: members were initialised or moved there from step k - 1; an observation has
+updated members and weights; members were resampled (``ancestors`` tells from which); the record has
+ended."""
 
 NO_CALLBACK = (0, 0, 0)
-"""No witness."""
+"""A null address, and two vectors that are not read."""
 
-CALLBACK_ARGUMENTS = (
-    I64_PTR, F64_PTR,  # the witness's own
-    types.int64, types.int64, types.int64,  # event, observation, step
-    F64_PTR, F64_PTR,  # X (n, N), log_w (N,)
-    F64_PTR, F64_PTR,  # the observation (p,) and D (p, N), to be read when updated alone
-    I64_PTR,  # ancestors (N,), to be read when resampled alone
-)  # fmt: skip
+CALLBACK_ARGUMENTS = {
+    "integers": I64_PTR, "reals": F64_PTR,  # vectors of the callback
+    "event": types.int64, "j": types.int64, "k": types.int64,  # event, observation, step
+    "X": F64_PTR, "log_w": F64_PTR,  # members (n, N) and their log weights (N,)
+    "d": F64_PTR, "D": F64_PTR,  # observation (p,) and simulated ones (p, N), if updated
+    "ancestors": I64_PTR,  # (N,), if resampled
+}  # fmt: skip
+
+CallbackArguments = arguments_class("CallbackArguments", CALLBACK_ARGUMENTS, __name__)
 
 
 @inline_always
-def emit(with_callback, event, j, k, members, d, ancestors):
-    """Call the witness, if there is one."""
-    witness, counts, numbers = with_callback
-    if witness != 0:
-        arguments = (
-            counts, numbers, event, np.int64(j), k,
-            members.X, members.log_w, d, members.D, ancestors,
-        )  # fmt: skip
-        call_address(witness, arguments)
+def emit(callback, event, j, k, members, d, ancestors):
+    """Call the callback, if there is one."""
+    address, integers, reals = callback
+    if address != 0:
+        arguments = CallbackArguments(
+            integers=integers,
+            reals=reals,
+            event=event,
+            j=np.int64(j),
+            k=k,
+            X=members.X,
+            log_w=members.log_w,
+            d=d,
+            D=members.D,
+            ancestors=ancestors,
+        )
+        call_address(address, arguments)
 
 
 @njit_contract
-def searchsorted(k, rows, first):
-    """The first of increasing rows, from number ``first`` on, that is not before step k."""
+def searchsorted(rows, k, first):
+    """Index of the first of increasing rows, from ``first`` on, that is not before step k."""
     place = first
     while place < rows.size and rows[place] < k:
         place += 1

@@ -1,18 +1,22 @@
-"""The Kalman update of an ensemble: moments, gain and nudge, shared by EnKF and PFEnKF.
+"""The Kalman update of an ensemble: moments, gain and analysis, shared by EnKF and PFEnKF.
 
 Members are columns: X (states, members), D (observables, members). Weights are normalised; with
 equal weights 1/N the weighted covariances of Eqs. 4.32-4.33 are those of Eqs. 4.18-4.19.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
     solve_lower_transposed,
 )
-from pymc_statespace_filters.filters.ensemble.reductions import exchange, sum_products, total
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.ensemble.reductions import weighted_cov, weighted_mean
+from pymc_statespace_filters.filters.protocol import System
 
 
 @njit_contract
@@ -24,15 +28,6 @@ def mark_finite(X, D, alive):
         for a in range(A.shape[0]):
             for i in range(alive.size):
                 alive[i] &= np.isfinite(A[a, i])
-
-
-@njit_contract
-def count_true(flags):
-    """Return how many flags are set."""
-    count = 0
-    for flag in flags:
-        count += flag
-    return count
 
 
 @njit_contract
@@ -61,30 +56,42 @@ def mean(w, X, out):
         out[a] = total
 
 
-@njit_contract
-def forecast_moments(w, X, D, d, divisor, local, moments):
-    """Covariances of states and simulated observations, whose means are given (Eqs. 4.16-4.19).
+class Moments(NamedTuple):
+    """Moments of a forecast: of states, simulated observations, and both (Eqs. 4.16-4.19).
 
-    They are sums with weights w over ``divisor``. P_dd is left as its Cholesky factor.
-
-    A missing component of d gets a row and column of the identity in P_dd and of zero in P_xd, so
-    that it moves nothing. Returns False if P_dd is not positive definite.
+    `forecast_moments` leaves the Cholesky factor in ``P_dd``, `kalman_update` the gain in ``P_xd``.
     """
-    x_mean, d_mean, P_xd, P_dd = moments
-    n, p = P_xd.shape
-    sum_products(w, X, x_mean, D, d_mean, local, 0)
-    sum_products(w, D, d_mean, D, d_mean, local, n * p)
-    exchange(local, (n + p) * p)
-    for b in range(p):
-        for a in range(n):
-            P_xd[a, b] = total(local, a * p + b) / divisor
-        for a in range(p):
-            P_dd[a, b] = total(local, (n + a) * p + b) / divisor
-    for b in range(p):
+
+    x_mean: np.ndarray
+    d_mean: np.ndarray
+    P_xd: np.ndarray
+    P_dd: np.ndarray
+
+
+@inline_always
+def moments_workspace(n, p):
+    """Room for the moments of n states and p observables."""
+    return Moments(np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
+
+
+@njit_contract
+def forecast_moments(w, X, D, d, total_weight, divisor, local, moments):
+    """Means and covariances of states and simulated observations (Eqs. 4.16-4.19, 4.30-4.33).
+
+    Means are sums with weights w over ``total_weight``, covariances over ``divisor``. A missing
+    component of d gets a row and column of the identity in P_dd and of zero in P_xd, so that it
+    moves nothing. Returns False if P_dd is not positive definite.
+    """
+    x_mean, d_mean, P_xd, P_dd = moments.x_mean, moments.d_mean, moments.P_xd, moments.P_dd
+    weighted_mean(w, X, total_weight, local, x_mean)
+    weighted_mean(w, D, total_weight, local, d_mean)
+    weighted_cov(w, X, x_mean, D, d_mean, divisor, local, P_xd)
+    weighted_cov(w, D, d_mean, D, d_mean, divisor, local, P_dd)
+    for b in range(d.size):
         if np.isnan(d[b]):
-            for a in range(n):
+            for a in range(x_mean.size):
                 P_xd[a, b] = 0.0
-            for a in range(p):
+            for a in range(d.size):
                 P_dd[a, b] = P_dd[b, a] = 0.0
             P_dd[b, b] = 1.0
     return cholesky(P_dd)
@@ -94,9 +101,9 @@ def forecast_moments(w, X, D, d, divisor, local, moments):
 def kalman_update(d, D, alive, free, moments, X):
     """x^a_i = x^f_i + K (d - d_i) with K = P_xd P_dd^-1 (Eqs. 4.20-4.21, 4.34-4.35), in place.
 
-    Only free states are moved. P_xd becomes the gain.
+    Only free states are moved.
     """
-    _, _, K, P_dd_chol = moments
+    K, P_dd_chol = moments.P_xd, moments.P_dd
     for a in free:
         solve_lower(P_dd_chol, K[a])
         solve_lower_transposed(P_dd_chol, K[a])
@@ -106,3 +113,13 @@ def kalman_update(d, D, alive, free, moments, X):
             for i in range(alive.size):
                 step = K[a, b] * (d[b] - D[b, i])
                 X[a, i] += step if alive[i] else 0.0
+
+
+def check_simulated_observations(name: str, system: System) -> None:
+    """Raise unless an observation can be simulated for a Kalman gain."""
+    if not system.gaussian_observation:
+        raise ModelError(
+            f"{name} updates members by a Kalman gain and so needs an observation function with "
+            f"Gaussian noise; with observation_dist or observation_logp use the particle filters "
+            f"BootstrapPF or PFEnKF"
+        )

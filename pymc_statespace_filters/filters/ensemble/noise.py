@@ -11,7 +11,7 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint, arguments_class
 from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.compiler.numerics.philox import (
     FILL_NORMALS,
@@ -113,6 +113,15 @@ def resampling_normals(noise, j, k):
     return noise.buffer[: sizes.resampling]
 
 
+STORE_ARGUMENTS = {
+    "seed": types.int64, "steps": I64_PTR, "n_observations": types.intp, "width": types.intp,
+    "initial": types.intp, "process": types.intp, "observation": types.intp,
+    "resampling": types.intp, "out": types.intp,
+}  # fmt: skip
+
+StoreArguments = arguments_class("StoreArguments", STORE_ARGUMENTS, __name__)
+
+
 def _store(seed, steps, n_observations, width, initial, process, observation, resampling, out):
     one, first = np.int64(1), np.int64(0)
     n_steps = carray(steps, (n_observations,))[n_observations - 1] if n_observations else 0
@@ -132,7 +141,7 @@ def _store(seed, steps, n_observations, width, initial, process, observation, re
 
 STORE_NORMALS = EntryPoint(
     _store,
-    (types.int64, I64_PTR, *(types.intp,) * 7),
+    STORE_ARGUMENTS,
     "store_normals",
     digest("store_normals"),
     needs=(FILL_NORMALS,),

@@ -1,33 +1,103 @@
-"""Which smoother a particle filter has for a system: backward simulation, or ancestries."""
+"""What particle filters share: when and how they resample, and how they smooth."""
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 
-from pymc_statespace_filters.compiler.lowering.ensemble import Machine
-from pymc_statespace_filters.compiler.lowering.scalar_state import has_additive_process_noise
-from pymc_statespace_filters.compiler.lowering.structure import process_noise_reaches_every_state
-from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, past_kernel
-from pymc_statespace_filters.filters.ensemble.backward_simulation import backward_kernel
-from pymc_statespace_filters.filters.ensemble.base import EnsembleFilter, system_table
-from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, ancestral_smoother
+from pymc_statespace_filters.filters.ensemble.backward_simulation import backward_simulation
+from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
+from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
+from pymc_statespace_filters.filters.ensemble.noise import resampling_normals
+from pymc_statespace_filters.filters.ensemble.resampling import (
+    SCHEMES,
+    check_sortable,
+    n_normals,
+    resample_if_few,
+    resampler,
+    smooth_resampling,
+)
+from pymc_statespace_filters.filters.protocol import StatesFunction, System
+from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
+
+_N_SETTINGS = 2  # threshold of resampling, number of its scheme
 
 
-def _has_transition_density(system: StateSpaceModel) -> bool:
-    """Whether a step has a Gaussian density given the state before."""
-    return has_additive_process_noise(system) and process_noise_reaches_every_state(system)
+@inline_always
+def _resampler(settings, n, local):
+    return resampler(settings[0], int(settings[1]), n, local)
 
 
-def particle_smoother(
-    filter: EnsembleFilter, system: StateSpaceModel, machine: Machine, *, nudges: bool
-) -> Any:
-    """Bind the smoother of a particle filter to one system."""
-    with_callback, n_particles = filter.with_callback(machine), filter.size()
-    if _has_transition_density(system):
-        return backward_kernel(with_callback, system_table(machine), machine, n_particles)
-    return past_kernel(with_callback, machine, n_particles, nudges=nudges, lag=LAG)
+@inline_always
+def _resample(resampling, noise, j, k, n_effective, members, local):
+    z = resampling_normals(noise, j, k)
+    return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, local)
 
 
-def particle_smoothing_method(system: StateSpaceModel) -> str:
-    """Name the method, and the lag if it has one."""
-    if _has_transition_density(system):
-        return "backward simulation"
-    return f"ancestries, settled {LAG} observations later"
+def particle_filter(
+    name: str, workspace: Callable, update: Callable, n_settings: int = 0
+) -> EntryPoint:
+    """Make a particle filter one compiled function, see `loop.ensemble_filter`.
+
+    ``n_settings`` counts the filter's own settings; they follow those of the resampling.
+    """
+    return ensemble_filter(
+        name,
+        workspace,
+        update,
+        _N_SETTINGS + n_settings,
+        resampler=_resampler,
+        resample=_resample,
+    )
+
+
+@dataclass(frozen=True)
+class ParticleFilter(EnsembleFilterBase):
+    """A filter of weighted particles that are resampled when few of them carry the weight."""
+
+    n_particles: int
+    _: KW_ONLY
+    resample_below: float = 1 / 3
+    resampling: str = "systematic"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_particles", check_count("n_particles", self.n_particles))
+        fraction = check_fraction("resample_below", self.resample_below)
+        object.__setattr__(self, "resample_below", fraction)
+        check_choice("resampling", self.resampling, SCHEMES)
+
+    def size(self) -> int:
+        """Return the number of particles."""
+        return self.n_particles
+
+    def settings(self) -> tuple[float, ...]:
+        """Return the threshold of resampling and the number of its scheme."""
+        return self.resample_below, SCHEMES.index(self.resampling)
+
+    def check(self, system: System) -> None:
+        """Raise if the scheme has to sort particles and cannot sort those of so many states."""
+        check_sortable(self.resampling, system.n)
+
+    def smooth(self, system: System) -> "ParticleFilter":
+        """Return this filter with an estimate that changes little when its normals do."""
+        return smooth_resampling(self, system.n)
+
+    def resampling_normals(self) -> int:
+        """Return how many normals a resampling takes."""
+        return n_normals(self.resampling, self.n_particles)
+
+    def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
+        """Compile backward simulation, or where a step has no density the ancestral smoother."""
+        if system.has_transition_density:
+            return backward_simulation(self.with_callback(system), system, self.n_particles)
+        return ancestral_smoother(
+            self.with_callback(system), system, self.n_particles, updates=self.simulates, lag=LAG
+        )
+
+    def smoothing_method(self, system: System) -> str:
+        """Name the method, and the lag if it has one."""
+        if system.has_transition_density:
+            return "backward simulation"
+        return f"ancestries, settled {LAG} observations later"

@@ -1,9 +1,9 @@
-"""Sums over the members of all ranks, block by block.
+"""Sums, means and covariances over the members of all ranks.
 
 A sum is a row of an array with a column for each block of 64 members. Every rank writes the columns
-of its own blocks, one exchange completes several rows, and every rank adds up all of them. The sum
-over one block is made by the same instructions whoever makes it, so that the result is the same to
-the bit on any number of ranks.
+of its local blocks, one allgather fills in the others, and every rank adds up all of them in their
+order. The sum over one block is made by the same instructions on every rank, so that the result is
+the same to the bit on any number of ranks. With one rank nothing is exchanged.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ HALVES = (32, 16, 8, 4, 2, 1)
 
 
 class LocalPartition(NamedTuple):
-    """Our own members among those of all ranks, and scratch of sums over members.
+    """The members of this rank among those of all ranks, and scratch of sums over members.
 
     There are ``size`` of them, padded to whole blocks ``width``, from member ``first`` and block
     ``first_block`` on. ``sums`` is (rows, blocks of all members), ``lanes`` has a number for each
@@ -49,7 +49,7 @@ class LocalPartition(NamedTuple):
 
 @inline_always
 def local_partition(layout, n_members, n_rows):
-    """Our own of all members, with room for so many rows of sums."""
+    """The members of this rank, with room for ``n_rows`` rows of sums."""
     first, last = local_range(layout, n_members, MEMBERS)
     width = BLOCK * -(-(last - first) // BLOCK)
     sums = np.empty((n_rows, -(-n_members // BLOCK)))
@@ -60,8 +60,8 @@ def local_partition(layout, n_members, n_rows):
 
 
 @inline_always
-def exchange(local, n_rows):
-    """Complete the first rows of sums."""
+def allgather_sums(local, n_rows):
+    """Fill in the blocks of other ranks in the first rows of sums."""
     allgather(local.layout, local.sums[:n_rows], BLOCKS)
 
 
@@ -133,7 +133,7 @@ def _products(given, i):
 
 
 @inline_always
-def _own_blocks(local, row):
+def _local_blocks(local, row):
     return local.sums[row, local.first_block :]
 
 
@@ -146,39 +146,67 @@ def sum_blocks(values, out):
 @njit_contract
 def sum_values(values, local, row):
     """Row of the sums of a vector, of numbers or flags."""
-    _values(values, values.size, _own_blocks(local, row))
+    _values(values, values.size, _local_blocks(local, row))
 
 
 @njit_contract
 def sum_squares(values, local, row):
     """Row of the sums of the squares of a vector."""
-    _squares(values, values.size, _own_blocks(local, row))
+    _squares(values, values.size, _local_blocks(local, row))
 
 
 @njit_contract
-def sum_spread(w, local, row):
-    """Row of the sums of w (1 - w), all positive: in all 1 - sum w^2, if w is normalised."""
-    _spread(w, w.size, _own_blocks(local, row))
+def _sum_spread(w, local, row):
+    _spread(w, w.size, _local_blocks(local, row))
 
 
 @njit_contract
-def sum_members(w, X, local, row):
+def _sum_members(w, X, local, row):
     """Rows of sum_i w_i X_ai for each row of X; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
-        _weighted((w, X[a]), w.size, _own_blocks(local, row + a))
+        _weighted((w, X[a]), w.size, _local_blocks(local, row + a))
 
 
 @njit_contract
-def sum_products(w, X, x_mean, Y, y_mean, local, row):
+def _sum_products(w, X, x_mean, Y, y_mean, local, row):
     """Rows of sum_i w_i (X_ai - mean) (Y_bi - mean), b fastest; zero weight as above."""
     for a in range(X.shape[0]):
         for b in range(Y.shape[0]):
-            out = _own_blocks(local, row + a * Y.shape[0] + b)
+            out = _local_blocks(local, row + a * Y.shape[0] + b)
             _products((w, X[a], x_mean[a], Y[b], y_mean[b]), w.size, out)
 
 
 @inline_always
-def means(local, row, weight, out):
-    """Means from completed rows of `sum_members`, of so much weight in all."""
+def count(flags, local):
+    """How many flags of all members are set."""
+    sum_values(flags, local, 0)
+    allgather_sums(local, 1)
+    return total(local, 0)
+
+
+@inline_always
+def weight_spread(w, local):
+    """1 - sum w^2 of normalised weights, as a sum of positive terms w (1 - w)."""
+    _sum_spread(w, local, 0)
+    allgather_sums(local, 1)
+    return total(local, 0)
+
+
+@inline_always
+def weighted_mean(w, X, total_weight, local, out):
+    """Mean of each row of X; ``total_weight`` is the sum of w. Zero weights may have NaN."""
+    _sum_members(w, X, local, 0)
+    allgather_sums(local, X.shape[0])
     for a in range(out.size):
-        out[a] = total(local, row + a) / weight
+        out[a] = total(local, a) / total_weight
+
+
+@inline_always
+def weighted_cov(w, X, x_mean, Y, y_mean, divisor, local, out):
+    """Covariances sum_i w_i (X_ai - mean) (Y_bi - mean) / divisor; zero weights as above."""
+    n, p = out.shape
+    _sum_products(w, X, x_mean, Y, y_mean, local, 0)
+    allgather_sums(local, n * p)
+    for a in range(n):
+        for b in range(p):
+            out[a, b] = total(local, a * p + b) / divisor

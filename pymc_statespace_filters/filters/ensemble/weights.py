@@ -11,7 +11,12 @@ import numpy as np
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
-from pymc_statespace_filters.filters.ensemble.reductions import HALVES, sum_squares, sum_values
+from pymc_statespace_filters.filters.ensemble.reductions import (
+    HALVES,
+    allgather_sums,
+    sum_squares,
+    sum_values,
+)
 
 
 @njit_contract
@@ -125,3 +130,24 @@ def normalise_own(log_total, log_w, w, local, row):
             w[i] *= scale
     for i in range(w.size):
         log_w[i] -= log_total
+
+
+@inline_always
+def normalise_weights(log_w, w, local):
+    """Make w and log_w the normalised weights of all members.
+
+    Returns the log of their former sum and their effective number (thesis, Eq. 4.43). NaN and +inf
+    are weights of zero. If every weight is zero, the log is -inf and the weights are useless.
+    """
+    log_total, n_effective = log_sum(log_w, w, local)
+    if log_total > -np.inf:
+        normalise_own(log_total, log_w, w, local, 0)
+    return log_total, n_effective
+
+
+@inline_always
+def log_sum(log_w, scratch, local):
+    """Log of the sum of the weights of all members, and their effective number."""
+    weigh(log_w, scratch, local, 0)
+    allgather_sums(local, 3)
+    return total_weight(local, 0)

@@ -20,10 +20,10 @@ from pymc_statespace_filters.filters.gaussian.recursion import (
     compile_taped,
     compiled_of,
 )
-from pymc_statespace_filters.filters.missing import is_missing
+from pymc_statespace_filters.filters.outcomes import is_missing
 
 
-def compile_reverse(recursion: GaussianFilterFunctions) -> CompiledFunction:
+def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
     parts = vector_functions(_reverse(recursion))
     parameters, zeros, start_vjp, predict_vjp, update_vjp = (
@@ -60,7 +60,7 @@ def compile_reverse(recursion: GaussianFilterFunctions) -> CompiledFunction:
 
 def compile_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, terms_bar) -> theta_bar."""
-    parts = {"taped": compile_taped(recursion), "reverse": compile_reverse(recursion)}
+    parts = {"taped": compile_taped(recursion), "reverse": compile_pullback(recursion)}
     taped, reverse = (part.function for part in parts.values())
 
     def gradient(theta, steps, observed, inputs, t0, seed, terms_bar):

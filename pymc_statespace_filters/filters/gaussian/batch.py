@@ -11,15 +11,19 @@ import numpy as np
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
 from pymc_statespace_filters.compiler.codegen.simd import LANES, LANES_AT_ONCE, lane_functions
-from pymc_statespace_filters.compiler.lowering.ensemble import covariance_check
+from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.filters.gaussian.recursion import (
     GaussianFilterFunctions,
     compile_value,
     compiled_of,
 )
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
+from pymc_statespace_filters.filters.outcomes import (
+    COVARIANCE_NOT_POSITIVE,
+    NO_FINITE_MEMBER,
+    NONE,
+    is_missing,
+)
 
 
 def compile_batch(recursion: GaussianFilterFunctions) -> CompiledFunction:

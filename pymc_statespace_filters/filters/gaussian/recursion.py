@@ -17,10 +17,14 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     jit,
 )
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
-from pymc_statespace_filters.compiler.lowering.ensemble import covariance_check
+from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
+from pymc_statespace_filters.filters.outcomes import (
+    COVARIANCE_NOT_POSITIVE,
+    NO_FINITE_MEMBER,
+    NONE,
+    is_missing,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 

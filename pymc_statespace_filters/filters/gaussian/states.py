@@ -16,7 +16,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     jit,
 )
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
-from pymc_statespace_filters.compiler.lowering.ensemble import (
+from pymc_statespace_filters.compiler.lowering.covariances import (
     covariance_check,
     semidefinite_cholesky,
 )
@@ -25,8 +25,12 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
 from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions, compiled_of
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE
+from pymc_statespace_filters.filters.outcomes import (
+    COVARIANCE_NOT_POSITIVE,
+    NO_FINITE_MEMBER,
+    NONE,
+    is_missing,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Streams of `STATES`: that of the record's steps, a column for each, and that of the start.
@@ -42,7 +46,7 @@ class ForwardPass:
     forwards: CompiledFunction
 
 
-def states_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
+def forward_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
     """The pass forwards of a filter."""
     smoother = BrysonFrazier(recursion)
     return ForwardPass(smoother, _noise(recursion.system), _forwards(smoother))

@@ -22,8 +22,6 @@ from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     LOG_TWO_PI,
     semidefinite_cholesky,
 )
-from pymc_statespace_filters.filters.ensemble.kalman_update import count_true
-from pymc_statespace_filters.filters.ensemble.reductions import total
 from pymc_statespace_filters.filters.kernel_density.direct_sum import (
     compact,
     kernel_sum_workspace,
@@ -56,10 +54,12 @@ class Kernel(NamedTuple):
     """Where the members of a density are and how far they spread: their mean and their bandwidth.
 
     ``H`` (n_free, n_free) is the lower Cholesky factor of Eqs. 4.38 and 4.39, of the directions in
-    which they spread at all, which ``active`` tells. ``mean`` (n,) is that of all states.
+    which they spread at all, which ``active`` tells. ``mean`` (n,) and ``cov`` (n, n) are those of
+    all states.
     """
 
     mean: np.ndarray
+    cov: np.ndarray
     H: np.ndarray
     active: np.ndarray
 
@@ -67,7 +67,9 @@ class Kernel(NamedTuple):
 @inline_always
 def kernel_workspace(n, n_free):
     """A kernel to be filled by ``scott_bandwidth``."""
-    return Kernel(np.empty(n), np.empty((n_free, n_free)), np.empty(n_free, np.bool_))
+    return Kernel(
+        np.empty(n), np.empty((n, n)), np.empty((n_free, n_free)), np.empty(n_free, np.bool_)
+    )
 
 
 @njit_contract
@@ -84,21 +86,22 @@ def density_workspace(local, n):
 
 
 @njit_contract
-def scott_bandwidth(local, row, spread, n_effective, free, kernel):
-    """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39); the mean is given.
+def scott_bandwidth(n_effective, free, kernel):
+    """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39), from mean and covariance.
 
-    From completed rows of ``sum_products`` of all states, to be divided by ``spread``. Returns
-    False if the moments are not finite.
+    Returns False if the moments are not finite.
     """
-    x_mean, H, active = kernel
+    H, n_active = kernel.H, 0
     floor = np.empty(free.size)
     for a in range(free.size):
-        floor[a] = (_KNOWN * x_mean[free[a]]) ** 2
+        floor[a] = (_KNOWN * kernel.mean[free[a]]) ** 2
         for b in range(free.size):
-            H[a, b] = total(local, row + free[a] * x_mean.size + free[b]) / spread
-    if not semidefinite_cholesky(H, floor, active):
+            H[a, b] = kernel.cov[free[a], free[b]]
+    if not semidefinite_cholesky(H, floor, kernel.active):
         return False
-    scott = n_effective ** (-1.0 / (count_true(active) + 4))
+    for is_active in kernel.active:
+        n_active += is_active
+    scott = n_effective ** (-1.0 / (n_active + 4))
     for a in range(free.size):
         for b in range(a + 1):
             H[a, b] *= scott
@@ -112,7 +115,7 @@ def _whiten(kernel, free, X, first, out):
     X becomes the columns from ``first`` on. Returns how many rows. Why the mean: far from zero
     x / h would be rounded to more than the distances between particles bear.
     """
-    x_mean, H, active = kernel
+    x_mean, H, active = kernel.mean, kernel.H, kernel.active
     n_rows, last = 0, first + X.shape[1]
     for a in range(active.size):
         if not active[a]:
@@ -124,9 +127,9 @@ def _whiten(kernel, free, X, first, out):
             y[i] = (_SQRT_HALF * scale) * (x[i] - x_0)
         for b in range(a):
             if active[b]:
-                layout, z = scale * H[a, b], out[before, first:last]
+                coupling, z = scale * H[a, b], out[before, first:last]
                 for i in range(x.size):
-                    y[i] -= layout * z[i]
+                    y[i] -= coupling * z[i]
                 before += 1
         n_rows += 1
     return n_rows

@@ -1,4 +1,4 @@
-"""Weights of nudged particles: kernel densities of prior and proposal (thesis, Eqs. 4.36-4.39)."""
+"""Weights of proposed particles by kernel densities (thesis, Eqs. 4.36-4.39)."""
 
 import math
 from typing import NamedTuple
@@ -6,35 +6,33 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
-from pymc_statespace_filters.filters.ensemble.kalman_update import equal_weights
-from pymc_statespace_filters.filters.ensemble.reductions import (
-    exchange,
-    means,
-    sum_members,
-    sum_products,
+from pymc_statespace_filters.filters.ensemble.kalman_update import (
+    Moments,
+    equal_weights,
+    moments_workspace,
 )
-from pymc_statespace_filters.filters.ensemble.system_table import log_density
+from pymc_statespace_filters.filters.ensemble.reductions import weighted_cov, weighted_mean
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     kernel_workspace,
     log_kernel_density,
     scott_bandwidth,
 )
+from pymc_statespace_filters.filters.system_table import log_density
 
 
 class Forecast(NamedTuple):
-    """Of the forecast of all ranks: who is alive, N_eff, 1 - sum w^2, and the log of E p(d | x)."""
+    """Of the forecast of all ranks: how many members are alive, N_eff, and 1 - sum w^2."""
 
     n_alive: float
     n_effective: float
     spread: float
-    log_mean: float
 
 
 class Scratch(NamedTuple):
     """Moments of the forecast, and what the densities of Eq. 4.36 need."""
 
-    moments: tuple
+    moments: Moments
     w_equal: np.ndarray
     log_prior: np.ndarray
     log_proposal: np.ndarray
@@ -42,53 +40,52 @@ class Scratch(NamedTuple):
 
 
 @inline_always
-def nudging_workspace(system, local):
+def proposal_workspace(system, local):
     """Scratch of one update."""
-    n, p, N = system.n, system.p, local.size
-    moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
-    density = density_workspace(local, system.free.size)
+    N, density = local.size, density_workspace(local, system.free.size)
+    moments = moments_workspace(system.n, system.p)
     return Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
 
 
 @inline_always
-def weigh_nudged(system, k, t, d, members, forecast, local, scratch, keeps_previous):
+def weigh_proposal(system, k, t, d, members, forecast, local, scratch, keeps_previous):
     """Leave the unnormalised weights of X in log_w and p(d | x^a) in log_p.
 
     ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if
-    the nudged particles and the forecast do not spread in the same directions.
+    the proposed particles and the forecast do not spread in the same directions.
     """
-    X, _, X_f, w, log_w, log_p, alive = members
-    _, w_equal, log_prior, log_proposal, density = scratch
-    free, n, n_alive = system.free, system.n, forecast.n_alive
+    X, w, log_w, log_p = members.X, members.w, members.log_w, members.log_p
+    free, n, n_alive, w_equal = system.free, system.n, forecast.n_alive, scratch.w_equal
     kernel_f, kernel_a = kernel_workspace(n, free.size), kernel_workspace(n, free.size)
-    equal_weights(alive, n_alive, w_equal)
-    if not _set_bandwidths(members, w_equal, forecast, free, local, scratch, kernel_f, kernel_a):
+    equal_weights(members.alive, n_alive, w_equal)
+    if not _set_bandwidths(members, forecast, free, local, scratch, kernel_f, kernel_a):
         return False
     log_density(system, k, t, d, X, log_p)
-    log_kernel_density(local, w, X_f, X, free, kernel_f, density, log_prior)
+    log_prior, log_proposal, density = scratch.log_prior, scratch.log_proposal, scratch.density
+    log_kernel_density(local, w, members.X_f, X, free, kernel_f, density, log_prior)
     log_kernel_density(local, w_equal, X, X, free, kernel_a, density, log_proposal)
     for i in range(w.size):
-        share = log_w[i] if keeps_previous else -math.log(n_alive)
-        log_weight = share + log_p[i] + (log_prior[i] - log_proposal[i])
-        log_w[i] = log_weight if alive[i] else -np.inf
+        log_factor = log_w[i] if keeps_previous else -math.log(n_alive)
+        log_weight = log_factor + log_p[i] + (log_prior[i] - log_proposal[i])
+        log_w[i] = log_weight if members.alive[i] else -np.inf
     return True
 
 
 @inline_always
-def _set_bandwidths(members, w_equal, forecast, free, local, scratch, kernel_f, kernel_a):
-    X, _, X_f, w, _, _, _ = members
-    n, n_alive = X.shape[0], forecast.n_alive
-    sum_members(w_equal, X, local, 0)
-    exchange(local, n)
-    means(local, 0, 1.0, kernel_a.mean)
-    for a in range(n):
-        kernel_f.mean[a] = scratch.moments[0][a]
-    sum_products(w_equal, X, kernel_a.mean, X, kernel_a.mean, local, 0)
-    sum_products(w, X_f, kernel_f.mean, X_f, kernel_f.mean, local, n * n)
-    exchange(local, 2 * n * n)
+def _set_bandwidths(members, forecast, free, local, scratch, kernel_f, kernel_a):
+    X, X_f, w_equal = members.X, members.X_f, scratch.w_equal
+    n_alive = forecast.n_alive
+    weighted_mean(w_equal, X, 1.0, local, kernel_a.mean)
+    for a in range(kernel_f.mean.size):
+        kernel_f.mean[a] = scratch.moments.x_mean[a]
+    spread_a = 1.0 - 1.0 / n_alive
+    weighted_cov(w_equal, X, kernel_a.mean, X, kernel_a.mean, spread_a, local, kernel_a.cov)
+    weighted_cov(
+        members.w, X_f, kernel_f.mean, X_f, kernel_f.mean, forecast.spread, local, kernel_f.cov
+    )
     return (
-        scott_bandwidth(local, 0, 1.0 - 1.0 / n_alive, n_alive, free, kernel_a)  # Eq. 4.38
-        and scott_bandwidth(local, n * n, forecast.spread, forecast.n_effective, free, kernel_f)
+        scott_bandwidth(n_alive, free, kernel_a)  # Eq. 4.38
+        and scott_bandwidth(forecast.n_effective, free, kernel_f)
         and _agree(kernel_a.active, kernel_f.active)
     )
 

@@ -9,18 +9,18 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import NONE
+from pymc_statespace_filters.filters.outcomes import NONE, is_missing
 from pymc_statespace_filters.filters.point_mass.recursion import (
     REFINEMENT,
     TOO_COARSE,
     TOO_SHORT,
     begin,
     forecast,
+    initial_moments,
     no_table,
     see,
 )
-from pymc_statespace_filters.filters.point_mass.system_table import move_points
+from pymc_statespace_filters.filters.system_table import step_moments
 
 _LENGTHENING = 1.6
 _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
@@ -47,11 +47,11 @@ def _first_spacing(system, t0, n_steps, tolerance):
     spacing = np.inf
     if n_steps == 0:
         return spacing
-    sd = system.sd
+    mean, sd = initial_moments(system)
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
-        X[0, i] = system.mean + (i - 1) * sd
-    move_points(system, 0, t0, X, M)
+        X[0, i] = mean + (i - 1) * sd
+    step_moments(system, 0, t0, X, M)
     slope = (M[0, 2] - M[0, 0]) / (2.0 * sd) if sd > 0.0 else 1.0
     for i in range(3):
         width = math.sqrt(M[1, i] / (1.0 + slope * slope))

@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.ensemble.system_table import log_density
 from pymc_statespace_filters.filters.outcomes import (
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
@@ -35,7 +34,7 @@ from pymc_statespace_filters.filters.point_mass.grid import (
     total,
     weigh,
 )
-from pymc_statespace_filters.filters.point_mass.system_table import move_points
+from pymc_statespace_filters.filters.system_table import log_density, step_moments
 
 # Reasons to begin again, beside the failures.
 TOO_COARSE, TOO_SHORT = -1, -2
@@ -54,6 +53,21 @@ def no_table():
 
 
 @inline_always
+def has_valid_covariances(system):
+    """Whether every covariance of the system is positive semidefinite."""
+    for root in system.c[system.n_theta + system.n :]:
+        if np.isnan(root):
+            return False
+    return True
+
+
+@inline_always
+def initial_moments(system):
+    """Mean and standard deviation of the state at step 0."""
+    return system.c[system.n_theta], system.c[system.n_theta + 1]
+
+
+@inline_always
 def cut_of(reach):
     """The share of the largest mass below which masses are dropped."""
     return math.exp(-0.5 * reach * reach)
@@ -62,7 +76,7 @@ def cut_of(reach):
 @njit_internal
 def begin(system, spacing, reach):
     """The grid at step 0, and the mixture (of one) that its masses are taken from."""
-    mean, sd, one = system.mean, system.sd, np.full(1, 1.0)
+    (mean, sd), one = initial_moments(system), np.full(1, 1.0)
     source = np.full(1, mean), np.full(1, sd), one
     if not (np.isfinite(mean) and np.isfinite(sd)):
         return NO_FINITE_MEMBER, (np.int64(0), 1.0, one), source
@@ -103,7 +117,7 @@ def forecast(system, k, t, spacing, reach, grid, table):
 def step_from(system, k, t, spacing, reach, grid, table):
     """What one step does to every point: (is it in the table?, mean, sd, shares, table)."""
     low, here, mass = grid
-    tabled = system.same_every_step and here == spacing and mass.size > 1
+    tabled = system.is_time_invariant and here == spacing and mass.size > 1
     first, mean, sd, shares, rows = table
     if not tabled or low < first or low + mass.size > first + mean.size:
         first, n = low, mass.size
@@ -128,7 +142,7 @@ def rows_from(low, table):
 def _moments(system, k, t, X, source_spacing, spacing):
     """Mean and deviation of the next state from every point, and what a step may misplace."""
     M = np.empty((2, X.shape[1]))
-    move_points(system, k, t, X, M)
+    step_moments(system, k, t, X, M)
     mean, sd = M[0], M[1]
     for i in range(sd.size):
         sd[i] = math.sqrt(sd[i])
@@ -148,7 +162,7 @@ def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
     for _ in range(20):
         for i in range(mean.size):
             X[0, i] = M[0, i]
-        move_points(system, k, t, X, M)
+        step_moments(system, k, t, X, M)
         for i in range(mass.size):
             if not np.isfinite(M[0, i]):
                 mass[i] = 0.0

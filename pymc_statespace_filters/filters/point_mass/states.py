@@ -19,14 +19,29 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    EntryPoint,
+    arguments_class,
+)
+from pymc_statespace_filters.compiler.native.jit import (
+    inline_always,
+    keep_alive,
+    njit_contract,
+    njit_internal,
+)
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.filters.ensemble.system_table import log_density
-from pymc_statespace_filters.filters.missing import is_missing
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.outcomes import (
+    COVARIANCE_NOT_POSITIVE,
+    NONE,
+    OUT_OF_MEMORY,
+    ZERO_WEIGHTS,
+    is_missing,
+)
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
     first_lattice,
@@ -36,28 +51,31 @@ from pymc_statespace_filters.filters.point_mass.grid import gather, gather_rows,
 from pymc_statespace_filters.filters.point_mass.moments import draw, mass_of, mean_and_sd
 from pymc_statespace_filters.filters.point_mass.recursion import (
     TOO_SHORT,
+    has_valid_covariances,
     no_table,
     rows_from,
     step_from,
 )
-from pymc_statespace_filters.filters.point_mass.system_table import read_one_state
+from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
+from pymc_statespace_filters.filters.system_table import (
+    SYSTEM_ARGUMENTS,
+    log_density,
+    read_system,
+    system_table,
+)
 
 PREDICTED, FILTERED, SMOOTHED = range(3)
 MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
 """Given the observations of earlier steps, of the step's own too, of all."""
 
-_ARGUMENTS = (
-    types.intp, types.intp, types.intp,  # addresses of the system's functions
-    types.intp, types.intp, types.intp, types.float64,  # p, inputs, same every step?, time step
-    types.float64, types.intp,  # tolerance, moment
-    F64_PTR, types.intp,  # theta
-    I64_PTR, types.intp, F64_PTR,  # steps and record
-    F64_PTR, types.intp,  # rows of inputs
-    types.float64,  # t0
-    I64_PTR, types.intp, types.int64,  # rows wanted, seed of the draws
-    F64_PTR, F64_PTR, F64_PTR,  # mean, deviation, draw
-    F64_PTR, F64_PTR,  # terms, health
-)  # fmt: skip
+STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
+    "tolerance": types.float64, "moment": types.intp,
+    "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
+    "rows": I64_PTR, "R": types.intp, "draw_seed": types.int64,  # the steps wanted, and their draws
+    "mean": F64_PTR, "sd": F64_PTR, "drawn": F64_PTR, "terms": F64_PTR, "health": F64_PTR,
+}  # fmt: skip
+
+StatesArguments = arguments_class("StatesArguments", STATES_ARGUMENTS, __name__)
 
 
 class _Rows(NamedTuple):
@@ -71,27 +89,22 @@ class _Rows(NamedTuple):
 
 
 def _grid_states(
-    start, move, log_density, p, n_inputs, same_every_step, dt, tolerance, moment, theta, n_theta,
-    steps, n_observations, observed, inputs, n_rows, t0, wanted, n_wanted, draw_seed,
-    mean, sd, drawn, terms, health,
+    table, dt, theta, n_theta, inputs, n_rows, tolerance, moment, steps, n_observations, observed,
+    t0, rows, R, draw_seed, mean, sd, drawn, terms, health,
 ):  # fmt: skip
     """The states as one function for all systems; see `_evaluate` for what it writes."""
-    system = read_one_state(
-        start, move, log_density, dt, same_every_step,
-        carray(theta, (n_theta,)), carray(inputs, (n_rows, n_inputs)),
-    )  # fmt: skip
-    at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, p))
-    rows = _Rows(
-        carray(wanted, (n_wanted,)), draw_seed,
-        carray(mean, (n_wanted,)), carray(sd, (n_wanted,)), carray(drawn, (n_wanted,)),
-    )  # fmt: skip
+    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
+    at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
+    wanted = _Rows(
+        carray(rows, (R,)), draw_seed, carray(mean, (R,)), carray(sd, (R,)), carray(drawn, (R,))
+    )
     out = carray(terms, (n_observations,))
-    code, j = _evaluate(system, at, record, t0, tolerance, moment, rows, out)
+    code, j = _evaluate(system, at, record, t0, tolerance, moment, wanted, out)
     for failed in range(j, n_observations):
         out[failed] = -np.inf
-    for i in range(n_wanted):
-        if code != NONE and (moment == SMOOTHED or j == 0 or rows.at[i] >= at[j]):
-            rows.mean[i], rows.sd[i], rows.drawn[i] = np.nan, np.nan, np.nan
+    for i in range(R):
+        if code != NONE and (moment == SMOOTHED or j == 0 or wanted.at[i] >= at[j]):
+            wanted.mean[i], wanted.sd[i], wanted.drawn[i] = np.nan, np.nan, np.nan
     state = carray(health, (3,))
     failure = code if code >= NONE else ZERO_WEIGHTS
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
@@ -100,7 +113,7 @@ def _grid_states(
 @inline_always
 def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     """Write rows and terms: (NONE, J), or (a reason, the observation that failed)."""
-    if not system.is_valid:
+    if not has_valid_covariances(system):
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
     kept = rows.at
     if moment == SMOOTHED and rows.at.size:
@@ -227,4 +240,78 @@ def _see_back(system, k, t, d, grid, term, ratio):
         ratio[i] *= math.exp(log_likelihood[i] - term) if is_seen else 0.0
 
 
-GRID_STATES = EntryPoint(_grid_states, _ARGUMENTS, "grid_states", digest("grid_states"))
+GRID_STATES = EntryPoint(_grid_states, STATES_ARGUMENTS, "grid_states", digest("grid_states"))
+
+
+def states_function(
+    system: System, tolerance: float, moment: str
+) -> CompiledFunction[StatesFunction]:
+    """Compile "predicted", "filtered" or "smoothed" states."""
+    bound = _bind(system, tolerance, MOMENTS[moment])
+    evaluate = bound.function
+
+    @njit_contract
+    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
+        mean, sd, drawn, _, health = evaluate(theta, steps, observed, inputs, t0, rows, draw_seed)
+        n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
+        return mean, sd, drawn, n_effective, health
+
+    return CompiledFunction(run, key_of("states", bound.key))
+
+
+def run_function(system: System, tolerance: float) -> CompiledFunction[RunFunction]:
+    """Compile one run: terms, health and filtered moments."""
+    bound = _bind(system, tolerance, FILTERED)
+    evaluate = bound.function
+
+    @njit_contract
+    def run(theta, steps, observed, inputs, t0, seed, rows):
+        mean, sd, _, terms, health = evaluate(theta, steps, observed, inputs, t0, rows, 0)
+        cov = (sd * sd).reshape(rows.size, 1, 1)
+        return terms, health, mean, cov, np.empty((rows.size, 0, 1)), np.empty((rows.size, 0))
+
+    return CompiledFunction(run, key_of("run", bound.key))
+
+
+def _bind(system: System, tolerance: float, moment: int) -> CompiledFunction:
+    """Bind the entry point to one system: (record, rows, draw_seed) -> moments, terms, health."""
+    GRID_STATES.compile()
+    table = system_table(system, ("step_moments", "log_density"))
+    evaluate, make_table, dt = GRID_STATES.external, table.make, system.dt
+
+    @njit_contract
+    def states(theta, steps, observed, inputs, t0, rows, draw_seed):
+        # One state: what is (R, 1) for the caller is a vector here.
+        mean, sd = np.full((rows.size, 1), np.nan), np.full((rows.size, 1), np.nan)
+        drawn, terms = np.full((rows.size, 1), np.nan), np.full(steps.size, -np.inf)
+        health = np.empty(3)
+        health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
+        table = make_table()
+        arguments = StatesArguments(
+            table=table.ctypes.data,
+            dt=dt,
+            theta=theta.ctypes.data,
+            n_theta=theta.size,
+            inputs=inputs.ctypes.data,
+            n_rows=inputs.shape[0],
+            tolerance=tolerance,
+            moment=moment,
+            steps=steps.ctypes.data,
+            n_observations=steps.size,
+            observed=observed.ctypes.data,
+            t0=t0,
+            rows=rows.ctypes.data,
+            R=rows.size,
+            draw_seed=draw_seed,
+            mean=mean.ctypes.data,
+            sd=sd.ctypes.data,
+            drawn=drawn.ctypes.data,
+            terms=terms.ctypes.data,
+            health=health.ctypes.data,
+        )
+        evaluate(*arguments)
+        keep_alive(table)
+        return mean, sd, drawn, terms, health
+
+    key = key_of(f"grid states {tolerance!r} {moment}", table.key, GRID_STATES.key)
+    return CompiledFunction(states, key)

@@ -17,7 +17,7 @@ import numpy as np
 from pymc.model import Model
 
 from pymc_statespace_filters.errors import ModelError, ParallelError
-from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, shared_evaluator
+from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, distributed_evaluator
 from pymc_statespace_filters.parallel.communicator import (
     LAST_WORDS_SECONDS,
     Communicator,
@@ -94,7 +94,7 @@ class Leader:
         self._ranks = ranks
         self._name = next(_leader_numbers)  # a group may have several leaders, one for each model
         self._likelihoods = likelihoods
-        self._evaluators = [shared_evaluator(*of, ranks) for of in likelihoods]
+        self._evaluators = [distributed_evaluator(*of, ranks) for of in likelihoods]
         self._sent: dict[int, bytes] = {}
         self._delegate = PythonCallback(self._evaluate)
 
@@ -194,7 +194,7 @@ def follow(ranks: Communicator) -> None:
                 continue
             name, system, filter, record = message.value
             try:
-                known[name] = shared_evaluator(system, filter, ranks), record
+                known[name] = distributed_evaluator(system, filter, ranks), record
                 ranks.send(message.source, _READY)
             except Exception as error:
                 failure = error

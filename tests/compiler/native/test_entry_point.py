@@ -25,7 +25,8 @@ def scale(x, n, factor):
         values[i] *= factor
 
 
-SCALE = EntryPoint(scale, (F64_PTR, types.intp, types.float64), "scale", None)
+ARGUMENTS = {"x": F64_PTR, "n": types.intp, "factor": types.float64}
+SCALE = EntryPoint(scale, ARGUMENTS, "scale", None)
 by_name, symbol = SCALE.external, SCALE.symbol
 
 
@@ -66,12 +67,10 @@ def test_an_array_is_handed_over_by_its_address():
 
 
 def test_a_second_entry_under_the_same_key_is_the_first():
-    one, two = (
-        EntryPoint(scale, (F64_PTR, types.intp, types.float64), "s", "key") for _ in range(2)
-    )
+    one, two = (EntryPoint(scale, ARGUMENTS, "s", "key") for _ in range(2))
     assert one.symbol == two.symbol
-    unnamed = EntryPoint(scale, (F64_PTR, types.intp, types.float64), "s", None)
-    assert unnamed.symbol != EntryPoint(scale, (), "s", None).symbol
+    unnamed = EntryPoint(scale, ARGUMENTS, "s", None)
+    assert unnamed.symbol != EntryPoint(scale, ARGUMENTS, "s", None).symbol
 
 
 def test_a_filter_is_compiled_once_for_all_systems_and_sizes():

@@ -43,7 +43,7 @@ def test_entries_are_closed():
         out[0] = twice_jitted(out[0])
 
     twice_jitted = njit(twice)
-    entry = EntryPoint(evaluate, (F64_PTR,), "evaluate", None)
+    entry = EntryPoint(evaluate, {"out": F64_PTR}, "evaluate", None)
     entry.compile()
     assert linkages_of_helpers(_compiled[entry.symbol]._library) == [Linkage.internal]
     result = np.array([0.5])

@@ -1,0 +1,192 @@
+"""A system as filters see it: its sizes, its properties, and its compiled functions."""
+
+from functools import cached_property, lru_cache
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+)
+from pymc_statespace_filters.compiler.codegen.functions import member_function
+from pymc_statespace_filters.compiler.lowering import structure
+from pymc_statespace_filters.compiler.lowering.covariances import (
+    covariances,
+    followed_by_square_roots,
+)
+from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
+from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+@lru_cache(maxsize=256)
+def compile_system(model: StateSpaceModel) -> "CompiledSystem":
+    """What filters, simulations and states need of a system; equal systems share one."""
+    return CompiledSystem(model)
+
+
+class CompiledSystem:
+    """Sizes, properties and compiled functions of one system, each made when first asked for.
+
+    Members of an ensemble are the columns of ``X`` (n, N). ``c = prepare(theta)`` are the constants
+    of one evaluation: the parameters, the initial mean, then the lower square roots of the
+    covariances, NaN where one is not positive semidefinite. ``Z`` holds standard normals and may
+    have more columns than there are members; ``k`` is the step, ``t`` its time, ``inputs`` has a
+    row for each step.
+
+    * ``prepare(theta)`` returns c.
+    * ``initialise(c, Z, X)`` draws the state at step 0.
+    * ``propagate(c, inputs, k, t, Z, X)`` moves every member from step k to k + 1, in place.
+    * ``observe(c, inputs, k, t, Z, X, D)`` simulates observations D (p, N), where the user wrote an
+      observation function.
+    * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
+    * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
+      column of X into M (2, N); for one state and additive noise.
+
+    Each is a `CompiledFunction`: ``system.propagate.function`` is called from compiled code, and
+    ``system.propagate.key`` identifies its code.
+
+    Attributes
+    ----------
+    model : StateSpaceModel
+        What the user wrote, for filters that work on its graphs.
+    n, m, p, r, n_inputs, n_theta, n_constants : int
+        Numbers of states, of normals that one step of a member takes (see `merged_noise`), of
+        observables, of measurement noises, of inputs, of parameters, and the length of ``c``.
+    dt : float
+        Length of a step.
+    free : ndarray of int
+        The states that an update may move: all but the carried ones.
+    """
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        self.model = model
+        self.n, self.p, self.r = model.n, model.p, model.r
+        self.n_inputs, self.n_theta, self.dt = model.n_inputs, model.n_theta, model.dt
+        self.states, self.carried = tuple(model.states), tuple(model.carried)
+        self.gaussian_observation = bool(model.gaussian_observation)
+        self.additive_noise = bool(model.additive_noise)
+        carried = [self.states.index(name) for name in self.carried]
+        self.free = np.setdiff1d(np.arange(self.n), carried)
+        self._merged_noise = structure.merged_noise(model)
+        self.m = model.m if self._merged_noise is None else model.n
+        self._covariances = covariances(model, self._merged_noise)
+        sizes = {name: g.outputs[0].type.shape[0] for name, g in self._covariances.items()}
+        self.n_constants = self.n_theta + self.n + sum(size**2 for size in sizes.values())
+        self._c = pt.tensor("c", shape=(self.n_constants,), dtype="float64")
+        self._symbols = symbols_of(model) | {"theta": self._c[: self.n_theta]}
+        self._square_roots, start = {}, self.n_theta + self.n
+        for name, size in sizes.items():
+            self._square_roots[name] = self._c[start : start + size**2].reshape((size, size))
+            start += size**2
+
+    # Functions
+
+    @cached_property
+    def prepare(self) -> CompiledFunction:
+        """Theta -> c."""
+        theta = pt.tensor("theta", shape=(self.n_theta,), dtype="float64")
+        mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
+        return followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
+
+    @cached_property
+    def initialise(self) -> CompiledFunction:
+        """Draw the state at step 0."""
+        z, mean = _normals(self.n), self._c[self.n_theta : self.n_theta + self.n]
+        return self._member_function(
+            "initialise",
+            "c, Z, X",
+            mean + self._square_roots["initial_cov"] @ z,
+            "X[{i}, member]",
+            z=z,
+        )
+
+    @cached_property
+    def propagate(self) -> CompiledFunction:
+        """Move every member one step, in place."""
+        z = _normals(self.m)
+        noise = self._coloured("process_noise", z)
+        transition = self.model.equations.transition
+        if self._merged_noise is None:
+            step = call(transition, self.model, self._given("xut") | {"q": noise})
+        else:
+            step = call(transition, self.model, self._given("xut")) + noise
+        arguments = "c, inputs, k, t, Z, X"
+        return self._member_function("propagate", arguments, step, "X[{i}, member]", "xut", z=z)
+
+    @cached_property
+    def observe(self) -> CompiledFunction:
+        """Simulate an observation of every member."""
+        z = _normals(self.r)
+        noise = {"e": self._coloured("observation_noise", z)}
+        seen = call(self.model.equations.observation, self.model, self._given("xut") | noise)
+        arguments = "c, inputs, k, t, Z, X, D"
+        return self._member_function("observe", arguments, seen, "D[{i}, member]", "xut", z=z)
+
+    @cached_property
+    def log_density(self) -> CompiledFunction:
+        """log p(d | x) of every member."""
+        density = pt.atleast_1d(observation_log_density(self.model, self._given("xutd")))
+        arguments = "c, inputs, k, t, d, X, out"
+        return self._member_function("log_density", arguments, density, "out[member]", "xutd")
+
+    @cached_property
+    def step_moments(self) -> CompiledFunction:
+        """Mean and variance of the next state, for one state and additive noise."""
+        arguments = "c, inputs, k, t, X, M"
+        moments = structure.step_moments(self.model, self._given("xut"))
+        return self._member_function("step_moments", arguments, moments, "M[{i}, member]", "xut")
+
+    def _given(self, names: str) -> dict[str, TensorVariable]:
+        return {name: self._symbols[name] for name in ("theta", *names)}
+
+    def _coloured(self, name: str, z: TensorVariable) -> TensorVariable:
+        """Noise of this covariance; an integrator's noise is white."""
+        return self._square_roots[name] @ z if name in self._square_roots else z
+
+    def _member_function(
+        self, name: str, arguments: str, output: TensorVariable, target: str, inputs: str = "", **z
+    ) -> CompiledFunction:
+        graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
+        return member_function(name, arguments, Graph(graph_inputs, [output]), target)
+
+    # Properties
+
+    @cached_property
+    def is_linear(self) -> bool:
+        """Whether state and noise enter transition and observation linearly; False if unknown."""
+        return structure.is_linear(self.model)
+
+    @cached_property
+    def has_additive_process_noise(self) -> bool:
+        """Whether g(x, q) = g(x, 0) + G(x) q; False if unknown."""
+        return structure.has_additive_process_noise(self.model)
+
+    @cached_property
+    def has_smooth_transition(self) -> bool:
+        """Whether no part of the transition has a kink or a jump; False if unknown."""
+        return structure.has_smooth_transition(self.model)
+
+    @cached_property
+    def is_time_invariant(self) -> bool:
+        """Whether `step_moments` depends on neither inputs nor time; False if unknown."""
+        symbols = {name: symbols_of(self.model)[name] for name in ("theta", *"xut")}
+        moments = structure.step_moments(self.model, symbols)
+        return structure.is_free_of(("u", "t"), moments, symbols)
+
+    @cached_property
+    def has_transition_density(self) -> bool:
+        """Whether one step has a Gaussian density given the state before."""
+        additive = self.has_additive_process_noise
+        return additive and structure.process_noise_reaches_every_state(self.model)
+
+    @property
+    def has_exact_observation_density(self) -> bool:
+        """Whether `log_density` is exact; noise that is not additive enters by linearization."""
+        return self.additive_noise or not self.gaussian_observation
+
+
+def _normals(size: int) -> TensorVariable:
+    return pt.tensor("z", shape=(size,), dtype="float64")

@@ -1,0 +1,132 @@
+"""Covariances of a system and their lower square roots."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytensor.tensor as pt
+from numba import carray, types
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+    jit,
+)
+from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.lowering.symbols import call
+from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+def covariances(
+    system: StateSpaceModel, merged_noise: FrozenFunctionGraph | None = None
+) -> dict[str, FrozenFunctionGraph]:
+    """Covariances whose square roots colour the noise; an integrator's noise is white."""
+    graphs = vars(system.equations) | (
+        {} if merged_noise is None else {"process_noise": merged_noise}
+    )
+    names = ("initial_cov", "process_noise", "observation_noise")
+    return {name: graphs[name] for name in names if graphs[name] is not None}
+
+
+def followed_by_square_roots(
+    outputs: Sequence[TensorVariable],
+    system: StateSpaceModel,
+    theta: TensorVariable,
+    graphs: Mapping[str, FrozenFunctionGraph],
+) -> CompiledFunction:
+    """theta -> these vectors, then the lower square root of every covariance, in one array."""
+    covs = [call(graph, system, {"theta": theta}) for graph in graphs.values()]
+    graph = Graph({"theta": theta}, [pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])])
+    flat = vector_functions({"moments": VectorFunction("c", graph)})["moments"]
+    length, sizes = graph.outputs[0].type.shape[0], tuple(cov.type.shape[0] for cov in covs)
+    moments, first = flat.function, length - sum(size**2 for size in sizes)
+    SQUARE_ROOT.compile()
+    take_root = SQUARE_ROOT.external
+
+    def prepare(theta):
+        c = np.empty(length)
+        values = moments(theta)
+        for i in range(c.size):
+            c[i] = values[i]
+        start = first
+        for size in sizes:
+            take_root(c[start:].ctypes.data, size)
+            start += size * size
+        return c
+
+    return CompiledFunction(jit(prepare), key_of(repr((length, sizes)), flat.key, SQUARE_ROOT.key))
+
+
+def covariance_check(system: StateSpaceModel) -> CompiledFunction:
+    """``check(theta)``: whether every covariance is symmetric and non-negative at theta.
+
+    A filter of moments would go on with a negative variance and give it a likelihood.
+    """
+    graphs = {
+        name: graph
+        for name, graph in covariances(system).items()
+        if any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
+    }
+    if not graphs:
+        return CompiledFunction(jit(lambda theta: True), key_of("nothing to check"))
+    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
+    prepare = followed_by_square_roots([], system, theta, graphs)
+    roots = prepare.function
+
+    def check(theta):
+        for value in roots(theta):
+            if np.isnan(value):
+                return False
+        return True
+
+    return CompiledFunction(jit(check), key_of("check", prepare.key))
+
+
+@jit
+def semidefinite_cholesky(a):
+    """Lower square root in place; a zero pivot gives a zero column, a negative one NaN.
+
+    Covariances without spread in some direction are ordinary here: a known initial state, noise
+    that acts on the velocity alone. Zero is judged against the component's own variance: one may be
+    in pascals, the next in metres.
+    """
+    n = a.shape[0]
+    variance = np.empty(n)
+    for j in range(n):
+        variance[j] = a[j, j]
+    for j in range(n):
+        pivot = a[j, j]
+        for k in range(j):
+            pivot -= a[j, k] ** 2
+        if pivot < -1e-10 * abs(variance[j]) or not np.isfinite(pivot):
+            a[:] = np.nan
+            return
+        root = np.sqrt(pivot) if pivot > 1e-14 * variance[j] else 0.0
+        a[j, j] = root
+        for i in range(j + 1, n):
+            rest = a[i, j]
+            for k in range(j):
+                rest -= a[i, k] * a[j, k]
+            if root > 0.0:
+                a[i, j] = rest / root
+            elif abs(rest) > 1e-7 * np.sqrt(variance[i] * variance[j]):
+                a[:] = np.nan
+                return
+            else:
+                a[i, j] = 0.0
+        for i in range(j):
+            a[i, j] = 0.0
+
+
+def _take_root(a, size):
+    semidefinite_cholesky(carray(a, (size, size)))
+
+
+SQUARE_ROOT = EntryPoint(
+    _take_root, {"a": F64_PTR, "size": types.intp}, "square_root", digest("square_root")
+)
+"""`semidefinite_cholesky` of the matrix at an address, compiled once for all systems."""

@@ -1,0 +1,344 @@
+"""What a filter is: the contract between filters and everything that uses them.
+
+A filter is a frozen, hashable object of settings. It says what it can treat and compiles functions
+for one system, which it is given as a `System`. No base class is needed: `log_likelihood`,
+`StateSpace`, `sample_dram` and the evidence take any `Filter`; what else a filter can do it says by
+the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter` and
+`EnsembleFilter`.
+
+Arrays of the compiled functions: ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each
+observation; ``observed`` (J, p), NaN where missing; ``inputs`` (rows, n_inputs), row k holds during
+step k; ``t0`` the time of step 0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a
+row that is wholly missing and -inf from a failing observation on, and ``health`` (3,): the smallest
+effective number of particles (inf without particles), a failure code of `filters.outcomes`, and the
+index of the failing observation or -1.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.errors import ModelError
+
+type Array = NDArray[np.float64]
+type Integers = NDArray[np.int64]
+
+
+class System(Protocol):
+    """One system as a filter sees it: `compiler.lowering.compiled_system.CompiledSystem`.
+
+    Functions are read there too; each is a `CompiledFunction`, compiled when first asked for.
+    """
+
+    model: Any
+    n: int
+    m: int
+    p: int
+    r: int
+    n_inputs: int
+    n_theta: int
+    n_constants: int
+    dt: float
+    free: Integers
+    states: tuple[str, ...]
+    carried: tuple[str, ...]
+    gaussian_observation: bool
+    additive_noise: bool
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def prepare(self) -> CompiledFunction:
+        """Function (theta) -> c, the constants of one evaluation."""
+        ...
+
+    @property
+    def initialise(self) -> CompiledFunction:
+        """Function (c, Z, X) that draws the state at step 0."""
+        ...
+
+    @property
+    def propagate(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, Z, X) that moves every member one step, in place."""
+        ...
+
+    @property
+    def observe(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, Z, X, D) that simulates observations."""
+        ...
+
+    @property
+    def log_density(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, d, X, out) that writes log p(d | x)."""
+        ...
+
+    @property
+    def step_moments(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, X, M): mean and variance of the next state, one state."""
+        ...
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the system is known to be linear."""
+        ...
+
+    @property
+    def has_additive_process_noise(self) -> bool:
+        """Whether the transition is known to be g(x, 0) + G(x) q."""
+        ...
+
+    @property
+    def has_smooth_transition(self) -> bool:
+        """Whether the transition is known to have no kink and no jump."""
+        ...
+
+    @property
+    def is_time_invariant(self) -> bool:
+        """Whether `step_moments` is known to depend on neither inputs nor time."""
+        ...
+
+    @property
+    def has_transition_density(self) -> bool:
+        """Whether one step is known to have a Gaussian density given the state before."""
+        ...
+
+    @property
+    def has_exact_observation_density(self) -> bool:
+        """Whether `log_density` is exact, not a linearization."""
+        ...
+
+
+class LogLikelihoodFunction(Protocol):
+    """Terms and health of one evaluation.
+
+    ``noise`` is a seed and a vector of stored normals, of which a deterministic filter reads
+    neither; where the vector is empty the seed counts.
+    """
+
+    def __call__(
+        self,
+        theta: Array,
+        steps: Integers,
+        observed: Array,
+        inputs: Array,
+        t0: float,
+        noise: tuple[int, Array],
+    ) -> tuple[Array, Array]:
+        """Evaluate."""
+        ...
+
+
+class DistributedLogLikelihoodFunction(Protocol):
+    """Terms and health of an evaluation that several ranks make together, equal on all of them."""
+
+    def __call__(
+        self,
+        theta: Array,
+        steps: Integers,
+        observed: Array,
+        inputs: Array,
+        t0: float,
+        seed: int,
+        rank: int,
+        n_ranks: int,
+        exchange: int,
+    ) -> tuple[Array, Array]:
+        """Evaluate."""
+        ...
+
+
+class StatesFunction(Protocol):
+    """Mean, sd and a draw (R, n) of the state at ``rows``; n_effective (R,); and health.
+
+    The draws of one ``draw_seed`` belong together. From a failing observation on all are NaN.
+    """
+
+    def __call__(
+        self,
+        theta: Array,
+        steps: Integers,
+        observed: Array,
+        inputs: Array,
+        t0: float,
+        seed: int,
+        rows: Integers,
+        draw_seed: int,
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """Evaluate."""
+        ...
+
+
+class RunFunction(Protocol):
+    """Terms, health, and the filtered state at the steps ``rows``.
+
+    The state is mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N), given the
+    observations up to each row; N is 0 for a filter without members.
+    """
+
+    def __call__(
+        self,
+        theta: Array,
+        steps: Integers,
+        observed: Array,
+        inputs: Array,
+        t0: float,
+        seed: int,
+        rows: Integers,
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Evaluate."""
+        ...
+
+
+class GradientFunction(Protocol):
+    """Vector-Jacobian product: the cotangent of theta (k,) from that of the terms (J,)."""
+
+    def __call__(
+        self,
+        theta: Array,
+        steps: Integers,
+        observed: Array,
+        inputs: Array,
+        t0: float,
+        seed: int,
+        terms_bar: Array,
+    ) -> Array:
+        """Evaluate."""
+        ...
+
+
+class StoredNoiseFunction(Protocol):
+    """The normals that an evaluation with this seed uses, one vector."""
+
+    def __call__(self, steps: Integers, seed: int) -> Array:
+        """Evaluate."""
+        ...
+
+
+@runtime_checkable
+class Filter(Protocol):
+    """Every filter."""
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the likelihood is an estimate that depends on a seed."""
+        ...
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether the filter is a `DifferentiableFilter`."""
+        ...
+
+    def check(self, system: System) -> None:
+        """Raise `ModelError` if the filter cannot treat the system."""
+        ...
+
+    def is_exact_for(self, system: System) -> bool:
+        """Whether the likelihood, or the mean of its estimates, is that of the system."""
+        ...
+
+    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+        """Compile the log-likelihood."""
+        ...
+
+
+@runtime_checkable
+class RunFilter(Filter, Protocol):
+    """A filter that `run_filter` can show."""
+
+    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+        """Compile one run with all that it computes."""
+        ...
+
+
+@runtime_checkable
+class StatesFilter(Filter, Protocol):
+    """A filter that gives states at draws: `filtered_states`, `smoothed_states`, `forecast`."""
+
+    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+        """Compile "predicted", "filtered" or "smoothed" states."""
+        ...
+
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
+        ...
+
+
+@runtime_checkable
+class BatchFilter(Filter, Protocol):
+    """A filter that evaluates many parameter points side by side."""
+
+    def compile_batch(self, system: System) -> CompiledFunction:
+        """Compile the log-likelihood of theta (B, k): terms (B, J), health (B, 3)."""
+        ...
+
+
+@runtime_checkable
+class DifferentiableFilter(Filter, Protocol):
+    """A filter whose likelihood has a gradient.
+
+    A gradient is one pass forwards, which leaves a tape, and one pass back over it. A graph that
+    holds the likelihood too shares the pass forwards.
+    """
+
+    def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
+        """Compile both passes as one function."""
+        ...
+
+    def compile_taped(self, system: System) -> CompiledFunction:
+        """Compile the pass forwards: terms, health and the tape."""
+        ...
+
+    def compile_pullback(self, system: System) -> CompiledFunction:
+        """Compile the pass back: (theta .. seed, tape, terms_bar) -> theta_bar."""
+        ...
+
+
+@runtime_checkable
+class EnsembleFilter(Filter, Protocol):
+    """A filter of members moved by normals, which can be stored, moved a little, or distributed."""
+
+    def size(self) -> int:
+        """Return the number of members."""
+        ...
+
+    def max_ranks(self) -> int:
+        """Return how many ranks can have a whole block of members each."""
+        ...
+
+    def smooth(self, system: System) -> "EnsembleFilter":
+        """Return this filter with an estimate that changes little when its normals do."""
+        ...
+
+    def n_normals(self, system: System, n_steps: Any, n_observations: Any) -> Any:
+        """Return how many normals one evaluation uses."""
+        ...
+
+    def stored_noise(self, system: System) -> CompiledFunction[StoredNoiseFunction]:
+        """Compile the making of these normals."""
+        ...
+
+    def compile_distributed(
+        self, system: System
+    ) -> CompiledFunction[DistributedLogLikelihoodFunction]:
+        """Compile the log-likelihood for members that are divided among ranks."""
+        ...
+
+
+def check_states_filter(filter: Filter) -> StatesFilter:
+    """Return the filter, or raise if it gives no states."""
+    if not isinstance(filter, StatesFilter):
+        raise ModelError(
+            f"{filter!r} gives no states: it has no compile_states; name a filter that does, such "
+            f"as filter=psf.EKF()"
+        )
+    return filter
+
+
+def check_filter(filter: Any) -> None:
+    """Raise unless this is a filter."""
+    if isinstance(filter, type) or not isinstance(filter, Filter):
+        raise ModelError(
+            f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
+        )

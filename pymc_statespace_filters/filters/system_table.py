@@ -1,0 +1,183 @@
+"""A compiled system inside machine code: sizes, and functions that are called by their address.
+
+`system_table` packs a `CompiledSystem` into one vector, `read_system` unpacks it. Both use the
+names of `TABLE`, so that no slot is known by its number alone.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import carray, types
+
+from pymc_statespace_filters.compiler.lowering.entry_points import MemberArguments, entry_point
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    address_of,
+    call_address,
+)
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.filters.protocol import System
+
+
+class Slots(NamedTuple):
+    """Places in the table of a system; the free states follow."""
+
+    n: int = 0
+    p: int = 1
+    n_inputs: int = 2
+    n_theta: int = 3
+    n_constants: int = 4
+    n_free: int = 5
+    is_time_invariant: int = 6
+    prepare: int = 7
+    initialise: int = 8
+    propagate: int = 9
+    observe: int = 10
+    log_density: int = 11
+    step_moments: int = 12
+
+
+TABLE = Slots()
+N_SLOTS = len(TABLE)
+
+SYSTEM_ARGUMENTS = {
+    "table": I64_PTR, "dt": types.float64, "theta": F64_PTR, "n_theta": types.intp,
+    "inputs": F64_PTR, "n_rows": types.intp,
+}  # fmt: skip
+"""What `read_system` reads, as arguments of an entry point."""
+
+NULL = np.int64(0)
+"""An address that is not read."""
+
+
+class TabledSystem(NamedTuple):
+    """One evaluation's system: ``c`` its constants, ``inputs`` a row for each step.
+
+    ``free`` are the states that an update may move. Functions are addresses, 0 for those that the
+    filter does not use.
+    """
+
+    n: int
+    p: int
+    n_theta: int
+    dt: float
+    is_time_invariant: bool
+    free: np.ndarray
+    c: np.ndarray
+    inputs: np.ndarray
+    initialise: int
+    propagate: int
+    observe: int
+    log_density: int
+    step_moments: int
+
+
+class SystemTable(NamedTuple):
+    """The compiled function () -> table, and the key of the system's functions in it."""
+
+    make: Any
+    key: str | None
+
+
+def system_table(system: System, functions: Sequence[str]) -> SystemTable:
+    """Pack a system and those of its functions that a filter uses, `prepare` always."""
+    used = {name: entry_point(system, name) for name in ("prepare", *functions)}
+    for entry in used.values():
+        entry.compile()
+    symbols = {name: entry.symbol for name, entry in used.items()}
+    prepare, initialise = symbols["prepare"], symbols.get("initialise", "")
+    propagate, observe = symbols.get("propagate", ""), symbols.get("observe", "")
+    log_density, step_moments = symbols.get("log_density", ""), symbols.get("step_moments", "")
+    constants = np.zeros(N_SLOTS + system.free.size, dtype=np.int64)
+    constants[TABLE.n], constants[TABLE.p] = system.n, system.p
+    constants[TABLE.n_inputs], constants[TABLE.n_theta] = system.n_inputs, system.n_theta
+    constants[TABLE.n_constants], constants[TABLE.n_free] = system.n_constants, system.free.size
+    constants[TABLE.is_time_invariant] = "step_moments" in used and system.is_time_invariant
+    constants[N_SLOTS:] = system.free
+
+    @njit_contract
+    def make():
+        table = constants.copy()
+        table[TABLE.prepare] = address_of(prepare)
+        table[TABLE.initialise] = address_of(initialise)
+        table[TABLE.propagate] = address_of(propagate)
+        table[TABLE.observe] = address_of(observe)
+        table[TABLE.log_density] = address_of(log_density)
+        table[TABLE.step_moments] = address_of(step_moments)
+        return table
+
+    keys = [entry.key for entry in used.values()]
+    return SystemTable(make, key_of(repr((system.dt, constants.tolist())), *keys))
+
+
+@inline_always
+def read_system(table, dt, theta, n_theta, inputs, n_rows):
+    """Unpack a table, and prepare the constants of one evaluation."""
+    slots = carray(table, (N_SLOTS,))
+    free = carray(table, (N_SLOTS + slots[TABLE.n_free],))[N_SLOTS:]
+    c = np.empty(slots[TABLE.n_constants])
+    call_address(slots[TABLE.prepare], (theta, n_theta, c))
+    return TabledSystem(
+        n=slots[TABLE.n],
+        p=slots[TABLE.p],
+        n_theta=slots[TABLE.n_theta],
+        dt=dt,
+        is_time_invariant=slots[TABLE.is_time_invariant] != 0,
+        free=free,
+        c=c,
+        inputs=carray(inputs, (n_rows, slots[TABLE.n_inputs])),
+        initialise=slots[TABLE.initialise],
+        propagate=slots[TABLE.propagate],
+        observe=slots[TABLE.observe],
+        log_density=slots[TABLE.log_density],
+        step_moments=slots[TABLE.step_moments],
+    )
+
+
+@inline_always
+def _call(address, system, k, t, z, width, X, out):
+    arguments = MemberArguments(
+        c=system.c,
+        inputs=system.inputs,
+        k=k,
+        t=t,
+        z=z,
+        width=width,
+        X=X,
+        out=out,
+        n_members=np.int64(X.shape[1]),
+    )
+    call_address(address, arguments)
+
+
+@inline_always
+def initialise(system, z, width, X):
+    """Draw every member's state at step 0 from normals at the address z."""
+    _call(system.initialise, system, NULL, 0.0, z, width, X, NULL)
+
+
+@inline_always
+def propagate(system, k, t, z, width, X):
+    """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
+    _call(system.propagate, system, k, t, z, width, X, NULL)
+
+
+@inline_always
+def observe(system, k, t, z, width, X, D):
+    """Simulate an observation of every member (Eq. 4.15)."""
+    _call(system.observe, system, k, t, z, width, X, D)
+
+
+@inline_always
+def log_density(system, k, t, d, X, log_p):
+    """Write log p(d | x) of every member; components of d that are NaN are left out."""
+    _call(system.log_density, system, k, t, d, NULL, X, log_p)
+
+
+@inline_always
+def step_moments(system, k, t, X, M):
+    """Write mean and variance of the next state, given each point X (1, N), to M (2, N)."""
+    _call(system.step_moments, system, k, t, NULL, NULL, X, M)
