@@ -16,12 +16,12 @@ from pymc_statespace_filters.filters.system_table import log_density
 
 
 @inline_always
-def _workspace(system, local, settings):
+def workspace(system, local, settings):
     return ()
 
 
 @inline_always
-def _update(system, j, k, t, d, noise, members, local, work):
+def update(system, j, k, t, d, noise, members, local, work):
     X, w, log_w, alive = members.X, members.w, members.log_w, members.alive
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
@@ -75,4 +75,4 @@ class BootstrapPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = particle_filter("bootstrap_pf", _workspace, _update)
+    entry: ClassVar[EntryPoint] = particle_filter("bootstrap_pf", workspace, update)

@@ -49,14 +49,14 @@ class _Work(NamedTuple):
 
 
 @inline_always
-def _workspace(system, local, settings):
+def workspace(system, local, settings):
     moments = moments_workspace(system.n, system.p)
     N = local.size
     return _Work(settings[0] == _ENSEMBLE, moments, np.empty(N), np.empty(N), np.empty(system.p))
 
 
 @inline_always
-def _update(system, j, k, t, d, noise, members, local, work):
+def update(system, j, k, t, d, noise, members, local, work):
     X, D, w, alive, moments = members.X, members.D, members.w, members.alive, work.moments
 
     # Simulated observations (Eq. 4.15)
@@ -147,7 +147,7 @@ class EnKF(EnsembleFilterBase):
     likelihood: str = "ensemble"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = ensemble_filter("enkf", _workspace, _update, n_settings=1)
+    entry: ClassVar[EntryPoint] = ensemble_filter("enkf", workspace, update, n_settings=1)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_members", check_count("n_members", self.n_members))

@@ -36,12 +36,12 @@ _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 
 @inline_always
-def _workspace(system, local, settings):
+def workspace(system, local, settings):
     return int(settings[2]), proposal_workspace(system, local)
 
 
 @inline_always
-def _update(system, j, k, t, d, noise, members, local, work):
+def update(system, j, k, t, d, noise, members, local, work):
     X, log_w = members.X, members.log_w
     likelihood, scratch = work
 
@@ -161,7 +161,7 @@ class PFEnKF(ParticleFilter):
     likelihood: str = "predictive"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = particle_filter("pf_enkf", _workspace, _update, n_settings=1)
+    entry: ClassVar[EntryPoint] = particle_filter("pf_enkf", workspace, update, n_settings=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
