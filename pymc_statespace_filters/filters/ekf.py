@@ -34,8 +34,12 @@ from pymc_statespace_filters.filters.gaussian.recursion import (
     compile_taped,
     compile_value,
 )
-from pymc_statespace_filters.filters.gaussian.run import compile_run
-from pymc_statespace_filters.filters.gaussian.states import ForwardPass, compile_states, states_pass
+from pymc_statespace_filters.filters.gaussian.states import (
+    ForwardPass,
+    compile_run,
+    compile_states,
+    forward_pass,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -131,25 +135,25 @@ def _start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
 def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     """Eqs. 4.8-4.11: A and B are taken at the analysis of this step."""
     mean, cov = unpack(values["s"], system.n)
-    move = linearize_transition(system, values, mean)
-    forecast_cov = move.state_jac @ cov @ move.state_jac.T
+    transition = linearize_transition(system, values, mean)
+    forecast_cov = transition.state_jac @ cov @ transition.state_jac.T
     if system.m:
         if system.equations.process_noise is not None:
             noise_cov = call(system.equations.process_noise, system, values)
-            forecast_cov += move.noise_jac @ noise_cov @ move.noise_jac.T
+            forecast_cov += transition.noise_jac @ noise_cov @ transition.noise_jac.T
         else:
-            forecast_cov += move.noise_jac @ move.noise_jac.T
-    return pack(move.mean, forecast_cov)
+            forecast_cov += transition.noise_jac @ transition.noise_jac.T
+    return pack(transition.mean, forecast_cov)
 
 
 def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
     mean, cov = unpack(values["s"], system.n)
-    sight = innovation_moments(system, values, mean, cov)
-    gain, kept = sight.gain, sight.kept
-    analysis_cov = kept @ cov @ kept.T + gain @ sight.noise_cov @ gain.T
-    increment = log_normal(sight.residual, sight.innovation_cov, sight.seen)
-    return pack(mean + gain @ sight.residual, analysis_cov), increment
+    innovation = innovation_moments(system, values, mean, cov)
+    gain, update_jac = innovation.gain, innovation.update_jac
+    analysis_cov = update_jac @ cov @ update_jac.T + gain @ innovation.noise_cov @ gain.T
+    increment = log_normal(innovation.residual, innovation.innovation_cov, innovation.observed)
+    return pack(mean + gain @ innovation.residual, analysis_cov), increment
 
 
 def _recursion(system: StateSpaceModel) -> GaussianFilterFunctions:
@@ -178,4 +182,4 @@ def _recursion(system: StateSpaceModel) -> GaussianFilterFunctions:
 
 @lru_cache(maxsize=256)
 def _states_pass(system: StateSpaceModel) -> ForwardPass:
-    return states_pass(_recursion(system))
+    return forward_pass(_recursion(system))

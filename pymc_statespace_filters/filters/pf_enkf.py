@@ -41,8 +41,8 @@ from pymc_statespace_filters.filters.ensemble.weights import normalise_own, tota
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.importance_weights import (
     Forecast,
-    nudging_workspace,
-    weigh_nudged,
+    importance_workspace,
+    reweight,
 )
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
@@ -56,7 +56,7 @@ _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 @inline_always
 def _workspace(system, local, settings):
-    return np.int64(settings[2]), nudging_workspace(system, local)
+    return np.int64(settings[2]), importance_workspace(system, local)
 
 
 @inline_always
@@ -81,7 +81,7 @@ def _update(system, j, k, t, d, noise, members, local, work):
     if not (
         forecast.spread > _ONE_PARTICLE
         and _nudge(system, d, members, forecast, local, scratch)  # Eqs. 4.30-4.35
-        and weigh_nudged(system, k, t, d, members, forecast, local, scratch, as_printed)  # Eq. 4.36
+        and reweight(system, k, t, d, members, forecast, local, scratch, as_printed)  # Eq. 4.36
     ):
         copy_members(X_f, X)
         log_density(system, k, t, d, X, log_p)

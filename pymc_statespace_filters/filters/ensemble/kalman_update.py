@@ -6,7 +6,7 @@ equal weights 1/N the weighted covariances of Eqs. 4.32-4.33 are those of Eqs. 4
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
@@ -27,15 +27,6 @@ def mark_finite(X, D, alive):
 
 
 @njit_contract
-def count_true(flags):
-    """Return how many flags are set."""
-    count = 0
-    for flag in flags:
-        count += flag
-    return count
-
-
-@njit_contract
 def copy_members(X, out):
     """Copy X into out, by loops: a slice assignment brings its error message into every filter."""
     for a in range(X.shape[0]):
@@ -48,17 +39,6 @@ def equal_weights(alive, count, w):
     """Weight 1/count for the members alive, zero for the others."""
     for i in range(w.size):
         w[i] = 1.0 / count if alive[i] else 0.0
-
-
-@njit_reassoc
-def mean(w, X, out):
-    """Weighted mean of each row; members of zero weight may be NaN."""
-    for a in range(X.shape[0]):
-        total = 0.0
-        for i in range(w.size):
-            term = w[i] * X[a, i]
-            total += term if w[i] > 0.0 else 0.0
-        out[a] = total
 
 
 @njit_contract

@@ -1,4 +1,8 @@
-"""Weights of nudged particles: kernel densities of prior and proposal (thesis, Eqs. 4.36-4.39)."""
+"""Importance weights of an ensemble Kalman proposal, by kernel densities (thesis, Eqs. 4.36-4.39).
+
+The forecast particles, moved by the Kalman update, are a sample of the proposal. The density of the
+forecast (the prior) and that of the proposal are estimated from the particles themselves.
+"""
 
 import math
 from typing import NamedTuple
@@ -23,7 +27,7 @@ from pymc_statespace_filters.filters.kernel_density.density import (
 
 
 class Forecast(NamedTuple):
-    """Of the forecast of all ranks: who is alive, N_eff, 1 - sum w^2, and the log of E p(d | x)."""
+    """Forecast of all ranks: number of finite particles, N_eff, 1 - sum w^2, log E p(d | x)."""
 
     n_alive: float
     n_effective: float
@@ -32,7 +36,7 @@ class Forecast(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Moments of the forecast, and what the densities of Eq. 4.36 need."""
+    """Moments of the forecast, and scratch of the densities of Eq. 4.36."""
 
     moments: tuple
     w_equal: np.ndarray
@@ -42,7 +46,7 @@ class Scratch(NamedTuple):
 
 
 @inline_always
-def nudging_workspace(system, local):
+def importance_workspace(system, local):
     """Scratch of one update."""
     n, p, N = system.n, system.p, local.size
     moments = (np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
@@ -51,11 +55,11 @@ def nudging_workspace(system, local):
 
 
 @inline_always
-def weigh_nudged(system, k, t, d, members, forecast, local, scratch, keeps_previous):
-    """Leave the unnormalised weights of X in log_w and p(d | x^a) in log_p.
+def reweight(system, k, t, d, members, forecast, local, scratch, keeps_previous):
+    """Write the unnormalised log-weights of X to log_w and log p(d | x^a) to log_p.
 
-    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if
-    the nudged particles and the forecast do not spread in the same directions.
+    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. Returns False, with log_w
+    unchanged, if proposal and forecast do not spread in the same directions.
     """
     X, _, X_f, w, log_w, log_p, alive = members
     _, w_equal, log_prior, log_proposal, density = scratch
@@ -68,8 +72,8 @@ def weigh_nudged(system, k, t, d, members, forecast, local, scratch, keeps_previ
     log_kernel_density(local, w, X_f, X, free, kernel_f, density, log_prior)
     log_kernel_density(local, w_equal, X, X, free, kernel_a, density, log_proposal)
     for i in range(w.size):
-        share = log_w[i] if keeps_previous else -math.log(n_alive)
-        log_weight = share + log_p[i] + (log_prior[i] - log_proposal[i])
+        previous = log_w[i] if keeps_previous else -math.log(n_alive)
+        log_weight = previous + log_p[i] + (log_prior[i] - log_proposal[i])
         log_w[i] = log_weight if alive[i] else -np.inf
     return True
 
