@@ -23,7 +23,7 @@ from pymc_statespace_filters.filters.ensemble.resampling import (
     smooth_resampling,
 )
 from pymc_statespace_filters.filters.ensemble.system_table import log_density
-from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.ensemble.weights import normalise_local, total_weight, weigh
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -51,7 +51,7 @@ def _update(system, j, k, t, d, noise, members, local, work):
     increment, n_effective = total_weight(local, 0)  # Eq. 4.43
     if increment == -np.inf:
         return -np.inf, 0.0, ZERO_WEIGHTS
-    normalise_own(increment, log_w, w, local, 0)
+    normalise_local(increment, log_w, w, local, 0)
     return increment, n_effective, NONE
 
 

@@ -37,7 +37,7 @@ from pymc_statespace_filters.filters.ensemble.resampling import (
     smooth_resampling,
 )
 from pymc_statespace_filters.filters.ensemble.system_table import log_density, observe
-from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.ensemble.weights import normalise_local, total_weight, weigh
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.importance_weights import (
     Forecast,
@@ -110,7 +110,7 @@ def _weigh_alive(members, local):
     exchange(local, 4)
     log_alive, n_effective = total_weight(local, 0)
     if log_alive > -np.inf:
-        normalise_own(log_alive, log_w, w, local, 0)
+        normalise_local(log_alive, log_w, w, local, 0)
     return total(local, 3), n_effective, log_alive
 
 
@@ -153,7 +153,7 @@ def _normalise(members, local, scratch):
     exchange(local, 6)
     log_total, n_effective = total_weight(local, 0)
     if log_total > -np.inf:
-        normalise_own(log_total, log_w, w, local, 0)
+        normalise_local(log_total, log_w, w, local, 0)
     return n_effective, log_total, total_weight(local, 3)[0] - log_total
 
 

@@ -27,7 +27,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
     total,
 )
 from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
-from pymc_statespace_filters.filters.ensemble.weights import normalise_own, total_weight, weigh
+from pymc_statespace_filters.filters.ensemble.weights import normalise_local, total_weight, weigh
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
@@ -121,7 +121,7 @@ def all_sums(rank, n_ranks, address, w, X, log_w):
     for row in range(6):
         out[row] = total(local, row)
     out[6], out[7] = total_weight(local, 6)
-    normalise_own(out[6], log_v, relative, local, 6)
+    normalise_local(out[6], log_v, relative, local, 6)
     sum_values(relative, local, 0)
     exchange(local, 1)
     out[8] = total(local, 0)

@@ -99,9 +99,9 @@ def _fill_cells(X, x_mean, spread, n_bits, cells):
         x, cell, origin, scale = X[a], cells[row], x_mean[a], 1.0 / spread[a]
         for i in range(x.size):
             z = scale * (x[i] - origin)
-            place = half + half * (z / (1.0 + abs(z)))
+            position = half + half * (z / (1.0 + abs(z)))
             # The comparison is false for NaN, whose conversion to an integer is undefined.
-            cell[i] = np.int64(place) if place < last else last
+            cell[i] = np.int64(position) if position < last else last
         row += 1
 
 
@@ -158,9 +158,9 @@ def _sort(n_bits, work):
             start += count
         for i in range(keys.size):
             digit = (keys[i] >> shift) & (_DIGITS - 1)
-            place = counts[digit]
-            counts[digit] = place + 1
-            moved_keys[place], moved_order[place] = keys[i], order[i]
+            position = counts[digit]
+            counts[digit] = position + 1
+            moved_keys[position], moved_order[position] = keys[i], order[i]
         keys, moved_keys = moved_keys, keys
         order, moved_order = moved_order, order
     return order

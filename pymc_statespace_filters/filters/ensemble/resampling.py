@@ -104,13 +104,13 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
         systematic(z, points)
     gather_particles(w, X, local, resampling.all_particles)
     w_all, X_all = resampling.all_particles[0], resampling.all_particles[1:]
-    own_points = points[local.first :]
+    local_points = points[local.first :]
     if resampling.in_order:
         order = order_particles(w_all, X_all, resampling.order_work)
         w_ordered = resampling.w_ordered
-        choose_in_order(w_all, order, own_points, w_ordered, resampling.cumulative, ancestors)
+        choose_in_order(w_all, order, local_points, w_ordered, resampling.cumulative, ancestors)
     else:
-        choose_ancestors(w_all, own_points, resampling.cumulative, ancestors)
+        choose_ancestors(w_all, local_points, resampling.cumulative, ancestors)
     copy_ancestors(X_all, ancestors, X)
     for i in range(log_w.size):
         log_w[i] = -math.log(local.n_members)
@@ -145,12 +145,12 @@ def check_sortable(scheme: str, n_states: int) -> None:
 @njit_contract
 def gather_particles(w, X, local, all_particles):
     """Weights and states of the particles of all ranks, (1 + n, N)."""
-    own_columns = all_particles[:, local.first : local.first + local.size]
+    local_columns = all_particles[:, local.first : local.first + local.size]
     for i in range(w.size):
-        own_columns[0, i] = w[i]
+        local_columns[0, i] = w[i]
     for a in range(X.shape[0]):
         for i in range(w.size):
-            own_columns[1 + a, i] = X[a, i]
+            local_columns[1 + a, i] = X[a, i]
     allgather(local.layout, all_particles, MEMBERS)
 
 

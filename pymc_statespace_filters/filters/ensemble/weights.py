@@ -116,7 +116,7 @@ def total_weight(local, row):
 
 
 @njit_contract
-def normalise_own(log_total, log_w, w, local, row):
+def normalise_local(log_total, log_w, w, local, row):
     """Normalise a rank's own w and log_w after `total_weight`, which returned ``log_total``."""
     for first in range(0, w.size, BLOCK):
         scale = local.sums[row, local.first_block + first // BLOCK]

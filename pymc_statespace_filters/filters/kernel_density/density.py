@@ -153,9 +153,9 @@ def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """
     sources, targets, sums = work
     first, last = local.first, local.first + local.size
-    own_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
+    local_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
     for i in range(w.size):
-        own_w[i] = w[i]
+        local_w[i] = w[i]
     n_dims = _whiten(kernel, free, X, first, sources.rows)
     _whiten(kernel, free, V, first, targets.rows)
     if not (

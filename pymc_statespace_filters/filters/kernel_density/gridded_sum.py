@@ -185,9 +185,9 @@ def _number_of_grids(n_members, n_points):
 
 
 @inline_always
-def _add_stretch(sources, i, j, n_dims, place, windows, grid):
+def _add_stretch(sources, i, j, n_dims, box, windows, grid):
     """Clear a grid and add the members i to j - 1 to it."""
-    (first, extent), (cell, lead, ratio) = place, windows
+    (first, extent), (cell, lead, ratio) = box, windows
     for point in range(grid.size):
         grid[point] = 0.0
     for a in range(n_dims):
@@ -197,7 +197,7 @@ def _add_stretch(sources, i, j, n_dims, place, windows, grid):
 
 
 @inline_always
-def _add_all(layout, sources, n_dims, n_points, place, windows, grids):
+def _add_all(layout, sources, n_dims, n_points, box, windows, grids):
     """The sum of the grids of all members, of n_points each.
 
     Members are divided among grids as they are among ranks. If every rank has the same number of
@@ -212,7 +212,7 @@ def _add_all(layout, sources, n_dims, n_points, place, windows, grids):
     for m in range(begin, end):
         i, j = local_range(RankLayout(m, n_grids, 0), sources.size, MEMBERS)
         grid = grids[0, m * n_points : (m + 1) * n_points]
-        _add_stretch(sources, i, j, n_dims, place, windows, grid)
+        _add_stretch(sources, i, j, n_dims, box, windows, grid)
     if n_grids > 1:
         allgather(layout, grids[:, : n_grids * n_points], n_points)
     total = grids[0]
@@ -278,8 +278,8 @@ def gridded_sums(layout, sources, targets, n_dims, work):
     if n_points > min(other.size, 0.25 * sources.size * targets.size):
         return False
     columns, rows = np.int64(extent[0]), np.int64(extent[1])
-    n_added, place = rows * (columns + 2 * _BLUR), (first, extent)
-    grid = _add_all(layout, sources, n_dims, n_added, place, windows, grids)
+    n_added, box = rows * (columns + 2 * _BLUR), (first, extent)
+    grid = _add_all(layout, sources, n_dims, n_added, box, windows, grids)
     blurred, start = _blur(n_dims, columns, rows, grid, other)
     for a in range(n_dims):
         v = targets.rows[1 + a, begin:end]

@@ -46,8 +46,8 @@ def shifted_sum_workspace(n_ranks, n, width):
 @inline_always
 def _take_logs(layout, targets):
     """Replace a rank's own sums by their logarithms; return how many are below the floor."""
-    begin, end = local_range(layout, targets.size, MEMBERS)
-    sums, n_missed = targets.rows[0, begin:end], 0
+    start, end = local_range(layout, targets.size, MEMBERS)
+    sums, n_missed = targets.rows[0, start:end], 0
     for i in range(sums.size):
         sums[i] = log(sums[i])
         n_missed += not sums[i] > _LOG_FLOOR
@@ -151,8 +151,8 @@ def _sum_tails(layout, sources, targets, n_dims, works):
         n_missed = _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works)
     if n_missed == 0:
         return
-    begin, end = local_range(layout, n_missed, BLOCKS)
-    for k in range(begin, end):
+    start, end = local_range(layout, n_missed, BLOCKS)
+    for k in range(start, end):
         exact[0, k] = log_kernel_sum(y, n_dims, members[1], v, missed[k], sum_work)
     allgather(layout, exact[:, :n_missed], BLOCKS)
     for k in range(n_missed):

@@ -103,14 +103,14 @@ def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
     if not system.is_valid:
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    kept = rows.at
+    stored = rows.at
     if moment == SMOOTHED and rows.at.size:
-        kept = np.arange(rows.at[0], steps[-1] + 1)
+        stored = np.arange(rows.at[0], steps[-1] + 1)
     spacing, reach = first_grid(system, steps, t0, tolerance)
     while True:
         grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
         grids.clear()
-        tape = grids, kept, moment
+        tape = grids, stored, moment
         code, j = attempt(
             system, steps, observed, t0, spacing, reach, tolerance, terms, _keep, tape
         )
@@ -128,14 +128,14 @@ def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
 
 @njit_internal
 def _keep(tape, k, grid, updated):
-    """Append the grid of a kept step to the tape; an updated grid replaces the predicted one."""
-    grids, kept, moment = tape
+    """Append the grid of a stored step to the tape; an updated grid replaces the predicted one."""
+    grids, stored, moment = tape
     n = len(grids)
     low, spacing, mass = grid
     if not updated:
-        if n < kept.size and kept[n] == k:
+        if n < stored.size and stored[n] == k:
             grids.append((low, spacing, mass.copy()))  # the next step may change the masses
-    elif moment != PREDICTED and n > 0 and kept[n - 1] == k:
+    elif moment != PREDICTED and n > 0 and stored[n - 1] == k:
         grids[n - 1] = low, spacing, mass.copy()
 
 
@@ -154,16 +154,16 @@ def _write_rows(rows, grids):
 @njit_internal
 def _smooth(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows):
     """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
-    grids, kept, _ = tape
+    grids, stored, _ = tape
     table, later = empty_table(), grids[-1]
     weights, ratio = later[2], np.ones(later[2].size)
     drawn = 0.0
     i, j = rows.at.size - 1, steps.size - 1
-    for place in range(kept.size - 1, -1, -1):
-        k, grid = kept[place], grids[place]
+    for row in range(stored.size - 1, -1, -1):
+        k, grid = stored[row], grids[row]
         low, grid_spacing, mass = grid
         t = t0 + k * system.dt
-        if k < kept[-1]:
+        if k < stored[-1]:
             mean, sd, ratio, table = _predict_adjoint(
                 system, k, t, spacing, reach, grid, table, later, ratio
             )
