@@ -17,11 +17,13 @@ from pymc_statespace_filters.filters.system_table import log_density
 
 @inline_always
 def workspace(system, local, settings):
+    """Nothing: the update needs no scratch."""
     return ()
 
 
 @inline_always
 def update(system, j, k, t, d, noise, members, local, work):
+    """Weight the particles by the density of the observation."""
     X, w, log_w, alive = members.X, members.w, members.log_w, members.alive
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation

@@ -34,9 +34,9 @@ from pymc_statespace_filters.filters.gaussian.recursion import (
     compile_taped,
     compile_value,
 )
-from pymc_statespace_filters.filters.gaussian.run import compile_run
 from pymc_statespace_filters.filters.gaussian.states import (
     ForwardPass,
+    compile_run,
     compile_states,
     forward_pass,
 )
@@ -133,20 +133,20 @@ def _start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
 def _predict(system: StateSpaceModel, values: Symbols) -> TensorVariable:
     """Eqs. 4.8-4.11: A and B are taken at the analysis of this step."""
     mean, cov = unpack(values["s"], system.n)
-    step = linearize_transition(system, values, mean)
-    forecast_cov = step.state_jac @ cov @ step.state_jac.T
+    transition = linearize_transition(system, values, mean)
+    forecast_cov = transition.state_jac @ cov @ transition.state_jac.T
     if system.m:
-        forecast_cov += process_noise_cov(system, values, step.noise_jac)
-    return pack(step.mean, forecast_cov)
+        forecast_cov += process_noise_cov(system, values, transition.noise_jac)
+    return pack(transition.mean, forecast_cov)
 
 
 def _update(system: StateSpaceModel, values: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
     mean, cov = unpack(values["s"], system.n)
     innovation = innovation_moments(system, values, mean, cov)
-    gain, complement = innovation.gain, innovation.kept
-    analysis_cov = complement @ cov @ complement.T + gain @ innovation.noise_cov @ gain.T
-    increment = log_normal(innovation.residual, innovation.innovation_cov, innovation.seen)
+    gain, update_jac = innovation.gain, innovation.update_jac
+    analysis_cov = update_jac @ cov @ update_jac.T + gain @ innovation.noise_cov @ gain.T
+    increment = log_normal(innovation.residual, innovation.innovation_cov, innovation.observed)
     return pack(mean + gain @ innovation.residual, analysis_cov), increment
 
 

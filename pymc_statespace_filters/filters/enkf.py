@@ -50,6 +50,7 @@ class _Work(NamedTuple):
 
 @inline_always
 def workspace(system, local, settings):
+    """Scratch of an update."""
     moments = moments_workspace(system.n, system.p)
     N = local.size
     return _Work(settings[0] == _ENSEMBLE, moments, np.empty(N), np.empty(N), np.empty(system.p))
@@ -57,6 +58,7 @@ def workspace(system, local, settings):
 
 @inline_always
 def update(system, j, k, t, d, noise, members, local, work):
+    """Move the members by the Kalman gain of their own covariances."""
     X, D, w, alive, moments = members.X, members.D, members.w, members.alive, work.moments
 
     # Simulated observations (Eq. 4.15)

@@ -34,9 +34,9 @@ from pymc_statespace_filters.filters.outcomes import (
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
-    first_lattice,
-    keep_nothing,
-    next_lattice,
+    discard,
+    first_grid,
+    next_grid,
 )
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
 from pymc_statespace_filters.filters.point_mass.states import run_function, states_function
@@ -208,12 +208,12 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
     if not has_valid_covariances(system):
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    spacing, reach = first_lattice(system, steps, t0, tolerance)
+    spacing, reach = first_grid(system, steps, t0, tolerance)
     while True:
         code, j = attempt(
-            system, steps, observed, t0, spacing, reach, tolerance, terms, keep_nothing, None
+            system, steps, observed, t0, spacing, reach, tolerance, terms, discard, None
         )
-        again, spacing, reach = next_lattice(code, spacing, reach)
+        again, spacing, reach = next_grid(code, spacing, reach)
         if not again:
             return code, j
 

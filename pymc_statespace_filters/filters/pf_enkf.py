@@ -21,8 +21,8 @@ from pymc_statespace_filters.filters.ensemble.weights import log_sum, normalise_
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.importance_weights import (
     Forecast,
-    proposal_workspace,
-    weigh_proposal,
+    importance_workspace,
+    reweight,
 )
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.protocol import System
@@ -37,11 +37,13 @@ _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 @inline_always
 def workspace(system, local, settings):
-    return int(settings[2]), proposal_workspace(system, local)
+    """The choice of the likelihood, and scratch of an update."""
+    return int(settings[2]), importance_workspace(system, local)
 
 
 @inline_always
 def update(system, j, k, t, d, noise, members, local, work):
+    """Move the particles by a Kalman gain, and weight them for the densities that this changes."""
     X, log_w = members.X, members.log_w
     likelihood, scratch = work
 
@@ -67,7 +69,7 @@ def update(system, j, k, t, d, noise, members, local, work):
     as_printed = likelihood == _AS_PRINTED
     if not (
         _propose(d, members, forecast, system.free, local, scratch)
-        and weigh_proposal(system, k, t, d, members, forecast, local, scratch, as_printed)
+        and reweight(system, k, t, d, members, forecast, local, scratch, as_printed)
     ):
         copy_members(members.X_f, X)
         log_density(system, k, t, d, X, members.log_p)
@@ -112,7 +114,7 @@ def _propose(d, members, forecast, free, local, scratch):
 
 @dataclass(frozen=True)
 class PFEnKF(ParticleFilter):
-    """Particle filter whose particles an ensemble Kalman update nudges before they are weighted.
+    """Particle filter whose proposal is an ensemble Kalman update.
 
     Parameters
     ----------
@@ -146,10 +148,10 @@ class PFEnKF(ParticleFilter):
     weight, or a covariance is singular or not finite) the update is that of the bootstrap filter.
 
     With `observation_dist` or `observation_logp` observations are not simulated, no particle is
-    nudged, and the filter is the bootstrap filter.
+    moved, and the filter is the bootstrap filter.
 
     A particle with a non-finite state or simulated observation has weight zero. Carried states move
-    with their particle, are not nudged and are not part of the kernel densities.
+    with their particle, are not updated and are not part of the kernel densities.
 
     Examples
     --------
@@ -177,7 +179,7 @@ class PFEnKF(ParticleFilter):
         Returns
         -------
         str
-            "lattice" (O(N)), "exact" (O(N^2)), or "none" where nothing is nudged and the filter is
+            "lattice" (O(N)), "exact" (O(N^2)), or "none" where no particle is moved and the filter is
             the bootstrap filter.
 
         Examples

@@ -1,4 +1,4 @@
-"""The point-mass filter against exact answers: Kalman's, and sums on lattices of the tests' own."""
+"""The point-mass filter against exact answers: Kalman's, and sums on grids of the tests' own."""
 
 import warnings
 
@@ -156,7 +156,7 @@ def test_it_is_the_independent_point_mass_filter(reference, record):
 
 @pytest.mark.parametrize("tolerance", [1e-8, pytest.param(1e-4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sensor", [0.3, 0.03, 0.003])
-def test_tolerance_is_kept_against_a_much_finer_lattice(sensor, tolerance):
+def test_tolerance_is_kept_against_a_much_finer_grid(sensor, tolerance):
     reference = DoubleWell(noise_var=sensor**2, initial_var=0.02)
     steps = np.arange(5, 41, 5)
     observed = simulated(reference, steps)
@@ -174,7 +174,7 @@ def test_tolerance_is_kept_against_a_much_finer_lattice(sensor, tolerance):
 
 
 def dense_terms(x, mean, sd, density, likelihoods, steps):
-    """Terms by a full matrix on a fixed lattice."""
+    """Terms by a full matrix on a fixed grid."""
     spacing, now, terms = x[1] - x[0], 0, []
     matrix = norm.pdf(x[:, None], mean(x), sd(x)) * spacing
     for step, seen in zip(steps, likelihoods, strict=True):

@@ -9,7 +9,7 @@ from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.native.jit import compiled as compiled_code
+from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -273,7 +273,7 @@ def test_other_draws_are_independent():
         assert abs(correlations).max() < 5.0 / np.sqrt(N_DRAWS)
 
 
-@compiled_code
+@njit_contract
 def quantiles(low, spacing, mass, u, out):
     for i in range(u.size):
         out[i] = draw(low, spacing, mass, u[i])
@@ -281,7 +281,7 @@ def quantiles(low, spacing, mass, u, out):
 
 @pytest.mark.parametrize(("sd", "distance"), [(1.2, 0.0), (1.5, 7.0), (4.0, 0.4)])
 def test_draws_have_mean_and_variance_of_the_masses(sd, distance):
-    """From the coarsest lattice in use on, of 1.2 points to a deviation."""
+    """From the coarsest grid in use on, of 1.2 points to a deviation."""
     points = np.arange(-30, 31)
     peaks = np.array([0.3, 0.3 + distance])
     mass = 0.1 * norm.pdf(points[:, None], peaks, sd) @ [0.4, 0.6]

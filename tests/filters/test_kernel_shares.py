@@ -47,19 +47,19 @@ def assert_same(X, w, V, sizes=(2, 3, 4)):
 
 @pytest.mark.parametrize("N", [193, 300, 1000])
 @pytest.mark.parametrize("n", [LINE, PLANE, SPACE])
-def test_exact_sums_and_lattices(n, N):
+def test_exact_sums_and_grids(n, N):
     rng, X, w = weighted_particles(n, N, seed=n)
     assert np.all(np.isfinite(assert_same(X, w, X + 0.3 * rng.standard_normal(X.shape))))
 
 
 @pytest.mark.parametrize("n", [LINE, PLANE])
-def test_one_lattice_for_each_stretch_of_many_members(n):
+def test_one_grid_for_each_stretch_of_many_members(n):
     rng, X, w = weighted_particles(n, 9000, seed=2)
     assert_same(X, w, X + 0.1 * rng.standard_normal(X.shape))
 
 
 @pytest.mark.parametrize("n", [LINE, PLANE])
-def test_members_stay_where_they_are_if_each_rank_has_lattices_of_its_own(n):
+def test_members_stay_where_they_are_if_each_rank_has_grids_of_its_own(n):
     _, X, w = weighted_particles(n, 9000, seed=2)
     _, kernel, _ = bandwidth(X, w)
     V = 0.9 * X + 0.5  # in the bulk
@@ -72,7 +72,7 @@ def test_members_stay_where_they_are_if_each_rank_has_lattices_of_its_own(n):
 )
 @pytest.mark.parametrize("n", [LINE, PLANE])
 def test_tails_of_one_rank_alone(n, targets):
-    # fewer targets than are worth a lattice, more, and those of a block that is not full
+    # fewer targets than are worth a grid, more, and those of a block that is not full
     _, X, w = weighted_particles(n, 1000, seed=3)
     V = X.copy()
     V[:, targets] += 40
@@ -100,7 +100,7 @@ def test_ranks_without_any_weight_or_finite_target(n):
     assert np.all(out[400:] == -np.inf)
 
 
-def test_a_lattice_that_would_be_too_large():
+def test_a_grid_that_would_be_too_large():
     _, X, w = weighted_particles(PLANE, 300, seed=6)
     w[7] = 1e-20
     X[:, 7] = 1e5

@@ -7,8 +7,8 @@ import pytest
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     order_particles,
     order_workspace,
-    read_places,
-    undo_turns,
+    read_keys,
+    undo_rotations,
 )
 
 workspace = numba.njit(lambda n, n_particles: order_workspace(n, n_particles))
@@ -25,11 +25,11 @@ def order_of(X, w=None):
 def test_the_curve_visits_every_cell_once_and_goes_from_neighbour_to_neighbour(n, n_bits):
     side = 1 << n_bits
     cells = np.indices((side,) * n).reshape(n, -1).astype(np.int64)
-    turned, places = cells.copy(), np.empty(cells.shape[1], np.int64)
-    undo_turns(turned, n_bits)
-    read_places(turned, n_bits, places)
-    assert np.array_equal(np.sort(places), np.arange(places.size))
-    path = cells[:, np.argsort(places)]
+    rotated, keys = cells.copy(), np.empty(cells.shape[1], np.int64)
+    undo_rotations(rotated, n_bits)
+    read_keys(rotated, n_bits, keys)
+    assert np.array_equal(np.sort(keys), np.arange(keys.size))
+    path = cells[:, np.argsort(keys)]
     assert np.all(np.abs(np.diff(path)).sum(axis=0) == 1)
     assert np.all(path[:, 0] == 0)
 
@@ -39,10 +39,10 @@ def test_the_curve_fills_one_cell_of_each_coarser_grid_before_the_next(n_bits):
     """What tells Hilbert's curve from a snake through the rows."""
     side = 1 << n_bits
     cells = np.indices((side,) * 3).reshape(3, -1).astype(np.int64)
-    turned, places = cells.copy(), np.empty(cells.shape[1], np.int64)
-    undo_turns(turned, n_bits)
-    read_places(turned, n_bits, places)
-    coarse = (cells >> 1)[:, np.argsort(places)].reshape(3, -1, 8)
+    rotated, keys = cells.copy(), np.empty(cells.shape[1], np.int64)
+    undo_rotations(rotated, n_bits)
+    read_keys(rotated, n_bits, keys)
+    coarse = (cells >> 1)[:, np.argsort(keys)].reshape(3, -1, 8)
     assert np.all(coarse == coarse[:, :, :1])
 
 

@@ -55,7 +55,7 @@ def assert_same(filter_, name, steps, observed, theta=(1.0,), sizes=SIZES):
 
 
 @pytest.mark.parametrize("likelihood", ["predictive", "weights", "as_printed"])
-def test_by_lattice_with_missing_components(likelihood):
+def test_by_grid_with_missing_components(likelihood):
     filter_ = PFEnKF(500, likelihood=likelihood, resample_below=0.9)
     terms, health = assert_same(filter_, "plane", *OSCILLATOR[1:])
     assert np.count_nonzero(terms) == 9

@@ -1,1 +1,1 @@
-"""Compiled mathematical functions that know no model."""
+"""Compiled mathematical functions that depend on no model."""

@@ -1,12 +1,12 @@
 """Exponentials, logarithms and powers for vector code.
 
-Branches are selects, and nothing is called, so that loops over members become vector code; libm is
-called number by number. Domains are those of NumPy, with its NaN, infinities, signed zeros and
-subnormal numbers. Each docstring states the largest error found, in units in the last place (ulp)
-of the result.
+Branches are selects and nothing is called, so that loops over members vectorise; functions of libm
+would be called number by number. Domains are those of NumPy, with its NaN, infinities, signed zeros
+and subnormal numbers. Each docstring states the largest error found, in units in the last place
+(ulp) of the result.
 
 The polynomials are Chebyshev interpolants, computed for these intervals with 200 bits and rounded;
-that of `_log_parts` is fdlibm's (Sun Microsystems, 1993), as is its arrangement.
+that of `_log_parts` and its evaluation are fdlibm's (Sun Microsystems, 1993).
 """
 
 import numpy as np
@@ -25,15 +25,15 @@ from pymc_statespace_filters.compiler.numerics.intrinsics import (
 LOG2_E, _LOG2_E_LOW = 1.4426950408889634, 2.0355273740931033e-17
 _LOG10_E, _LOG10_E_LOW = 0.4342944819032518, 1.098319650216765e-17
 _LN2, _LN2_REST = 0.6931471805599453, 2.3190468138462996e-17
-# Short enough that the product with an exponent is exact.
+# The high part is short enough that its product with an exponent is exact.
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LOG10_2_HIGH, _LOG10_2_LOW = 0.301029995663157, 8.241712586023572e-13
 _THIRD, _THIRD_LOW = 0.3333333333333333, 1.850371707708594e-17
 
 _SMALLEST_NORMAL = 2.2250738585072014e-308
 _TWO_54 = 2.0**54
-_TINY = 2.0**-54  # below it, expm1(x) and log1p(x) are x
-_BEYOND = 1000.0  # exp of it overflows, exp of minus it underflows
+_TINY = 2.0**-54  # below it, expm1(x) and log1p(x) round to x
+_BEYOND = 1000.0  # exp(1000) overflows, exp(-1000) underflows
 MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
 EXPONENT_BITS = np.uint64(52)
 SQRT_HALF = np.uint64(0x3FE6A09E667F3BCD)
@@ -48,7 +48,7 @@ _EXP = (
     0.04166666666666667, 0.1666666666666667, 0.5,
 )  # fmt: skip
 # (log(1 + f) - f + f**2 / 2) in z = (f / (2 + f))**2: fdlibm's, without its factor z
-_LOG = (
+LOG = (
     1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01,
     2.222219843214978396e-01, 2.857142874366239149e-01, 3.999999999940941908e-01,
     6.666666666666735130e-01,
@@ -72,7 +72,7 @@ def _halved(x):
 
 @inlined
 def _exp_near_zero(r, low):
-    """exp(r + low), where ``low`` is lost when added to r."""
+    """exp(r + low), where ``low`` is below the rounding of r."""
     y = 1.0 + r
     lost = (1.0 - y) + r
     return y + fma(r * r, polynomial(r, _EXP), lost + low)
@@ -80,14 +80,14 @@ def _exp_near_zero(r, low):
 
 @inlined
 def _scaled(y, k):
-    """2**k y in two factors, of which the second may overflow or underflow, rounded once."""
+    """2**k y, rounded once, in two factors: only the second may overflow or underflow."""
     first = (0.5 * k + ROUND) - ROUND
     return y * power_of_two(first) * power_of_two(k - first)
 
 
 @inlined
 def exp_times(x, doublings):
-    """exp(x) 2**doublings, for a few doublings."""
+    """exp(x) 2**doublings, for a small whole number of doublings."""
     x = _BEYOND if x > _BEYOND else x
     x = -_BEYOND if x < -_BEYOND else x
     k, r = _halved(x)
@@ -128,7 +128,7 @@ def expm1(x):
 
 @inlined
 def _split(x):
-    """(k, f) of a positive finite x, subnormal ones included."""
+    """(k, f) of a positive finite x, which may be subnormal."""
     tiny = x < _SMALLEST_NORMAL
     enlarged = x * _TWO_54
     bits = bits_of(enlarged if tiny else x) + ONE_OVER_SQRT_HALF
@@ -145,7 +145,7 @@ def _log_parts(f):
     z = s * s
     half_square = 0.5 * f * f
     high = f - half_square
-    low = ((f - high) - half_square) + s * (half_square + z * polynomial(z, _LOG))
+    low = ((f - high) - half_square) + s * (half_square + z * polynomial(z, LOG))
     return high, low
 
 
@@ -158,7 +158,7 @@ def _sum(large, small, rest):
 
 @inlined
 def _log_domain(x, result):
-    """A logarithm at x, given the ``result`` that holds for positive finite x."""
+    """A logarithm at any x, given the ``result`` for positive finite x."""
     result = result if x < np.inf else x
     outside = -np.inf if x == 0.0 else np.nan
     return result if x > 0.0 else (x if x != x else outside)
@@ -264,6 +264,6 @@ def power(x, y):
     result = np.nan if undefined else result
     signed = float_of(bits_of(result) | sign_bit(x))
     result = signed if whole & (not even) else result
-    # 1 to any power, any number to the power 0, and -1 to an infinite power
+    # 1**y, x**0 and (-1)**(+-inf) are 1
     one = (x == 1.0) | (y == 0.0) | ((x == -1.0) & (abs(y) == np.inf))
     return 1.0 if one else result

@@ -1,4 +1,4 @@
-"""Hyperbolic functions for vector code, under the same rules as `exponentials`."""
+"""Hyperbolic functions for vector code, by the rules of `exponential`."""
 
 from pymc_statespace_filters.compiler.numerics.exponential import exp, exp_times
 from pymc_statespace_filters.compiler.numerics.intrinsics import (

@@ -1,9 +1,9 @@
-"""Machine instructions that numba does not offer by name, and how functions made of them compile.
+"""Machine instructions that numba does not expose, and the compilation of functions built on them.
 
-What is built from these has neither branches nor calls, so a loop around it becomes vector code.
-Nothing here takes part in fast mathematics: a caller's flags (`compiled.FAST_MATH`) end where an
-inlined function begins, so the error-free steps stay what they are written as, and a number does
-not depend on whether the loop around it was vectorised.
+Such functions have neither branches nor calls, so that loops around them vectorise. None of them
+uses fast-math flags: the caller's flags (`cache_key.FAST_MATH`) do not apply inside an inlined
+function, so error-free transformations are computed as written, and a result does not depend on
+whether the loop around it was vectorised.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ inlined = njit(
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
 )
-"""For the functions inside vector loops: machine code is pasted into every caller."""
+"""For functions inside vector loops: LLVM inlines them into every caller."""
 
 ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it rounds to an integer, held in the lowest bits
 _ROUND_BIASED = ROUND + 1023.0
@@ -29,7 +29,7 @@ _SIGN = np.uint64(0x8000000000000000)
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """``a * b + c``, rounded once; where no such instruction exists, a slow call."""
+    """``a * b + c``, rounded once; a slow call on processors without the instruction."""
 
     def code(context, builder, signature, arguments):
         return builder.fma(*arguments)
@@ -90,11 +90,11 @@ def power_of_two(k):
 
 @inlined
 def sign_bit(x):
-    """The bits of +0.0 or -0.0, whichever has the sign of x."""
+    """The bits of the zero with the sign of x."""
     return bits_of(x) & _SIGN
 
 
 @inlined
 def with_sign(magnitude, sign):
-    """``magnitude``, not negative, with the sign that `sign_bit` found."""
+    """A non-negative ``magnitude`` with the sign from `sign_bit`."""
     return float_of(bits_of(magnitude) | sign)

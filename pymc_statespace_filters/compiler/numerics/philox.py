@@ -1,10 +1,10 @@
 """Random numbers as a pure function of (seed, purpose, step, component, member).
 
 The generator is Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"):
-ten rounds that scramble a counter with a key. The key is the seed, the counter is where the number
-is used, so there is no state to carry: a number does not depend on how many members there are, on
-which numbers were drawn before, or on who draws it. No branch, no rejection: the loops become
-vector code. Normals are Box and Muller's.
+ten rounds that mix a counter with a key. The key is the seed and the counter is where the number is
+used, so there is no state: a number depends neither on the number of members, nor on the numbers
+drawn before, nor on the rank that draws it. There are no branches and no rejection, so that loops
+vectorise. Normals are made by the Box-Muller transform.
 """
 
 import numpy as np
@@ -21,10 +21,10 @@ from pymc_statespace_filters.compiler.numerics.restricted_domain import (
 )
 
 INITIAL, PROCESS, OBSERVATION, RESAMPLING, STATES = (np.uint64(purpose) for purpose in range(5))
-"""Purposes: which stream of a step a number belongs to."""
+"""Purposes: the independent streams of a step."""
 
 BLOCK = 64
-"""Rows of noise are padded to a multiple of this many members."""
+"""Rows of noise are padded to a multiple of this number of members."""
 
 _PAIRS = BLOCK // 2
 
@@ -61,7 +61,7 @@ def philox(c0, c1, c2, c3, k0, k1):
 
 @inline_always
 def key_words(seed):
-    """The 64 bits of an integer seed, negative ones included, as the two words of a key."""
+    """The two words of a key: the 64 bits of an integer seed, which may be negative."""
     bits = np.uint64(seed)
     return bits & _LOW_WORD, bits >> _WORD_BITS
 
@@ -77,8 +77,8 @@ def open_unit(low, high):
 def box_muller(w0, w1, w2, w3):
     """Two independent standard normals from four 32-bit words.
 
-    The angle is a fraction of the quadrant around zero; two bits that the fraction leaves over
-    mirror it on the diagonal and on the origin, which covers the circle.
+    The angle is uniform in the quadrant around zero; two further bits reflect the point in the
+    diagonal and in the origin, which covers the circle.
     """
     radius = np.sqrt(-2.0 * log(open_unit(w0, w1)))
     sine, cosine = sin_cos_quarter(open_unit(w2, w3) - 0.5)
@@ -94,9 +94,10 @@ def padded(n_members: int) -> int:
 
 @njit_contract
 def fill_normals(seed, purpose, step, Z, first_block=0):
-    """Fill Z (components, padded members) with the standard normals of members from a block on.
+    """Fill Z (components, padded members) with the standard normals of members, by blocks of 64.
 
-    One Philox block makes two normals: they go to members i and i + 32 of a block of 64.
+    Column 0 is the first member of ``first_block``. One call of Philox makes two normals, for the
+    members i and i + 32 of a block.
     """
     k0, k1 = key_words(seed)
     c2, c3 = np.uint64(step), purpose
@@ -113,7 +114,7 @@ def fill_normals(seed, purpose, step, Z, first_block=0):
 
 @inline_always
 def uniform_at(seed, purpose, step, component):
-    """A uniform number in (0, 1) of its own."""
+    """A single uniform number in (0, 1)."""
     k0, k1 = key_words(seed)
     zero = np.uint64(0)
     w0, w1, _, _ = philox(zero, np.uint64(component), np.uint64(step), purpose, k0, k1)
@@ -147,4 +148,4 @@ FILL_NORMALS = EntryPoint(
     "fill_normals",
     digest("fill_normals"),
 )
-"""`fill_normals` of rows at an address: compiled once for all filters."""
+"""`fill_normals` of an array given by its address, compiled once for all filters."""

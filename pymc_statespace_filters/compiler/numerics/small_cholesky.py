@@ -1,4 +1,9 @@
-"""Small Gaussian algebra: Cholesky factors, triangular solves and the log-density, in place."""
+"""Cholesky factors, triangular solves and the Gaussian log-density of small matrices, in place.
+
+Three other factorisations differ on purpose. `lowering.ensemble.semidefinite_cholesky` takes
+covariances given by the user, and marks a matrix that is none by NaN. `codegen.scalarize` and
+`codegen.array_linalg` implement PyTensor's Cholesky in generated code, with its conventions.
+"""
 
 import math
 
@@ -8,13 +13,14 @@ from pymc_statespace_filters.compiler.native.jit import inline_always, njit_cont
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 
-_STRICT = 1e-14  # a pivot below this share of its variance is rounding noise of a singular matrix
-_SEMIDEFINITE = 1e-12  # wider: a direction is rather dropped than divided by a noisy pivot
+# A smaller pivot, relative to its variance, is rounding of a singular matrix. The second is larger:
+# dropping a direction is better than dividing by an inaccurate pivot.
+_STRICT, _SEMIDEFINITE = 1e-14, 1e-12
 
 
 @inline_always
 def _eliminate(A, j):
-    """Pivot j of the factor of A whose columns before j are done."""
+    """Pivot j of A, whose columns before j are factored."""
     pivot = A[j, j]
     for k in range(j):
         pivot -= A[j, k] * A[j, k]
@@ -23,7 +29,7 @@ def _eliminate(A, j):
 
 @inline_always
 def _scale_column(A, j, root):
-    """Column j of the factor below and on the diagonal, zeros above."""
+    """Write column j of the factor on and below the diagonal, and zeros above."""
     n = A.shape[0]
     A[j, j] = root
     for i in range(j + 1, n):
@@ -36,7 +42,7 @@ def _scale_column(A, j, root):
 
 @njit_contract
 def cholesky(A):
-    """Replace A by its lower Cholesky factor; False, with A half done, if not positive definite."""
+    """Replace A by its lower Cholesky factor; False, with A in parts, if not positive definite."""
     for j in range(A.shape[0]):
         pivot = _eliminate(A, j)
         if not (pivot > _STRICT * A[j, j] and pivot < np.inf):
@@ -49,8 +55,8 @@ def cholesky(A):
 def semidefinite_cholesky(A, floor, active):
     """Replace A by a lower factor in which directions without variance have a zero column.
 
-    A pivot that does not exceed its share of rounding noise, or ``floor[j]``, is such a direction:
-    ``active[j]`` becomes False. Returns False if A holds NaN or infinity.
+    Direction j has no variance if its pivot does not exceed rounding or ``floor[j]``; ``active[j]``
+    is then False. Returns False if A holds NaN or infinity.
     """
     for j in range(A.shape[0]):
         pivot = _eliminate(A, j)
@@ -85,9 +91,9 @@ def solve_lower_transposed(L, b):
 
 @njit_contract
 def log_gaussian(r, L, n_dims):
-    """log N(r; 0, L L^T) of which ``n_dims`` components count; r is overwritten.
+    """log N(r; 0, L L^T) of ``n_dims`` components; r is overwritten.
 
-    Components that are left out have a zero in r and a row and column of the identity in L.
+    A missing component has a zero in r and a row and column of the identity in L.
     """
     solve_lower(L, r)
     total = -0.5 * n_dims * LOG_TWO_PI

@@ -1,11 +1,11 @@
-"""Trigonometric functions, and division with a remainder, for vector code.
+"""Trigonometric functions and division with remainder, for vector code.
 
-As in `exponentials`: selects for branches, no calls, the domains of NumPy, and the largest error
-found in each docstring. The polynomials of sine and cosine are fdlibm's (Sun Microsystems, 1993);
-that of the arctangent is a Chebyshev interpolant.
+The rules are those of `exponential`: selects for branches, no calls, the domains of NumPy, and the
+largest error found in each docstring. The polynomials of sine and cosine are fdlibm's (Sun
+Microsystems, 1993); that of the arctangent is a Chebyshev interpolant.
 
-Angles are reduced by pi / 2 in three parts. With fused multiplications that loses nothing below
-2**47, where neighbouring numbers are 1/64 apart. From there on an angle counts as zero.
+Angles are reduced by pi / 2 in three parts, which with fused multiplications is accurate below
+2**47, where neighbouring numbers are 1/64 apart. Larger angles are replaced by zero.
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ _ARCTAN = (
 
 @inlined
 def _quarter(x):
-    """(a, bits): x is a plus as many quarter turns as the lowest two bits say; |a| <= pi / 4."""
+    """(a, bits): x = a + n pi / 2 with |a| <= pi / 4; the lowest two bits are n modulo 4."""
     x = x if abs(x) < _LARGEST_ANGLE else x * 0.0
     shifted = fma(x, _TWO_OVER_PI, ROUND)
     n = shifted - ROUND
@@ -86,7 +86,7 @@ def _sin_cos_near_zero(a):
 
 @inlined
 def _turned(value, bits):
-    """``value`` with its sign changed if the second bit is set."""
+    """``value``, negated if the second bit is set."""
     return float_of(bits_of(value) ^ ((bits & _TWO_BIT) << _TO_SIGN))
 
 
@@ -104,7 +104,7 @@ def cos(x):
     """The cosine, to 1.5 ulp; of an angle from 2**47 on, 1."""
     a, bits = _quarter(x)
     s, c = _sin_cos_near_zero(a)
-    # the cosine is the sine a quarter turn on
+    # cos(x) = sin(x + pi / 2)
     return _turned(c if (bits & _ONE_BIT) == 0 else s, bits + _ONE_BIT)
 
 
@@ -168,7 +168,7 @@ def _floor_division(x, y):
     """(q, r) with x = q y + r, q whole and r between 0 and y, for |x / y| < 2**52."""
     q = np.floor(x / y)
     r = x if q == 0.0 else fma(-q, y, x)
-    # Rounding may have carried x / y up to a whole number.
+    # Rounding may have raised x / y to a whole number.
     carried = (r != 0.0) & ((r < 0.0) != (y < 0.0))
     lower, rest = q - 1.0, r + y
     return lower if carried else q, rest if carried else r
@@ -176,11 +176,11 @@ def _floor_division(x, y):
 
 @inlined
 def floor_divide(x, y):
-    """The whole number at or below x / y, for |x / y| < 2**52."""
+    """The largest whole number not above x / y, for |x / y| < 2**52."""
     return _floor_division(x, y)[0]
 
 
 @inlined
 def modulo(x, y):
-    """What `floor_divide` leaves over, of the sign of y."""
+    """The remainder of `floor_divide`, with the sign of y."""
     return _floor_division(x, y)[1]

@@ -1,12 +1,13 @@
-"""An order of particles in which neighbours are close, and which moves little when they do.
+"""Sorting particles so that neighbours in the order are close in state space, in O(n N).
 
-One direction is ordered by the state. Several are ordered along a Hilbert curve through the cube
-(-1, 1)^n, into which every direction goes by z / (1 + |z|), z in standard deviations of the
-weighted particles. The place on the curve is found as by Skilling (2004), "Programming the Hilbert
-curve", here for all particles at once; then places are sorted by their digits (radix sort). O(n N).
+Particles of one state are sorted by it. Those of several states are sorted along a Hilbert curve
+through the cube (-1, 1)^n, to which each direction is mapped by z / (1 + |z|), with z in standard
+deviations of the weighted particles. The key of a particle is its position on the curve, computed
+as in Skilling (2004), "Programming the Hilbert curve", for all particles at once. Keys are sorted
+by radix sort.
 
 A direction without spread is left out. Coordinates are rounded to 32 bits in one direction, 12 in
-two and 8 in more, finer than the particles lie apart; those in one cell keep their order.
+two and 8 in more, finer than the distances between particles; those in one cell keep their order.
 """
 
 from typing import NamedTuple
@@ -14,18 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
-from pymc_statespace_filters.filters.ensemble.kalman_update import mean
 
-MOST_STATES = 8  # of 8 bits each: a place on the curve is one 64-bit number
+MOST_STATES = 8  # of 8 bits each: a key is one 64-bit integer
 
 _BITS = (32, 12, 8)  # of a coordinate in one, two and more directions
 _DIGIT_BITS = 8
 _DIGITS = 1 << _DIGIT_BITS
-_KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a value known exactly
+_KNOWN = 1e-13  # a smaller spread, relative to the mean, is rounding of a value known exactly
 
 
 class OrderWork(NamedTuple):
-    """Scratch of `order_particles`: moments of the states, coordinates, and what is sorted."""
+    """Scratch of `order_particles`: moments of the states, cells, keys and indices."""
 
     x_mean: np.ndarray
     spread: np.ndarray
@@ -51,12 +51,11 @@ def order_workspace(n, n_particles):
 
 @njit_contract
 def order_particles(w, X, work):
-    """The order of the particles X (n, N) with weights w: an array of ``work``, of their numbers.
+    """Indices that sort the particles X (n, N) with weights w; an array of ``work``.
 
-    Particles of zero weight may be NaN or infinite, and stand anywhere.
+    Particles of zero weight may be NaN or infinite; their place in the order is arbitrary.
     """
-    mean(w, X, work.x_mean)
-    _spreads(w, X, work.x_mean, work.spread)
+    _moments(w, X, work.x_mean, work.spread)
     n_active = 0
     for a in range(X.shape[0]):
         n_active += work.spread[a] > _KNOWN * abs(work.x_mean[a])
@@ -68,25 +67,30 @@ def order_particles(w, X, work):
         for i in range(keys.size):
             keys[i] = cell[i]
     else:
-        undo_turns(cells, n_bits)
-        read_places(cells, n_bits, work.keys)
+        undo_rotations(cells, n_bits)
+        read_keys(cells, n_bits, work.keys)
     return _sort(n_active * n_bits, work)
 
 
 @njit_reassoc
-def _spreads(w, X, x_mean, out):
-    """Weighted standard deviation of each row; members of zero weight may be NaN."""
+def _moments(w, X, mean, sd):
+    """Weighted mean and standard deviation of each row; zero weights may have NaN states."""
     for a in range(X.shape[0]):
         total = 0.0
         for i in range(w.size):
-            term = w[i] * (X[a, i] - x_mean[a]) ** 2
+            term = w[i] * X[a, i]
             total += term if w[i] > 0.0 else 0.0
-        out[a] = np.sqrt(total)
+        mean[a] = total
+        total = 0.0
+        for i in range(w.size):
+            term = w[i] * (X[a, i] - mean[a]) ** 2
+            total += term if w[i] > 0.0 else 0.0
+        sd[a] = np.sqrt(total)
 
 
 @njit_contract
 def _fill_cells(X, x_mean, spread, n_bits, cells):
-    """Number of the cell, from 0 to 2^n_bits - 1, in each direction that has spread."""
+    """Cell number, from 0 to 2^n_bits - 1, in each direction with spread."""
     half, last = 0.5 * (1 << n_bits), (1 << n_bits) - 1
     row = 0
     for a in range(X.shape[0]):
@@ -95,19 +99,19 @@ def _fill_cells(X, x_mean, spread, n_bits, cells):
         x, cell, origin, scale = X[a], cells[row], x_mean[a], 1.0 / spread[a]
         for i in range(x.size):
             z = scale * (x[i] - origin)
-            place = half + half * (z / (1.0 + abs(z)))
-            # False for NaN too, whose conversion to an integer is anything.
-            cell[i] = np.int64(place) if place < last else last
+            position = half + half * (z / (1.0 + abs(z)))
+            # The comparison is false for NaN, whose conversion to an integer is undefined.
+            cell[i] = np.int64(position) if position < last else last
         row += 1
 
 
 @njit_contract
-def undo_turns(cells, n_bits):
-    """Turn each point, level by level, as the curve in its cell is turned against the whole curve.
+def undo_rotations(cells, n_bits):
+    """Undo, level by level, the rotation of the curve within each particle's cell.
 
-    Every level halves all directions. In a half of set bit the curve runs with the first direction
-    mirrored, in one of cleared bit with the first direction and this one exchanged; both concern
-    the levels below. Skilling's loop, with particles innermost.
+    Each level halves all directions. In the half with the bit set the first direction of the curve
+    is mirrored; in the other half the first direction and this one are exchanged. Both affect the
+    levels below. Skilling's loop, with particles innermost.
     """
     for level in range(n_bits - 1, 0, -1):
         below = (np.int64(1) << level) - 1
@@ -119,12 +123,12 @@ def undo_turns(cells, n_bits):
                 is_set = (y >> level) & 1 == 1
                 turn = below if is_set else (x ^ y) & below
                 cell[i] = y if is_set else y ^ turn
-                first[i] = x ^ turn  # after the line above: they are one row where a is 0
+                first[i] = x ^ turn  # must come second: for a = 0 both are the same row
 
 
 @njit_contract
-def read_places(cells, n_bits, keys):
-    """Place on the curve: the bits of turned points, level by level, are its Gray code."""
+def read_keys(cells, n_bits, keys):
+    """Keys: the bits of the rotated points, level by level, are the key's Gray code."""
     for i in range(keys.size):
         keys[i] = 0
     for level in range(n_bits - 1, -1, -1):
@@ -137,7 +141,7 @@ def read_places(cells, n_bits, keys):
 
 @njit_contract
 def _sort(n_bits, work):
-    """Numbers of the particles by increasing key, digit by digit from the lowest; ties in order."""
+    """Indices of the particles by increasing key: stable radix sort from the lowest digit."""
     keys, moved_keys, counts = work.keys, work.moved_keys, work.counts
     order, moved_order = work.order, work.moved_order
     for i in range(order.size):
@@ -154,9 +158,9 @@ def _sort(n_bits, work):
             start += count
         for i in range(keys.size):
             digit = (keys[i] >> shift) & (_DIGITS - 1)
-            place = counts[digit]
-            counts[digit] = place + 1
-            moved_keys[place], moved_order[place] = keys[i], order[i]
+            position = counts[digit]
+            counts[digit] = position + 1
+            moved_keys[position], moved_order[position] = keys[i], order[i]
         keys, moved_keys = moved_keys, keys
         order, moved_order = moved_order, order
     return order

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
@@ -43,17 +43,6 @@ def equal_weights(alive, count, w):
     """Weight 1/count for the members alive, zero for the others."""
     for i in range(w.size):
         w[i] = 1.0 / count if alive[i] else 0.0
-
-
-@njit_reassoc
-def mean(w, X, out):
-    """Weighted mean of each row; members of zero weight may be NaN."""
-    for a in range(X.shape[0]):
-        total = 0.0
-        for i in range(w.size):
-            term = w[i] * X[a, i]
-            total += term if w[i] > 0.0 else 0.0
-        out[a] = total
 
 
 class Moments(NamedTuple):

@@ -1,9 +1,9 @@
 """Resampling: draw N ancestors in proportion to the weights (thesis, section 4.4.1), in O(N).
 
-Every scheme is a set of N increasing points in (0, 1) and a walk along the cumulative weights. In
-"sorted" the points are the systematic ones and the walk goes from neighbour to neighbour
-(`_order`), so that normals and particles that move little are resampled almost alike, and stand in
-that order afterwards (Deligiannidis, Doucet and Pitt 2018; Gerber and Chopin 2015).
+Every scheme is a set of N increasing points in (0, 1) and one pass over the cumulative weights.
+"sorted" uses the systematic points and takes the particles in the order of `hilbert_sort`, in which
+the new particles stay: small changes of particles and normals change the resampled set little
+(Deligiannidis, Doucet and Pitt 2018; Gerber and Chopin 2015).
 
 Differences from the source: the thesis copies particle n when v_n <= u < v_{n+1}, an interval that
 belongs to particle n + 1; here it is v_{n-1} <= u < v_n with v_0 = 0. It also draws N + 1 times;
@@ -31,7 +31,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import sum_blocks
 
 @njit_contract
 def systematic(z, points):
-    """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is not used."""
+    """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is unused."""
     n = points.size - 1
     u = uniform(z[0], z[1])
     for i in range(n):
@@ -57,10 +57,10 @@ _MULTINOMIAL, _SORTED = SCHEMES.index("multinomial"), SCHEMES.index("sorted")
 
 
 class Resampling(NamedTuple):
-    """When and how to resample, and scratch for it.
+    """When and how to resample, and scratch.
 
-    ``everyone`` holds weights and states of the particles of all ranks, (1 + n, N); ``cumulative``
-    the cumulative weights at the end of each block.
+    ``all_particles`` (1 + n, N) holds weights and states of the particles of all ranks,
+    ``cumulative`` the cumulative weights at the end of each block.
     """
 
     threshold: float
@@ -69,7 +69,7 @@ class Resampling(NamedTuple):
     always: bool
     points: np.ndarray
     ancestors: np.ndarray
-    everyone: np.ndarray
+    all_particles: np.ndarray
     cumulative: np.ndarray
     order_work: OrderWork
     w_ordered: np.ndarray
@@ -77,7 +77,7 @@ class Resampling(NamedTuple):
 
 @inline_always
 def resampler(fraction, scheme, n_states, local):
-    """Resample below this fraction of the particles, by the scheme of this number."""
+    """Settings and scratch: resample below ``fraction`` of the particles, by scheme number."""
     N, in_order = local.n_members, scheme == _SORTED
     n_ordered = N if in_order else 0
     return Resampling(
@@ -92,24 +92,25 @@ def resampler(fraction, scheme, n_states, local):
 def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
     """Draw new particles of equal weight if the effective number is below the threshold.
 
-    ``z`` are the normals that a resampling takes. Returns whether it was done; ``ancestors`` tell
-    then who became whom.
+    ``z`` are the normals of the scheme. Returns whether particles were resampled; their indices
+    before are then in ``ancestors``.
     """
     if not (resampling.always or n_effective < resampling.threshold):
         return False
-    points, ancestors, everyone = resampling.points, resampling.ancestors, resampling.everyone
+    points, ancestors = resampling.points, resampling.ancestors
     if resampling.multinomial:
         multinomial(z, points)
     else:
         systematic(z, points)
-    gather_particles(w, X, local, everyone)
-    w_all, X_all, own_points = everyone[0], everyone[1:], points[local.first :]
+    gather_particles(w, X, local, resampling.all_particles)
+    w_all, X_all = resampling.all_particles[0], resampling.all_particles[1:]
+    local_points = points[local.first :]
     if resampling.in_order:
         order = order_particles(w_all, X_all, resampling.order_work)
         w_ordered = resampling.w_ordered
-        choose_in_order(w_all, order, own_points, w_ordered, resampling.cumulative, ancestors)
+        choose_in_order(w_all, order, local_points, w_ordered, resampling.cumulative, ancestors)
     else:
-        choose_ancestors(w_all, own_points, resampling.cumulative, ancestors)
+        choose_ancestors(w_all, local_points, resampling.cumulative, ancestors)
     copy_ancestors(X_all, ancestors, X)
     for i in range(log_w.size):
         log_w[i] = -math.log(local.n_members)
@@ -117,51 +118,51 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
 
 
 def smooth_resampling(filter: Any, n_states: int) -> Any:
-    """Give a particle filter's version whose estimate moves little when its normals do.
+    """Return a version of a particle filter whose estimate changes little with its normals.
 
-    Whether to resample is a jump of its own, which is avoided by resampling at every observation
-    where the order of the particles is exact. Along a curve through several dimensions it is not,
-    and resampling less often is better.
+    The decision to resample is discontinuous too. With one state, where sorted resampling is
+    smooth, it is avoided by resampling at every observation. With several states the order along
+    the curve is not continuous, and resampling less often is better.
     """
     always = {"resample_below": 1.0} if n_states == 1 else {}
     return replace(filter, resampling="sorted", **always)
 
 
 def n_normals(scheme: str, n_particles: int) -> int:
-    """Normals that a scheme takes, a whole number of blocks."""
+    """Number of normals that a scheme uses, in whole blocks."""
     return 2 * padded(n_particles + 1) if scheme == "multinomial" else padded(2)
 
 
 def check_sortable(scheme: str, n_states: int) -> None:
-    """Raise if the scheme orders particles and cannot order those of so many states."""
+    """Raise if the scheme sorts particles and cannot sort those of so many states."""
     if scheme == "sorted" and n_states > MOST_STATES:
         raise ModelError(
             f"resampling='sorted' orders particles of at most {MOST_STATES} states, this system "
-            f"has {n_states}; take resampling='systematic'"
+            f"has {n_states}; use resampling='systematic'"
         )
 
 
 @njit_contract
-def gather_particles(w, X, local, everyone):
+def gather_particles(w, X, local, all_particles):
     """Weights and states of the particles of all ranks, (1 + n, N)."""
-    own_columns = everyone[:, local.first : local.first + local.size]
+    local_columns = all_particles[:, local.first : local.first + local.size]
     for i in range(w.size):
-        own_columns[0, i] = w[i]
+        local_columns[0, i] = w[i]
     for a in range(X.shape[0]):
         for i in range(w.size):
-            own_columns[1 + a, i] = X[a, i]
-    allgather(local.layout, everyone, MEMBERS)
+            local_columns[1 + a, i] = X[a, i]
+    allgather(local.layout, all_particles, MEMBERS)
 
 
 @njit_contract
 def choose_ancestors(w, points, cumulative, ancestors):
     """Ancestor of each point: the n with v_{n-1} <= u < v_n, v the cumulative weights (Eq. 4.44).
 
-    Within a block of 64 they are added up from the end of the block before, which is written to
-    ``cumulative``: so points need not be walked to from the very first particle.
+    ``cumulative`` receives the weights up to the end of each block of 64; within a block weights
+    are added from there on, so that a rank's search need not start at the first particle.
 
-    A particle of zero weight has an empty interval. The end is the last particle that has weight,
-    whatever rounding makes of the last cumulative sum.
+    A particle of zero weight has an empty interval. The last particle with a positive weight ends
+    the search, however the last cumulative sum was rounded.
     """
     sum_blocks(w, cumulative)
     last_block = cumulative.size - 1
@@ -188,7 +189,7 @@ def choose_ancestors(w, points, cumulative, ancestors):
 
 @inline_always
 def _last_of_weight(w, first):
-    """The last particle of a block that has weight; the first, if none has."""
+    """The last particle of positive weight in the block from ``first`` on; ``first`` if none."""
     last = min(first + BLOCK, w.size) - 1
     while last > first and not w[last] > 0.0:
         last -= 1
@@ -197,7 +198,7 @@ def _last_of_weight(w, first):
 
 @njit_contract
 def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
-    """Ancestor of each point on a walk along the particles in this order."""
+    """As `choose_ancestors`, with the particles taken in this order."""
     for i in range(order.size):
         w_ordered[i] = w[order[i]]
     choose_ancestors(w_ordered, points, cumulative, ancestors)
@@ -207,7 +208,7 @@ def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
 
 @njit_contract
 def copy_ancestors(X_all, ancestors, X):
-    """Make the columns of X (states, particles) those of their ancestors in X_all."""
+    """Set the columns of X (states, particles) to those of their ancestors in X_all."""
     for a in range(X.shape[0]):
         old, row = X_all[a], X[a]
         for i in range(row.size):

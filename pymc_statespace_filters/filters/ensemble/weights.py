@@ -1,7 +1,7 @@
-"""Weights of particles, kept as logarithms.
+"""Weights of particles, stored as logarithms.
 
-Sums of the weights of all ranks go by way of `_sums`: the weights of a block are first taken
-relative to the largest of that block, and blocks are then compared, so that one exchange is enough.
+Sums over all ranks use `reductions`: the weights of a block are taken relative to the largest of
+that block, and the blocks are then rescaled, so that one exchange is enough.
 """
 
 import math
@@ -21,10 +21,10 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
 
 @njit_contract
 def normalise(log_w, w):
-    """Make w and log_w the normalised weights; return the log of their former sum.
+    """Normalise log_w and write the weights to w; return the log of their former sum.
 
-    NaN and +inf are weights of zero. If every weight is zero the result is -inf and the weights are
-    useless.
+    NaN and +inf count as zero weights. If every weight is zero the result is -inf and w is
+    undefined.
     """
     largest = -np.inf
     for i in range(log_w.size):
@@ -36,8 +36,7 @@ def normalise(log_w, w):
         return -np.inf
     total = 0.0
     for i in range(w.size):
-        above = log_w[i] - largest
-        w[i] = exp(above) if above > EXP_LOWEST else 0.0
+        w[i] = _relative(log_w[i], largest)
         total += w[i]
     log_total = largest + math.log(total)
     for i in range(w.size):
@@ -57,10 +56,10 @@ def effective_number(w):
 
 @njit_contract
 def weigh(log_w, w, local, row):
-    """Leave in w the weights relative to the largest of their block, and three rows of sums.
+    """Write to w the weights relative to the largest of their block, and three rows of sums.
 
-    The rows, for `total_weight`: the log of the largest, and the sums of w and of w^2. NaN and
-    +inf are weights of zero, and become so in log_w.
+    The rows, for `total_weight`: the log of the largest weight, and the sums of w and of w^2. NaN
+    and +inf count as zero weights and become -inf in log_w.
     """
     n_whole, out = w.size // BLOCK, local.sums[row, local.first_block :]
     for block in range(n_whole):  # a loop of fixed length becomes straight vector code
@@ -74,7 +73,7 @@ def weigh(log_w, w, local, row):
 
 @inline_always
 def _weigh_block(log_w, w, first, n, lanes):
-    """Return the largest of n weights, and leave them relative to it."""
+    """Write n weights relative to the largest of them; return its logarithm."""
     log_block, w_block = log_w[first : first + n], w[first : first + n]
     for i in range(n, BLOCK):
         lanes[i] = -np.inf
@@ -92,16 +91,16 @@ def _weigh_block(log_w, w, first, n, lanes):
 
 @inline_always
 def _relative(log_w, largest):
-    above = log_w - largest
-    return exp(above) if above > EXP_LOWEST else 0.0
+    difference = log_w - largest
+    return exp(difference) if difference > EXP_LOWEST else 0.0
 
 
 @njit_contract
 def total_weight(local, row):
     """Log of the sum of all weights, and their effective number (thesis, Eq. 4.43).
 
-    From three completed rows of `weigh`; -inf and 0 if every weight is zero. What a block's weights
-    are to be multiplied by, so that all are normalised, is left in the first of them.
+    From three completed rows of `weigh`; -inf and 0 if every weight is zero. The first row is
+    replaced by the factors that normalise the weights of each block.
     """
     scales, sums, squares = local.sums[row], local.sums[row + 1], local.sums[row + 2]
     largest = -np.inf
@@ -122,8 +121,8 @@ def total_weight(local, row):
 
 
 @njit_contract
-def normalise_own(log_total, log_w, w, local, row):
-    """Make w and log_w normalised weights after `total_weight`, which found ``log_total``."""
+def normalise_local(log_total, log_w, w, local, row):
+    """Normalise a rank's own w and log_w after `total_weight`, which returned ``log_total``."""
     for first in range(0, w.size, BLOCK):
         scale = local.sums[row, local.first_block + first // BLOCK]
         for i in range(first, min(first + BLOCK, w.size)):
@@ -141,7 +140,7 @@ def normalise_weights(log_w, w, local):
     """
     log_total, n_effective = log_sum(log_w, w, local)
     if log_total > -np.inf:
-        normalise_own(log_total, log_w, w, local, 0)
+        normalise_local(log_total, log_w, w, local, 0)
     return log_total, n_effective
 
 

@@ -1,1 +1,1 @@
-"""The recursion, derivative, batch and smoother of the extended Kalman filter."""
+"""Recursion, derivative, batch evaluation and smoother of the extended Kalman filter."""

@@ -1,4 +1,4 @@
-"""The derivative of a deterministic filter's likelihood: its tape read backwards, exactly."""
+"""Exact reverse-mode derivative of a deterministic filter's likelihood, from the forward tape."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,7 +25,7 @@ from pymc_statespace_filters.filters.outcomes import is_missing
 
 def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
-    parts = vector_functions(_reverse(recursion))
+    parts = vector_functions(_vjps(recursion))
     parameters, zeros, start_vjp, predict_vjp, update_vjp = (
         part.function for part in parts.values()
     )
@@ -33,7 +33,7 @@ def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
 
     def reverse(theta, steps, observed, inputs, t0, seed, tape, terms_bar):
         theta_bar = np.zeros(theta.size)
-        row = np.uint64(tape.shape[0])  # unsigned: no index from the end is considered
+        row = np.uint64(tape.shape[0])  # unsigned: spares the check for negative indices
         if row == 0:
             return theta_bar
         c = parameters(theta)
@@ -70,21 +70,23 @@ def compile_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
     return compiled_of(gradient, "gradient", parts, recursion)
 
 
-def _reverse(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
+def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
     """Vector-Jacobian products of the three parts; each adds to ``c_bar``, theta's cotangent.
 
-    They are linear in the cotangent, and only the cotangent waits for the step after. An element
-    that is written apart waits for one multiplication: the Jacobian's entries that it meets are
-    computed meanwhile. The others go backwards through the equations, which takes fewer operations
-    in all. Which to write apart was found by measuring.
+    They are linear in the cotangent, which is their only input from the later step. For the first
+    ``n_explicit`` elements of the cotangent the row of the Jacobian is computed explicitly: the
+    processor does so ahead of time, and the cotangent then takes one multiplication. The other
+    elements are propagated through the equations, with fewer operations in all. The numbers of
+    explicit elements were chosen by measurement.
     """
     theta, s = (recursion.predict.graph.inputs[name] for name in ("theta", "s"))
     s_bar, c_bar = s.type("s_bar"), theta.type("c_bar")
     term_bar = pt.tensor("term_bar", shape=(), dtype="float64")
     n, size = recursion.system.n, recursion.size
 
-    def pulled(part: VectorFunction, wrt: list, cotangents: dict, n_apart: int) -> VectorFunction:
-        *states_bar, theta_bar = _pull(part.graph.outputs, list(cotangents.values()), wrt, n_apart)
+    def vjp(part: VectorFunction, wrt: list, cotangents: dict, n_explicit: int) -> VectorFunction:
+        values = list(cotangents.values())
+        *states_bar, theta_bar = _pullback(part.graph.outputs, values, wrt, n_explicit)
         given = {"tape" if v is s else name: v for name, v in part.graph.inputs.items()}
         inputs = {**given, **cotangents, "c_bar": c_bar}
         return VectorFunction(
@@ -93,26 +95,26 @@ def _reverse(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
             [False] * len(wrt),
         )
 
-    nothing = [pt.zeros(v.type.shape) for v in (s, theta)]
-    step, seen = {"s_bar": s_bar}, {"s_bar": s_bar, "term_bar": term_bar}
+    zeros = [pt.zeros(v.type.shape) for v in (s, theta)]
+    state, state_and_term = {"s_bar": s_bar}, {"s_bar": s_bar, "term_bar": term_bar}
     return {
         "parameters": recursion.parts()["parameters"],
-        "zeros": VectorFunction("c", Graph({"theta": theta}, nothing), (False, False)),
-        "start_vjp": pulled(recursion.start, [theta], step, 0),
-        "predict_vjp": pulled(recursion.predict, [s, theta], step, size if n == 1 else n),
-        "update_vjp": pulled(recursion.update, [s, theta], seen, size + 1 if n <= 2 else 0),
+        "zeros": VectorFunction("c", Graph({"theta": theta}, zeros), (False, False)),
+        "start_vjp": vjp(recursion.start, [theta], state, 0),
+        "predict_vjp": vjp(recursion.predict, [s, theta], state, size if n == 1 else n),
+        "update_vjp": vjp(recursion.update, [s, theta], state_and_term, size + 1 if n <= 2 else 0),
     }
 
 
-def _pull(
+def _pullback(
     outputs: Sequence[TensorVariable],
     cotangents: Sequence[TensorVariable],
     wrt: Sequence[TensorVariable],
-    n_apart: int,
+    n_explicit: int,
 ) -> list[TensorVariable]:
-    """Vector-Jacobian products, with the first elements of the cotangents written apart."""
-    given = pt.concatenate([pt.atleast_1d(c) for c in cotangents])
-    symbol = given.type("cotangent")
+    """Vector-Jacobian products, the first elements of the cotangents by explicit Jacobian rows."""
+    cotangent = pt.concatenate([pt.atleast_1d(c) for c in cotangents])
+    symbol = cotangent.type("cotangent")
     ends = np.cumsum([output.type.shape[0] for output in outputs])
     pieces = [symbol[end - o.type.shape[0] : end] for o, end in zip(outputs, ends, strict=True)]
     bars = pytensor.grad(
@@ -127,10 +129,10 @@ def _pull(
     def at(value: Any) -> list[TensorVariable]:
         return graph_replace(bars, {symbol: pt.as_tensor(value)}, strict=False)
 
-    if not n_apart:
-        return at(given)
-    totals = at(pt.concatenate([np.zeros(n_apart), given[n_apart:]]))
-    for i in reversed(range(n_apart)):
+    if not n_explicit:
+        return at(cotangent)
+    totals = at(pt.concatenate([np.zeros(n_explicit), cotangent[n_explicit:]]))
+    for i in reversed(range(n_explicit)):
         row = at(np.eye(ends[-1])[i])
-        totals = [total + given[i] * entry for total, entry in zip(totals, row, strict=True)]
+        totals = [total + cotangent[i] * entry for total, entry in zip(totals, row, strict=True)]
     return totals

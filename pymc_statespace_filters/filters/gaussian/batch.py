@@ -1,7 +1,7 @@
-"""A deterministic filter at many parameter points: side by side, in lanes of vector code.
+"""A deterministic filter at many parameter points at once, one SIMD lane per point.
 
-One point waits for the result of every step before it can begin the next. Points beside it fill the
-wait, so that several cost little more than one.
+At a single point each step waits for the one before. Further points fill that latency, so several
+cost little more than one.
 """
 
 from typing import Any
@@ -73,10 +73,7 @@ def _lanes(recursion: GaussianFilterFunctions) -> CompiledFunction:
         W = np.empty(n_rows * LANES)
         nothing = np.empty(0)
         alive = np.empty(theta.shape[0], np.bool_)
-        for lane in range(n_lanes):
-            point = min(lane, theta.shape[0] - 1)  # lanes to spare repeat the last point
-            for i in range(theta.shape[1]):
-                W[i * LANES + lane] = theta[point, i]
+        _load_parameters(theta, n_lanes, W)
         for point in range(theta.shape[0]):
             alive[point] = has_valid_covariances(theta[point].copy())
             if not alive[point]:
@@ -91,26 +88,42 @@ def _lanes(recursion: GaussianFilterFunctions) -> CompiledFunction:
             while k < steps[j]:
                 predict(W, n_lanes, inputs, k, t0 + k * dt, nothing)
                 k += 1
-            seen = not is_missing(observed, j)
-            if seen:
+            if is_missing(observed, j):
+                for i in range(theta.shape[0]):
+                    terms[i, j] = 0.0 if alive[i] else terms[i, j]
+            else:
                 is_finite(W, finite)
                 update(W, n_lanes, inputs, k, t0 + k * dt, observed[j])
-            for i in range(theta.shape[0]):
-                term = W[last * LANES + i] if seen else 0.0
-                if alive[i] and np.isfinite(term):
-                    terms[i, j] = term
-                elif alive[i]:
-                    alive[i] = False
-                    health[i, 1] = COVARIANCE_NOT_POSITIVE if finite[i] else NO_FINITE_MEMBER
-                    health[i, 2] = j
+                _store_terms(W[last * LANES :], j, finite, alive, terms, health)
             if not alive.any():
                 break
 
     return CompiledFunction(group, key_of("lanes", lanes.key, valid.key))
 
 
+@jit
+def _load_parameters(theta, n_lanes, W):
+    """Write the parameters of each point to its lane; spare lanes repeat the last point."""
+    for lane in range(n_lanes):
+        point = min(lane, theta.shape[0] - 1)
+        for i in range(theta.shape[1]):
+            W[i * LANES + lane] = theta[point, i]
+
+
+@jit
+def _store_terms(lanes, j, finite, alive, terms, health):
+    """Store the finite terms of observation j; a point without one fails there."""
+    for i in range(alive.size):
+        if alive[i] and np.isfinite(lanes[i]):
+            terms[i, j] = lanes[i]
+        elif alive[i]:
+            alive[i] = False
+            health[i, 1] = COVARIANCE_NOT_POSITIVE if finite[i] else NO_FINITE_MEMBER
+            health[i, 2] = j
+
+
 def _finite_mean(recursion: GaussianFilterFunctions) -> Any:
-    """``is_finite(W, finite)``: whether the mean is, lane by lane."""
+    """``is_finite(W, finite)``: whether the mean is finite, lane by lane."""
     first, n = recursion.system.n_theta, recursion.system.n
 
     @jit

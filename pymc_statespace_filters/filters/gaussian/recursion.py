@@ -1,7 +1,7 @@
-"""A deterministic filter as machine code: one vector ``s`` carried along a record.
+"""The forward pass of a deterministic filter, compiled: one vector ``s`` carried along a record.
 
-The filter is three functions of that vector, given as graphs. Its likelihood is one pass; where a
-derivative is wanted too, the pass leaves a tape of the states that it met, see `_reverse`.
+The filter is given as graphs of three functions of that vector. The likelihood takes one pass; for
+a derivative the pass also leaves a tape of its states, which `adjoint` reads.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 @dataclass(frozen=True)
 class GaussianFilterFunctions:
-    """The functions of a filter for one system; the first ``system.n`` entries of s are the mean.
+    """A filter's functions for one system; the first ``system.n`` entries of s are the mean.
 
     * ``start(c) -> s`` at step 0; ``c`` are the parameters.
     * ``predict(c, inputs, k, t, s) -> s`` from step k to k + 1.
@@ -44,7 +44,7 @@ class GaussianFilterFunctions:
 
     @property
     def size(self) -> int:
-        """The length of s."""
+        """Length of s."""
         return self.predict.graph.inputs["s"].type.shape[0]
 
     def parts(self) -> dict[str, VectorFunction]:
@@ -60,7 +60,7 @@ class GaussianFilterFunctions:
 
 @dataclass(frozen=True)
 class _Tape:
-    """What the forward pass does with the states it meets."""
+    """How the forward pass stores its states: ``new`` allocates, ``save`` writes a row."""
 
     new: Any
     save: Any
@@ -76,7 +76,7 @@ def _no_tape() -> _Tape:
 
 
 def _tape(size: int) -> _Tape:
-    """A row for the state before each prediction and each update; none if the filter fails."""
+    """A row for the state before each prediction and each update; no rows if the filter fails."""
 
     def new(steps):
         n_steps = steps[-1] if steps.size else 0
@@ -93,7 +93,7 @@ def _tape(size: int) -> _Tape:
 
 
 def _tape_to_the_end(size: int) -> _Tape:
-    """The same with the last state as a last row; from a failing observation on rows are NaN."""
+    """As `_tape`, with the last state as last row; rows from a failing observation on are NaN."""
     save = _tape(size).save
 
     def new(steps):
@@ -116,12 +116,12 @@ def compile_value(recursion: GaussianFilterFunctions) -> CompiledFunction:
 
 
 def compile_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
-    """The same function, with the tape as a third result."""
+    """As `compile_value`, with the tape as third result."""
     return _compile_forward(recursion, "taped", _tape(recursion.size))
 
 
 def compile_taped_to_the_end(recursion: GaussianFilterFunctions) -> CompiledFunction:
-    """The same with a tape that holds the last state too, and is there if the filter fails."""
+    """As `compile_taped`; the tape also holds the last state, and is kept if the filter fails."""
     return _compile_forward(recursion, "taped to the end", _tape_to_the_end(recursion.size))
 
 
@@ -176,6 +176,6 @@ def compiled_of(
     parts: Mapping[str, CompiledFunction],
     recursion: GaussianFilterFunctions,
 ) -> CompiledFunction:
-    """Compile a function that is made of parts of a recursion."""
+    """Compile a function that calls these parts; their keys enter its own."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
     return CompiledFunction(jit(function), key_of(what, *(part.key for part in parts.values())))

@@ -1,7 +1,8 @@
-"""The states that a Gaussian filter knows of, as machine code: one pass, and for all data one back.
+"""Compiled state estimates of a Gaussian filter: predicted, filtered, smoothed, and the run.
 
-A pass leaves two tapes, each a row per state: ``before`` every observation, ``after`` every step's
-observation, or the step where there is none.
+Predicted and filtered states take one forward pass, smoothed states a backward pass too. The
+forward pass leaves two tapes with a state per row: ``before`` each observation, and ``after`` each
+step with its observation, if there is one.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,11 @@ from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions, compiled_of
+from pymc_statespace_filters.filters.gaussian.recursion import (
+    GaussianFilterFunctions,
+    compile_taped_to_the_end,
+    compiled_of,
+)
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -33,13 +38,13 @@ from pymc_statespace_filters.filters.outcomes import (
 )
 from pymc_statespace_filters.system.model import StateSpaceModel
 
-# Streams of `STATES`: that of the record's steps, a column for each, and that of the start.
+# Counters of the random stream `STATES`: the steps of the record (one column each), the start.
 _ALONG, _AT_START = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardPass:
-    """What the states of all moments begin with: compiled once for a system."""
+    """The forward pass, compiled once for a system and shared by all moments."""
 
     smoother: BrysonFrazier
     noise: CompiledFunction
@@ -47,19 +52,19 @@ class ForwardPass:
 
 
 def forward_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
-    """The pass forwards of a filter."""
+    """The forward pass of a filter, its errors simulated alongside."""
     smoother = BrysonFrazier(recursion)
     return ForwardPass(smoother, _noise(recursion.system), _forwards(smoother))
 
 
-def compile_states(begin: ForwardPass, moment: str) -> CompiledFunction:
+def compile_states(forward: ForwardPass, moment: str) -> CompiledFunction:
     """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
-    recursion = begin.smoother.recursion
+    recursion = forward.smoother.recursion
     if moment == "smoothed":
-        read_states = _read_backwards(begin.smoother)
+        read_states = _read_backwards(forward.smoother)
     else:
         read_states = _read_forwards(recursion.system.n, predicted=moment == "predicted")
-    parts = {"noise": begin.noise, "forwards": begin.forwards, "read": read_states}
+    parts = {"noise": forward.noise, "forwards": forward.forwards, "read": read_states}
     noise, forwards, read = (part.function for part in parts.values())
     n = recursion.system.n
 
@@ -78,8 +83,38 @@ def compile_states(begin: ForwardPass, moment: str) -> CompiledFunction:
     return compiled_of(states, f"states {moment}", parts, recursion)
 
 
+def compile_run(recursion: GaussianFilterFunctions) -> CompiledFunction:
+    """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
+
+    Means and covariances are read from the tape of the forward pass; a run without members.
+    """
+    forward = compile_taped_to_the_end(recursion)
+    run_forward, n = forward.function, recursion.system.n
+
+    def run(theta, steps, observed, inputs, t0, seed, rows):
+        terms, health, tape = run_forward(theta, steps, observed, inputs, t0, seed)
+        R, j = rows.size, 0
+        mean, cov = np.empty((R, n)), np.empty((R, n, n))
+        for r in range(R):
+            while j < steps.size and steps[j] <= rows[r]:
+                j += 1
+            s = tape[rows[r] + j]  # the tape has a row for each step and each observation so far
+            at = n
+            for a in range(n):
+                mean[r, a] = s[a]
+                for b in range(a + 1):
+                    cov[r, a, b] = cov[r, b, a] = s[at]
+                    at += 1
+        return terms, health, mean, cov, np.empty((R, 0, n)), np.empty((R, 0))
+
+    return compiled_of(run, "run", {"forward": forward}, recursion)
+
+
 def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
-    """The filter and a simulated error of it along a record; ``end`` is the first step lost."""
+    """The filter and a simulated error of it along a record.
+
+    ``end``, the third result, is the first step without a state.
+    """
     system, size = smoother.recursion.system, smoother.size
     parts = vector_functions(smoother.forwards())
     parameters, start, predict, update = (part.function for part in parts.values())
@@ -122,7 +157,7 @@ def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
 
 
 def _read_forwards(n: int, *, predicted: bool) -> CompiledFunction:
-    """Write what the filter knew at the rows, and return how many have a state."""
+    """Write predicted or filtered states at the rows; return how many rows have a state."""
     size = n + n * (n + 1) // 2
 
     def read(record, before, after, end, rows, mean, sd, drawn):
@@ -147,10 +182,12 @@ def _read_forwards(n: int, *, predicted: bool) -> CompiledFunction:
 
 
 def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
-    """Write what all data say of the rows; nothing where the filter failed."""
+    """Write smoothed states at the rows; none if the filter failed."""
     system = smoother.recursion.system
     parts = vector_functions(smoother.backwards())
-    parameters, end_of, unpredict, unupdate, smooth = (part.function for part in parts.values())
+    parameters, end_of, predict_adjoint, update_adjoint, smooth = (
+        part.function for part in parts.values()
+    )
     dt, n = system.dt, system.n
 
     def read(record, before, after, end, rows, mean, sd, drawn):
@@ -161,12 +198,12 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
         c = parameters(theta)
         s_bar = end_of(c)
         j, r = steps.size - 1, rows.size - 1
-        informed = False  # where nothing later was seen, zero stays zero whatever comes there
+        informed = False  # until an observation the adjoint is zero, even if Jacobians are infinite
         for k in range(n_steps, -1, -1):
             if r < 0:
                 break
             if informed:
-                s_bar = unpredict(c, inputs, k, t0 + k * dt, after, k, s_bar)
+                s_bar = predict_adjoint(c, inputs, k, t0 + k * dt, after, k, s_bar)
             if rows[r] == k:
                 m, variances, x = smooth(c, after, k, s_bar)
                 for i in range(n):
@@ -175,7 +212,9 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
                 r -= 1
             if j >= 0 and steps[j] == k:
                 if not is_missing(observed, j):
-                    s_bar = unupdate(c, inputs, k, t0 + k * dt, observed[j], before, j, Z, k, s_bar)
+                    s_bar = update_adjoint(
+                        c, inputs, k, t0 + k * dt, observed[j], before, j, Z, k, s_bar
+                    )
                     informed = True
                 j -= 1
         return rows.size
@@ -187,8 +226,8 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
 def _noise(system: StateSpaceModel) -> CompiledFunction:
     """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (m + p, steps).
 
-    The first m rows of Z have the covariance of q. The roots are those of the user's covariances,
-    which may be singular, and were found to be covariances at theta.
+    The first m rows of Z have the covariance of q. The covariances may be singular; that they are
+    covariances at theta has been checked.
     """
     equations, n, m = system.equations, system.n, system.m
     is_white = equations.process_noise is None
@@ -203,14 +242,14 @@ def _noise(system: StateSpaceModel) -> CompiledFunction:
     fill, purpose = FILL_NORMALS.external, np.int64(STATES)
 
     def noise(theta, n_steps, draw_seed):
-        width = BLOCK * (n_steps // BLOCK + 1)  # a column for each step, and some to spare
+        width = BLOCK * (n_steps // BLOCK + 1)  # a column for each step, padded to whole blocks
         X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
         fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
         fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
         values = covariances(theta)
-        colour(values, 0, n, X)
+        apply_covariance(values, 0, n, X)
         if not is_white:
-            colour(values, n * n, m, Z)
+            apply_covariance(values, n * n, m, Z)
         return X, Z
 
     key = key_of(f"noise of states {n} {m} {n_rows}", flat.key, FILL_NORMALS.key)
@@ -218,14 +257,14 @@ def _noise(system: StateSpaceModel) -> CompiledFunction:
 
 
 @jit
-def colour(values, first, size, Z):
-    """Give the first ``size`` rows of standard normals the covariance found in ``values``."""
+def apply_covariance(values, first, size, Z):
+    """Multiply ``size`` rows of standard normals by the root of the covariance in ``values``."""
     root = np.empty((size, size))
     for i in range(size):
         for j in range(size):
             root[i, j] = values[first + i * size + j]
     semidefinite_cholesky(root)
-    for i in range(size - 1, -1, -1):  # from below: a row is made of itself and those above
+    for i in range(size - 1, -1, -1):  # last row first: a row depends on itself and those above
         for member in range(Z.shape[1]):
             total = 0.0
             for j in range(i + 1):

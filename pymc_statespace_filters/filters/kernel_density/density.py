@@ -2,13 +2,13 @@
 
 The density at a target v is sum_l w_l |H|^-1 K(H^-1 (x_l - v)), where H is the lower Cholesky
 factor of the weighted covariance times N_eff^{-1/(n+4)}. Members and targets are whitened by H
-first, so that the sums see plain distances. In one and two directions they go over a lattice
-(`_lattice_sum`), O(N), for targets far outside the cloud too (`_tilted_sum`); in more directions,
-for few members and for single targets in the tails they are exact (`_kernel_sum`), O(N) a target.
+first. In one and two directions the sums go through a grid (`gridded_sum`), O(N), also at targets
+far outside the cloud (`shifted_sum`). In more directions, for few members and for single targets in
+the tails they are exact (`direct_sum`), O(N) per target.
 
 A direction in which the members do not spread at all (a state known exactly, or a copy of another)
-is left out: all members and all targets lie in the same subspace, and the density is the one on it,
-n its dimension.
+is left out: all members and targets lie in the same subspace, and the density is the one on that
+subspace, with n its dimension.
 """
 
 import math
@@ -27,35 +27,34 @@ from pymc_statespace_filters.filters.kernel_density.direct_sum import (
     kernel_sum_workspace,
     log_kernel_sum,
 )
-from pymc_statespace_filters.filters.kernel_density.gridded_sum import lattice_workspace
+from pymc_statespace_filters.filters.kernel_density.gridded_sum import gridded_sum_workspace
 from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
 from pymc_statespace_filters.filters.kernel_density.shifted_sum import (
-    log_lattice_sums,
-    tilted_workspace,
+    log_gridded_sums,
+    shifted_sum_workspace,
 )
 
 _SQRT_HALF = math.sqrt(0.5)
-_KNOWN = 1e-13  # a spread below this share of the mean is rounding noise of a value known exactly
-_LINE_FROM, _PLANE_FROM = 64, 256  # members from which a lattice is at least twice as fast
+_KNOWN = 1e-13  # a smaller spread, relative to the mean, is rounding of a value known exactly
+_LINE_FROM, _PLANE_FROM = 64, 256  # members from which a grid is at least twice as fast
 
 
 @inline_always
-def _by_lattice(n_active, n_members):
-    least = _LINE_FROM if n_active == 1 else _PLANE_FROM
-    return 1 <= n_active <= 2 and n_members >= least
+def _uses_grid(n_active, n_members):
+    minimum = _LINE_FROM if n_active == 1 else _PLANE_FROM
+    return 1 <= n_active <= 2 and n_members >= minimum
 
 
 def density_method(n_active, n_members):
-    """How the densities of n_members particles that spread in n_active directions are summed."""
-    return "lattice" if _by_lattice.py_func(n_active, n_members) else "exact"
+    """Name of the summation for n_members particles that spread in n_active directions."""
+    return "lattice" if _uses_grid.py_func(n_active, n_members) else "exact"
 
 
 class Kernel(NamedTuple):
-    """Where the members of a density are and how far they spread: their mean and their bandwidth.
+    """Mean and bandwidth of the members of a density.
 
-    ``H`` (n_free, n_free) is the lower Cholesky factor of Eqs. 4.38 and 4.39, of the directions in
-    which they spread at all, which ``active`` tells. ``mean`` (n,) and ``cov`` (n, n) are those of
-    all states.
+    ``mean`` (n,) is that of all states; ``H`` (n_free, n_free) is the lower Cholesky factor of
+    Eqs. 4.38 and 4.39 of the free states. ``active`` marks the directions with any spread.
     """
 
     mean: np.ndarray
@@ -76,20 +75,21 @@ def kernel_workspace(n, n_free):
 def density_workspace(local, n):
     """Scratch of ``log_kernel_density`` for n directions.
 
-    The members and their weights, the targets and the logs of the sums at them, of all ranks.
+    The members and their weights, and the targets and the logs of their sums, of all ranks.
     """
     n_ranks, width = local.layout.n_ranks, BLOCK * local.sums.shape[1]
     sources = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
     targets = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
-    exact, lattice = kernel_sum_workspace(width), lattice_workspace(n_ranks, width)
-    return sources, targets, (exact, lattice, tilted_workspace(n_ranks, n, width))
+    exact, grid = kernel_sum_workspace(width), gridded_sum_workspace(n_ranks, width)
+    return sources, targets, (exact, grid, shifted_sum_workspace(n_ranks, n, width))
 
 
 @njit_contract
-def scott_bandwidth(n_effective, free, kernel):
-    """Fill H and its directions, of the free states (Eqs. 4.38 and 4.39), from mean and covariance.
+def scott_bandwidth(local, row, spread, n_effective, free, kernel):
+    """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39); the mean is given.
 
-    Returns False if the moments are not finite.
+    The covariance is the completed rows of ``sum_products`` of all states over ``spread``. Returns
+    False if the moments are not finite.
     """
     H, n_active = kernel.H, 0
     floor = np.empty(free.size)
@@ -110,10 +110,10 @@ def scott_bandwidth(n_effective, free, kernel):
 
 @njit_contract
 def _whiten(kernel, free, X, first, out):
-    """Leave H^-1 (X - mean) / sqrt(2) of the active directions in rows of ``out``, from 1 on.
+    """Write H^-1 (X - mean) / sqrt(2) of the active directions to rows of ``out``, from 1 on.
 
-    X becomes the columns from ``first`` on. Returns how many rows. Why the mean: far from zero
-    x / h would be rounded to more than the distances between particles bear.
+    X fills the columns from ``first`` on. Returns the number of rows. The mean is subtracted
+    because far from zero the rounding of x / h would swamp the distances between particles.
     """
     x_mean, H, active = kernel.mean, kernel.H, kernel.active
     n_rows, last = 0, first + X.shape[1]
@@ -137,7 +137,7 @@ def _whiten(kernel, free, X, first, out):
 
 @inline_always
 def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
-    """Logs of the sums at a rank's own targets, which begin at the column ``first``."""
+    """Logs of the exact sums at a rank's own targets, which begin at column ``first``."""
     complete_points(layout, sources, n_dims)
     y, v = sources.rows[1:], targets.rows[1:]
     _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
@@ -149,19 +149,19 @@ def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
 def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 
-    All are a rank's own; the density is that of the particles of all ranks. Members of zero weight
-    are left out, and may be NaN. A target that is not finite gets -inf.
+    w, X and V are a rank's own; the density is that of the particles of all ranks. Members of zero
+    weight are ignored and may be NaN. A target that is not finite gets -inf.
     """
     sources, targets, sums = work
     first, last = local.first, local.first + local.size
-    own_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
+    local_w, logs = sources.rows[0, first:last], targets.rows[0, first:last]
     for i in range(w.size):
-        own_w[i] = w[i]
+        local_w[i] = w[i]
     n_dims = _whiten(kernel, free, X, first, sources.rows)
     _whiten(kernel, free, V, first, targets.rows)
     if not (
-        _by_lattice(n_dims, local.n_members)
-        and log_lattice_sums(local.layout, sources, targets, n_dims, sums)
+        _uses_grid(n_dims, local.n_members)
+        and log_gridded_sums(local.layout, sources, targets, n_dims, sums)
     ):
         _sum_exactly(local.layout, sources, targets, n_dims, first, logs, sums[0])
     log_kernel = 0.0

@@ -1,8 +1,8 @@
-"""Sum of weighted Gaussian kernels at one target, exact, in logs, O(N).
+"""Exact sum of weighted Gaussian kernels at one target, in logarithms, O(N).
 
-Two passes over the members, in blocks of 64: their exponents and the largest of these, then the sum
-of exponentials relative to it. So a target many bandwidths away from every member still has its
-finite logarithm.
+Two passes over the members, in blocks of 64: the exponents and their maximum, then the sum of
+exponentials relative to the maximum. The logarithm is finite for a target many bandwidths away from
+every member.
 """
 
 import math
@@ -42,7 +42,7 @@ def compact(w, sources, n_dims, work):
 
 @inline_always
 def _exponents(sources, log_w, n_dims, first, targets, target, e):
-    """e_l = log w_l - |y_l - v|^2 / 2, coordinates over sqrt(2), for a block of members."""
+    """e_l = log w_l - |y_l - v|^2 for a block of members, coordinates scaled by 1 / sqrt(2)."""
     for i in range(BLOCK):
         e[i] = log_w[first + i]
     for a in range(n_dims):

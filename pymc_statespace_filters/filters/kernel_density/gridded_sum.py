@@ -1,23 +1,24 @@
-"""Sums of weighted Gaussian kernels at many targets, O(N), by way of a lattice of points.
+"""Sums of weighted Gaussian kernels at many targets through a uniform grid, O(N).
 
-With s the variance of a bell (`_windows.VARIANCE`) and D the lattice spacing, in units of the
-kernel's standard deviation, and g and h running over the lattice, in one direction
+With s the variance of the spreading Gaussian (`simd_windows.VARIANCE`) and D the grid spacing, in
+units of the kernel's standard deviation, and g and h running over the grid, in one direction
 
     exp(-(v - y)^2 / 2) ~ c sum_g sum_h exp(-(v - g)^2 / 2s) exp(-(g - h)^2 / 2(1 - 2s))
                             exp(-(h - y)^2 / 2s),    c = D^2 / (2 pi s sqrt(1 - 2s)).
 
-So each member y adds its bell to the lattice, the lattice is blurred, and each target v sums the
-lattice under its own bell. In two directions all three are products.
+So each member y adds its Gaussian to the grid, the grid is blurred (convolved with the middle
+factor), and each target v sums the grid times its own Gaussian. In two directions all three factors
+are products over the directions.
 
-Seen as a function of g and h, the summand is the left side times a Gaussian density, in which g and
-h have variance s (1 - s). By Poisson's formula the relative error of the sums is therefore
+As a function of g and h, the summand is the left side times a Gaussian density in which g and h
+have variance s (1 - s). By Poisson's formula the relative error of the sums is therefore
 4 exp(-2 pi^2 s (1 - s) / D^2) = 5e-10 for every single pair of member and target, however far
-apart, and twice that in two directions: all terms are positive, nothing cancels. What is beyond the
-windows and the blur is below 2e-15 of the total weight, so 2e-9 of a sum at the `FLOOR`. Smaller
-sums, in the far tails, are the caller's.
+apart, and twice that in two directions: all terms are positive, nothing cancels. The truncation of
+windows and blur is below 2e-15 of the total weight, so 2e-9 of a sum at the `FLOOR`. Smaller sums,
+in the far tails, are left to the caller.
 
-A large ensemble adds its members to a few lattices, each its own stretch of them, and these are
-added up in their order: however many ranks share that work, the sums are the same.
+The members of a large ensemble are divided among several grids, which are then added in a fixed
+order: the sums have the same bits on any number of ranks.
 """
 
 import math
@@ -52,36 +53,33 @@ from pymc_statespace_filters.filters.kernel_density.simd_windows import (
 FLOOR = 1e-6
 """Sums below this share of the total weight are left to the caller."""
 
-_NEGLIGIBLE = 1e-25  # smaller weights add nothing to sums above the floor, but denormal numbers
-_FAR = 8.6  # nor do members that are farther than this from all targets: exp(-FAR^2 / 2) < 1e-16
-_BLUR = 16  # lattice points on either side; an even number
-_ONE_LATTICE = 8192  # members; more of them are divided among several
-_MOST_LATTICES = 8
-_POINTS_A_MEMBER = (
-    4  # of all lattices: to clear them and add them up is then a fiftieth of the work
-)
+_NEGLIGIBLE = 1e-25  # smaller weights do not change sums above the floor, and make subnormals
+_FAR = 8.6  # neither do members farther than this from all targets: exp(-FAR^2 / 2) < 1e-16
+_BLUR = 16  # grid points on either side; an even number
+_MEMBERS_PER_GRID = 8192  # larger ensembles are divided among several grids
+_MOST_GRIDS = 8
+_POINTS_PER_MEMBER = 4  # in all grids: clearing and adding them is then a fiftieth of the work
 _BLUR_VARIANCE = 1.0 - 2.0 * VARIANCE
 _blur_lanes = taps_sum(
     (SPACING**2 / (2.0 * math.pi * VARIANCE * math.sqrt(_BLUR_VARIANCE)))
     * np.exp(-((SPACING * np.arange(_BLUR + 1)) ** 2) / (2.0 * _BLUR_VARIANCE))
 )
-_POINTS_PER_UNIT = math.sqrt(2.0) / SPACING  # coordinates come divided by the root of 2
+_POINTS_PER_UNIT = math.sqrt(2.0) / SPACING  # coordinates are scaled by 1 / sqrt(2)
 _WITHIN = _FAR * math.sqrt(0.5)
 
 
 @njit_contract
-def lattice_workspace(n_ranks, width):
-    """Scratch of ``lattice_sums`` for a padded number of members.
+def gridded_sum_workspace(n_ranks, width):
+    """Scratch of ``gridded_sums`` for a padded number of members.
 
-    The windows of members or targets (the first cell, the lead and the ratio of a bell), lanes of a
-    minimum and a maximum, the ranges that each rank has found, where the lattice begins and how far
-    it goes, and two arrays for lattices, with room for several times the points that an ensemble of
-    two states covers.
+    The windows of members or targets (first cell, lead and ratio, see `simd_windows`), lanes for a
+    minimum and a maximum, the ranges found by each rank, first coordinate and extent of the grid,
+    and two arrays for grids, several times as large as an ensemble of two states needs.
     """
-    bells = np.empty((2, width)), np.empty((2, width)), np.empty((2, width))
+    windows = np.empty((2, width)), np.empty((2, width)), np.empty((2, width))
     lanes, ranges = (np.empty(BLOCK), np.empty(BLOCK)), np.empty((8, n_ranks))
     room = 32768 + 8 * width
-    return bells, lanes, ranges, (np.empty(2), np.empty(2)), (np.empty((1, room)), np.empty(room))
+    return windows, lanes, ranges, (np.empty(2), np.empty(2)), (np.empty((1, room)), np.empty(room))
 
 
 @njit_contract
@@ -105,9 +103,9 @@ def _range(y, w, least, lanes):
 
 @inline_always
 def _find_ranges(layout, sources, targets, n_dims, lanes, ranges):
-    """Lowest and highest of members and of targets in each direction, as each rank finds them.
+    """Ranges of members and of targets in each direction, of each rank.
 
-    The sums of the targets are zeros.
+    The sums at the targets must be zero: they serve as the weights of the targets.
     """
     y_first, y_last = local_range(layout, sources.size, MEMBERS)
     v_first, v_last = local_range(layout, targets.size, MEMBERS)
@@ -122,10 +120,10 @@ def _find_ranges(layout, sources, targets, n_dims, lanes, ranges):
 
 @inline_always
 def _extent(ranges):
-    """Where the lattice must be: its first coordinate, and a number of points.
+    """The first coordinate of the grid and its number of points.
 
-    Members farther than ``_WITHIN`` from all targets stay outside, and targets so far from all
-    members; there are no points if that leaves nothing.
+    Members farther than ``_WITHIN`` from all targets are left out, as are targets that far from all
+    members; the number of points is 0 if none remain.
     """
     y_low, y_high, v_low, v_high = ranges[0, 0], ranges[1, 0], ranges[2, 0], ranges[3, 0]
     for rank in range(1, ranges.shape[1]):
@@ -141,7 +139,7 @@ def _extent(ranges):
 
 @njit_contract
 def _place(y, first, n_points, cell, lead, ratio):
-    """The windows at coordinates: first cell, lead and ratio. Outside the lead is zero."""
+    """The windows at these coordinates: first cell, lead (zero outside the grid) and ratio."""
     last = n_points - POINTS
     for i in range(y.size):
         x = (y[i] - first) * _POINTS_PER_UNIT
@@ -163,111 +161,109 @@ def _weigh(w, lead):
 
 
 @inline_always
-def _add_members(bells, n, n_dims, stride, lattice):
-    cell, lead, ratio = bells
+def _add_members(windows, n, n_dims, stride, grid):
+    cell, lead, ratio = windows
     for i in range(n):
         if lead[0, i] > 0.0:
             at = _BLUR + np.int64(cell[0, i])
             if n_dims == 1:
-                add_to_line(lattice, at, stride, lead[0, i], ratio[0, i], 1.0, 0.0)
+                add_to_line(grid, at, stride, lead[0, i], ratio[0, i], 1.0, 0.0)
             else:
                 at += stride * np.int64(cell[1, i])
-                add_to_plane(lattice, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
+                add_to_plane(grid, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
 
 
 @inline_always
-def _choose_lattices(n_members, n_points):
-    """How many lattices share the members: a power of two, as numbers of ranks often are."""
-    n_lattices = 1
-    if n_members > _ONE_LATTICE:
-        most = min(float(_MOST_LATTICES), _POINTS_A_MEMBER * n_members / n_points)
-        while 2 * n_lattices <= most:
-            n_lattices *= 2
-    return n_lattices
+def _number_of_grids(n_members, n_points):
+    """Number of grids that the members are divided among: a power of two, as ranks often are."""
+    n_grids = 1
+    if n_members > _MEMBERS_PER_GRID:
+        most = min(float(_MOST_GRIDS), _POINTS_PER_MEMBER * n_members / n_points)
+        while 2 * n_grids <= most:
+            n_grids *= 2
+    return n_grids
 
 
 @inline_always
-def _add_stretch(sources, i, j, n_dims, place, bells, lattice):
-    """Make a lattice of the members from i on to before j."""
-    (first, extent), (cell, lead, ratio) = place, bells
-    for point in range(lattice.size):
-        lattice[point] = 0.0
+def _add_stretch(sources, i, j, n_dims, box, windows, grid):
+    """Clear a grid and add the members i to j - 1 to it."""
+    (first, extent), (cell, lead, ratio) = box, windows
+    for point in range(grid.size):
+        grid[point] = 0.0
     for a in range(n_dims):
         _place(sources.rows[1 + a, i:j], first[a], extent[a], cell[a], lead[a], ratio[a])
     _weigh(sources.rows[0, i:j], lead[0])
-    _add_members(bells, j - i, n_dims, np.int64(extent[0]) + 2 * _BLUR, lattice)
+    _add_members(windows, j - i, n_dims, np.int64(extent[0]) + 2 * _BLUR, grid)
 
 
 @inline_always
-def _add_all(layout, sources, n_dims, n_points, place, bells, lattices):
-    """The sum of the lattices of all members, of n_points each.
+def _add_all(layout, sources, n_dims, n_points, box, windows, grids):
+    """The sum of the grids of all members, of n_points each.
 
-    The members of a lattice are those that a rank would have if there were as many ranks: where
-    each rank has as many lattices, their members are its own.
+    Members are divided among grids as they are among ranks. If every rank has the same number of
+    grids, their members are its own, and none need be exchanged.
     """
-    n_lattices = _choose_lattices(sources.size, n_points)
-    if not sources.known and n_lattices % layout.n_ranks != 0:
+    n_grids = _number_of_grids(sources.size, n_points)
+    if not sources.known and n_grids % layout.n_ranks != 0:
         complete_points(layout, sources, n_dims)
     begin, end = np.int64(0), np.int64(1)
-    if n_lattices > 1:
-        begin, end = local_range(layout, n_lattices, BLOCKS)
+    if n_grids > 1:
+        begin, end = local_range(layout, n_grids, BLOCKS)
     for m in range(begin, end):
-        i, j = local_range(RankLayout(m, n_lattices, 0), sources.size, MEMBERS)
-        lattice = lattices[0, m * n_points : (m + 1) * n_points]
-        _add_stretch(sources, i, j, n_dims, place, bells, lattice)
-    if n_lattices > 1:
-        allgather(layout, lattices[:, : n_lattices * n_points], n_points)
-    total = lattices[0]
-    for m in range(1, n_lattices):
-        lattice = lattices[0, m * n_points : (m + 1) * n_points]
+        i, j = local_range(RankLayout(m, n_grids, 0), sources.size, MEMBERS)
+        grid = grids[0, m * n_points : (m + 1) * n_points]
+        _add_stretch(sources, i, j, n_dims, box, windows, grid)
+    if n_grids > 1:
+        allgather(layout, grids[:, : n_grids * n_points], n_points)
+    total = grids[0]
+    for m in range(1, n_grids):
+        grid = grids[0, m * n_points : (m + 1) * n_points]
         for point in range(n_points):
-            total[point] += lattice[point]
+            total[point] += grid[point]
     return total
 
 
 @inline_always
-def _sum_targets(bells, n_dims, start, stride, lattice, out):
-    cell, lead, ratio = bells
+def _sum_targets(windows, n_dims, start, stride, grid, out):
+    cell, lead, ratio = windows
     for i in range(out.size):
         at = start + np.int64(cell[0, i])
         if n_dims == 1:
-            out[i] = sum_line(lattice, at, stride, lead[0, i], ratio[0, i], 1.0, 0.0)
+            out[i] = sum_line(grid, at, stride, lead[0, i], ratio[0, i], 1.0, 0.0)
         else:
             at += stride * np.int64(cell[1, i])
-            out[i] = sum_plane(
-                lattice, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i]
-            )
+            out[i] = sum_plane(grid, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
 
 
 @inline_always
-def _blur(n_dims, columns, rows, lattice, other):
-    """Blur ``lattice``, which has room for the taps beside its rows.
+def _blur(n_dims, columns, rows, grid, other):
+    """Blur ``grid``, whose rows have a margin of `_BLUR` points on either side.
 
-    Return the array of the result, and where in it the result begins.
+    Return the array that holds the result and the index of its first point.
     """
     wide, below = columns + 2 * _BLUR, (n_dims - 1) * _BLUR * columns
     for row in range(rows):
         for j in range(0, columns, LANES):
-            _blur_lanes(lattice, row * wide + _BLUR + j, 1, other, below + row * columns + j)
+            _blur_lanes(grid, row * wide + _BLUR + j, 1, other, below + row * columns + j)
     if n_dims == 1:
         return other, below
     for i in range(below):
         other[i] = 0.0
         other[below + rows * columns + i] = 0.0
     for i in range(0, rows * columns, LANES):
-        _blur_lanes(other, below + i, columns, lattice, i)
-    return lattice, 0
+        _blur_lanes(other, below + i, columns, grid, i)
+    return grid, 0
 
 
 @njit_contract
-def lattice_sums(layout, sources, targets, n_dims, work):
+def gridded_sums(layout, sources, targets, n_dims, work):
     """sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
 
-    Zero where it is not known. What a rank needs to know of others' members it learns here. Returns
-    False if the lattice would be too large.
+    Zero at targets outside the grid. Members of other ranks are exchanged as needed. Returns False
+    if the grid would be too large.
     """
-    bells, lanes, ranges, (first, extent), (lattices, other) = work
-    cell, lead, ratio = bells
+    windows, lanes, ranges, (first, extent), (grids, other) = work
+    cell, lead, ratio = windows
     begin, end = local_range(layout, targets.size, MEMBERS)
     sums = targets.rows[0, begin:end]
     for i in range(sums.size):
@@ -282,11 +278,11 @@ def lattice_sums(layout, sources, targets, n_dims, work):
     if n_points > min(other.size, 0.25 * sources.size * targets.size):
         return False
     columns, rows = np.int64(extent[0]), np.int64(extent[1])
-    n_added, place = rows * (columns + 2 * _BLUR), (first, extent)
-    lattice = _add_all(layout, sources, n_dims, n_added, place, bells, lattices)
-    blurred, start = _blur(n_dims, columns, rows, lattice, other)
+    n_added, box = rows * (columns + 2 * _BLUR), (first, extent)
+    grid = _add_all(layout, sources, n_dims, n_added, box, windows, grids)
+    blurred, start = _blur(n_dims, columns, rows, grid, other)
     for a in range(n_dims):
         v = targets.rows[1 + a, begin:end]
         _place(v, first[a], extent[a], cell[a], lead[a], ratio[a])
-    _sum_targets(bells, n_dims, start, columns, blurred, sums)
+    _sum_targets(windows, n_dims, start, columns, blurred, sums)
     return True

@@ -1,4 +1,8 @@
-"""Weights of proposed particles by kernel densities (thesis, Eqs. 4.36-4.39)."""
+"""Importance weights of an ensemble Kalman proposal, by kernel densities (thesis, Eqs. 4.36-4.39).
+
+The forecast particles, moved by the Kalman update, are a sample of the proposal. The density of the
+forecast (the prior) and that of the proposal are estimated from the particles themselves.
+"""
 
 import math
 from typing import NamedTuple
@@ -30,7 +34,7 @@ class Forecast(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Moments of the forecast, and what the densities of Eq. 4.36 need."""
+    """Moments of the forecast, and scratch of the densities of Eq. 4.36."""
 
     moments: Moments
     w_equal: np.ndarray
@@ -40,7 +44,7 @@ class Scratch(NamedTuple):
 
 
 @inline_always
-def proposal_workspace(system, local):
+def importance_workspace(system, local):
     """Scratch of one update."""
     N, density = local.size, density_workspace(local, system.free.size)
     moments = moments_workspace(system.n, system.p)
@@ -48,11 +52,11 @@ def proposal_workspace(system, local):
 
 
 @inline_always
-def weigh_proposal(system, k, t, d, members, forecast, local, scratch, keeps_previous):
-    """Leave the unnormalised weights of X in log_w and p(d | x^a) in log_p.
+def reweight(system, k, t, d, members, forecast, local, scratch, keeps_previous):
+    """Write the unnormalised log-weights of X to log_w and log p(d | x^a) to log_p.
 
-    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. False, with log_w as it was, if
-    the proposed particles and the forecast do not spread in the same directions.
+    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. Returns False, with log_w
+    unchanged, if proposal and forecast do not spread in the same directions.
     """
     X, w, log_w, log_p = members.X, members.w, members.log_w, members.log_p
     free, n, n_alive, w_equal = system.free, system.n, forecast.n_alive, scratch.w_equal
@@ -65,8 +69,8 @@ def weigh_proposal(system, k, t, d, members, forecast, local, scratch, keeps_pre
     log_kernel_density(local, w, members.X_f, X, free, kernel_f, density, log_prior)
     log_kernel_density(local, w_equal, X, X, free, kernel_a, density, log_proposal)
     for i in range(w.size):
-        log_factor = log_w[i] if keeps_previous else -math.log(n_alive)
-        log_weight = log_factor + log_p[i] + (log_prior[i] - log_proposal[i])
+        previous = log_w[i] if keeps_previous else -math.log(n_alive)
+        log_weight = previous + log_p[i] + (log_prior[i] - log_proposal[i])
         log_w[i] = log_weight if members.alive[i] else -np.inf
     return True
 

@@ -1,4 +1,4 @@
-"""Members and targets of a kernel density, of which each rank has a part."""
+"""Members and targets of a kernel density, divided among ranks."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,9 @@ from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgathe
 class Points(NamedTuple):
     """Members and their weights, or targets and the sums at them.
 
-    The first ``size`` columns of ``rows`` (1 + n, width): first a row of the numbers, then rows of
-    coordinates. Ranks have their `part` of the columns; ``known`` says whether all is known.
+    In the first ``size`` columns of ``rows`` (1 + n, width) the first row holds the weights or
+    sums, the others the coordinates. A rank fills its own columns; ``known`` tells whether this
+    rank holds all columns from the start.
     """
 
     rows: np.ndarray
@@ -22,5 +23,5 @@ class Points(NamedTuple):
 
 @inline_always
 def complete_points(layout, points, n_dims):
-    """Let all ranks know numbers and coordinates of all points."""
+    """Complete the weights or sums and the coordinates on every rank."""
     allgather(layout, points.rows[: 1 + n_dims], MEMBERS)

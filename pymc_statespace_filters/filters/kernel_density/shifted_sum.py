@@ -1,13 +1,15 @@
-"""Lattice sums where the targets are: over the cloud of members, or far outside, O(N).
+"""Gridded kernel sums at targets in the cloud of members and far outside it, O(N).
 
 For any shift t of the targets
 
     w_l exp(-|y_l - v|^2) = [w_l exp(2 t.y_l)] exp(-|y_l - (v - t)|^2) exp(t.(t - 2 v)),
 
-so sums at far targets are sums at near ones, with other weights. The shift moves the mean of the
-targets onto the mean of the members that matter there, each in proportion to its term of the sum.
-First all targets are tried as they are, then, if many are left, these are shifted. What is still
-left is summed exactly, by all ranks together: the tails may be those of one rank's members alone.
+so a sum at a far target is a sum at a near one with other weights (an exponential tilt). The shift
+moves the mean of the targets onto the mean of the members weighted by their terms of the sum.
+
+All targets are tried without a shift first; if many are below the floor, these are shifted; the
+rest is summed exactly. The ranks divide the last two steps evenly, since all targets in the tails
+may belong to one rank.
 """
 
 import math
@@ -23,18 +25,19 @@ from pymc_statespace_filters.filters.ensemble.partition import (
     local_range,
 )
 from pymc_statespace_filters.filters.kernel_density.direct_sum import compact, log_kernel_sum
-from pymc_statespace_filters.filters.kernel_density.gridded_sum import FLOOR, lattice_sums
+from pymc_statespace_filters.filters.kernel_density.gridded_sum import FLOOR, gridded_sums
 from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
 
 _LOG_FLOOR = math.log(FLOOR)
-_FEW = 64  # exact sums that cost less than another lattice; both grow with the number of members
+_FEW = 64  # so many exact sums cost less than another grid; both costs are O(N)
 
 
 @njit_contract
-def tilted_workspace(n_ranks, n, width):
-    """Scratch of ``log_lattice_sums``.
+def shifted_sum_workspace(n_ranks, n, width):
+    """Scratch of ``log_gridded_sums``.
 
-    Missed targets and their number on each rank; these targets shifted, and the shift; exact sums.
+    Indices of the targets below the floor and their number on each rank; these targets shifted, and
+    the shift; exact sums.
     """
     missed, counts = np.empty(width, np.int64), np.empty((1, n_ranks))
     return missed, counts, np.empty((1 + n, width)), np.empty(n), np.empty((1, width))
@@ -42,9 +45,9 @@ def tilted_workspace(n_ranks, n, width):
 
 @inline_always
 def _take_logs(layout, targets):
-    """Replace a rank's own sums by their logs; return how many are below the floor."""
-    begin, end = local_range(layout, targets.size, MEMBERS)
-    sums, n_missed = targets.rows[0, begin:end], 0
+    """Replace a rank's own sums by their logarithms; return how many are below the floor."""
+    start, end = local_range(layout, targets.size, MEMBERS)
+    sums, n_missed = targets.rows[0, start:end], 0
     for i in range(sums.size):
         sums[i] = log(sums[i])
         n_missed += not sums[i] > _LOG_FLOOR
@@ -63,7 +66,7 @@ def _total(layout, counts, count):
 
 @njit_contract
 def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, shift):
-    """The shift for the targets ``missed``; False if none of them is finite."""
+    """Find the shift for the targets ``missed``; False if none of them is finite."""
     n_sources, n_blocks = members
     for a in range(n_dims):
         total, count = 0.0, 0
@@ -85,8 +88,8 @@ def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, 
 
 
 @inline_always
-def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
-    """Leave w_l exp(2 t.y_l), normalised, in ``weights``; return the log of their sum."""
+def _shift_weights(sources, n_dims, n_sources, log_w, shift, weights):
+    """Write w_l exp(2 t.y_l), normalised, to ``weights``; return the log of their sum."""
     largest = -np.inf
     for i in range(n_sources):
         weights[i] = log_w[i]
@@ -104,17 +107,17 @@ def _tilt(sources, n_dims, n_sources, log_w, shift, weights):
 
 @inline_always
 def _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works):
-    """Sums at shifted targets; returns how many targets are still missed."""
-    sum_work, lattice_work, (missed, _, shifted, shift, _) = works
+    """Sums at shifted targets; return how many targets are still below the floor."""
+    sum_work, grid_work, (missed, _, shifted, shift, _) = works
     y, v, some = sources.rows[1:], targets.rows[1:], missed[:n_missed]
     if not _choose_shift(y, n_dims, members, v, some, sum_work, shifted[1:], shift):
         return n_missed
-    log_total = _tilt(y, n_dims, members[0], sum_work[0], shift, sources.rows[0])
+    log_total = _shift_weights(y, n_dims, members[0], sum_work[0], shift, sources.rows[0])
     for a in range(n_dims):
         for k in range(n_missed):
             shifted[1 + a, k] = v[a, some[k]] - shift[a]
-    tilted, at = Points(sources.rows, members[0], True), Points(shifted, n_missed, True)
-    if not lattice_sums(layout, tilted, at, n_dims, lattice_work):
+    shifted_sources, at = Points(sources.rows, members[0], True), Points(shifted, n_missed, True)
+    if not gridded_sums(layout, shifted_sources, at, n_dims, grid_work):
         return n_missed
     _take_logs(layout, at)
     allgather(layout, shifted[:1, :n_missed], MEMBERS)
@@ -133,7 +136,7 @@ def _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works):
 
 @inline_always
 def _sum_tails(layout, sources, targets, n_dims, works):
-    """Sums at the targets that a lattice over the cloud has missed; all ranks know all of them."""
+    """Sums at the targets below the floor; afterwards every rank holds all sums."""
     sum_work, _, (missed, _, _, _, exact) = works
     complete_points(layout, sources, n_dims)
     complete_points(layout, targets, n_dims)
@@ -148,8 +151,8 @@ def _sum_tails(layout, sources, targets, n_dims, works):
         n_missed = _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works)
     if n_missed == 0:
         return
-    begin, end = local_range(layout, n_missed, BLOCKS)
-    for k in range(begin, end):
+    start, end = local_range(layout, n_missed, BLOCKS)
+    for k in range(start, end):
         exact[0, k] = log_kernel_sum(y, n_dims, members[1], v, missed[k], sum_work)
     allgather(layout, exact[:, :n_missed], BLOCKS)
     for k in range(n_missed):
@@ -157,14 +160,14 @@ def _sum_tails(layout, sources, targets, n_dims, works):
 
 
 @inline_always
-def log_lattice_sums(layout, sources, targets, n_dims, works):
+def log_gridded_sums(layout, sources, targets, n_dims, works):
     """log sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
 
-    ``sources`` and ``targets`` are `Points`; the sums go to the latter. Returns False if the
-    lattice would be too large.
+    ``sources`` and ``targets`` are `Points`; the logs are written to the targets. Returns False if
+    the grid would be too large.
     """
-    _, lattice_work, (_, counts, _, _, _) = works
-    if not lattice_sums(layout, sources, targets, n_dims, lattice_work):
+    _, grid_work, (_, counts, _, _, _) = works
+    if not gridded_sums(layout, sources, targets, n_dims, grid_work):
         return False
     if _total(layout, counts, _take_logs(layout, targets)) > 0:
         _sum_tails(layout, sources, targets, n_dims, works)

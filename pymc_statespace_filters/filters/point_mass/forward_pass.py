@@ -1,7 +1,7 @@
-"""One pass of the point-mass filter over a record, and what an evaluation begins again with.
+"""One pass of the point-mass filter over a record, and the grid settings of the next attempt.
 
-A pass hands its grids to ``keep(tape, k, grid, seen)``: the grid of every step, and at an
-observation the grid once more, with what was seen there.
+A pass hands its grids to ``keep(tape, k, grid, updated)``: the predicted grid of every step, and at
+an observation the updated grid too.
 """
 
 import math
@@ -14,39 +14,35 @@ from pymc_statespace_filters.filters.point_mass.recursion import (
     REFINEMENT,
     TOO_COARSE,
     TOO_SHORT,
-    begin,
-    forecast,
+    empty_table,
     initial_moments,
-    no_table,
-    see,
+    initialise,
+    predict,
+    update,
 )
 from pymc_statespace_filters.filters.system_table import step_moments
 
 _LENGTHENING = 1.6
-_SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0  # deviations: densities down to 2e-16, to 1e-265
-_PER_STEP = 1e-5  # of the tolerance, what one step's error is planned for
+# In standard deviations: densities down to 2e-16, and down to 1e-265.
+_SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0
+_PER_STEP = 1e-5  # planned error of one step, as a share of the tolerance
 
 
 @inline_always
-def keep_nothing(tape, k, grid, seen):
-    """What a likelihood does with the grids."""
-
-
-@inline_always
-def first_lattice(system, steps, t0, tolerance):
-    """Spacing and reach of the first attempt."""
-    spacing = np.inf
-    if steps.size:
-        spacing = _first_spacing(system, t0, steps[-1], tolerance)
-    return spacing, _SHORTEST_REACH
+def discard(tape, k, grid, updated):
+    """Keep no grid: a likelihood needs none."""
 
 
 @njit_internal
-def _first_spacing(system, t0, n_steps, tolerance):
-    """The spacing that the first step asks for around the start; see `_lattice.aliasing`."""
+def first_grid(system, steps, t0, tolerance):
+    """(spacing, reach) of the first attempt: the spacing that the first step requires.
+
+    The step is taken from the initial mean and one standard deviation to either side, see
+    `grid.aliasing`.
+    """
     spacing = np.inf
-    if n_steps == 0:
-        return spacing
+    if steps.size == 0 or steps[-1] == 0:
+        return spacing, _SHORTEST_REACH
     mean, sd = initial_moments(system)
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
@@ -57,12 +53,13 @@ def _first_spacing(system, t0, n_steps, tolerance):
         width = math.sqrt(M[1, i] / (1.0 + slope * slope))
         if width > 0.0:
             spacing = min(spacing, width)
-    return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
+    spacing = spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
+    return spacing, _SHORTEST_REACH
 
 
 @inline_always
-def next_lattice(code, spacing, reach):
-    """After an attempt: (whether to begin again, spacing, reach)."""
+def next_grid(code, spacing, reach):
+    """After an attempt that ended with this code: (whether to repeat it, spacing, reach)."""
     if code == TOO_COARSE:
         return True, spacing * REFINEMENT, reach
     if code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
@@ -72,17 +69,17 @@ def next_lattice(code, spacing, reach):
 
 @inline_always
 def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep, tape):
-    """One pass over the record: its terms, and (NONE, J) or (why it stopped, where)."""
+    """Write the terms of one pass; return (NONE, J), or (reason, observation) of a stop."""
     k = np.int64(0)
-    code, grid, source = begin(system, spacing, reach)
+    code, grid, source = initialise(system, spacing, reach)
     if code == NONE:
         keep(tape, k, grid, False)
-    table = no_table()
+    table = empty_table()
     error, n_grids = 0.0, 1
     for j in range(steps.size):
         while k < steps[j] and code == NONE:
             t = t0 + k * system.dt
-            code, grid, source, table, lost = forecast(system, k, t, spacing, reach, grid, table)
+            code, grid, source, table, lost = predict(system, k, t, spacing, reach, grid, table)
             error += lost
             n_grids += 1
             if code == NONE and error > tolerance:
@@ -96,7 +93,7 @@ def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep,
             terms[j] = 0.0
             continue
         t = t0 + k * system.dt
-        code, grid, terms[j] = see(
+        code, grid, terms[j] = update(
             system, k, t, observed[j], reach, grid, source, n_grids, error, tolerance
         )
         if code != NONE:

@@ -1,9 +1,8 @@
-"""Densities of one variable on a uniform lattice, moved by Gaussian steps.
+"""Densities of one variable on a uniform grid, propagated by Gaussian transitions.
 
-Point ``i`` of a lattice is ``(low + i) * spacing``; what is kept there are masses: density times
-spacing. All integrals are trapezoidal sums. For smooth integrands that vanish at both ends their
-error falls faster than any power of the spacing: it is what the integrand's spectrum holds beyond
-2 pi / spacing.
+Point ``i`` of a grid is ``(low + i) * spacing`` and carries a mass: density times spacing. All
+integrals are trapezoidal sums. For smooth integrands that vanish at both ends their error falls
+faster than any power of the spacing: it is the integrand's spectrum beyond 2 pi / spacing.
 """
 
 import math
@@ -14,18 +13,18 @@ from pymc_statespace_filters.compiler.native.jit import inline_always, njit_inte
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 
 MAX_POINTS = 8192
-"""A lattice of more points is a failure; named in `_failures`."""
+"""A grid of more points is a failure, see `filters.outcomes`."""
 
-_MAX_PAIRS = 2**20  # of a source and a point that it reaches: 8 MB of kernel
+_MAX_PAIRS = 2**20  # of a source and a target point: a kernel of 8 MB
 
 _ONE_OVER_ROOT_TWO_PI = 1.0 / math.sqrt(2.0 * math.pi)
 _LARGEST_INDEX = 2.0**50
-_BLOCK = 8  # the points that a source reaches are a multiple of this: no remainder in vector loops
+_BLOCK = 8  # the targets of a source are a multiple of this, so that vector loops have no remainder
 
 
 @inline_always
-def lattice(low, n, spacing):
-    """The points, as the members of an ensemble: (1, n)."""
+def grid_points(low, n, spacing):
+    """Coordinates of the points in the layout of an ensemble, (1, n)."""
     X = np.empty((1, n))
     for i in range(n):
         X[0, i] = (low + i) * spacing
@@ -33,11 +32,11 @@ def lattice(low, n, spacing):
 
 
 @njit_internal
-def reached(mean, sd, mass, spacing, reach):
-    """The lattice of all points within ``reach`` deviations of some mean: (low, number).
+def extent_of(mean, sd, mass, spacing, reach):
+    """The grid of all points within ``reach`` standard deviations of some mean: (low, number).
 
-    Sources without mass, or that are not finite, do not count. The number is 0 if none is left, and
-    more than `MAX_POINTS` stands for any such number.
+    Sources without mass and sources that are not finite are ignored. The number is 0 if no source
+    remains; any number above `MAX_POINTS` is reported as `MAX_POINTS` + 1.
     """
     lowest, highest, width = np.inf, -np.inf, 0.0
     for i in range(mass.size):
@@ -57,7 +56,7 @@ def reached(mean, sd, mass, spacing, reach):
 
 @inline_always
 def _add_gaussian(first, spacing, mean, sd, mass, out):
-    """Add what N(mean, sd^2) of this mass puts on the points of ``out``, from ``first`` on."""
+    """Add the masses of mass * N(mean, sd^2) to ``out``, whose first point is number ``first``."""
     scale = spacing / sd
     height = mass * scale * _ONE_OVER_ROOT_TWO_PI
     start = (first * spacing - mean) / sd
@@ -68,17 +67,17 @@ def _add_gaussian(first, spacing, mean, sd, mass, out):
 
 @njit_internal
 def _target(mean, sd, spacing, reach):
-    """Numbers of the first point, and of the one after the last, that a source reaches."""
+    """The range [first, last) of points within ``reach`` standard deviations of a source."""
     if not (np.isfinite(mean) and np.isfinite(sd)):
-        return 0.0, 0.0  # what has gone to infinity has no mass
+        return 0.0, 0.0  # a diverged source has no targets
     first = math.ceil((mean - reach * sd) / spacing)
     blocks = math.ceil((mean + reach * sd - first * spacing) / (_BLOCK * spacing))
     return first, first + _BLOCK * max(blocks, 1.0)
 
 
 @njit_internal
-def spread(low, n, spacing, mean, sd, mass, reach):
-    """Masses on a lattice of the mixture sum_i mass_i N(mean_i, sd_i^2), cut at ``reach``."""
+def scatter(low, n, spacing, mean, sd, mass, reach):
+    """Masses on a grid of the mixture sum_i mass_i N(mean_i, sd_i^2), truncated at ``reach``."""
     out = np.zeros(n)
     for i in range(mass.size):
         first, last = _target(mean[i], sd[i], spacing, reach)
@@ -90,8 +89,8 @@ def spread(low, n, spacing, mean, sd, mass, reach):
 
 
 @inline_always
-def kernel(spacing, mean, sd, reach):
-    """Where every source sends its mass, row after row: (first targets, ends of rows, masses)."""
+def transition_kernel(spacing, mean, sd, reach):
+    """The transition kernel by rows, one per source: (first targets, ends of rows, masses)."""
     n = mean.size
     first, end = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
     for i in range(n):
@@ -107,22 +106,22 @@ def kernel(spacing, mean, sd, reach):
 
 
 @inline_always
-def move(first, end, masses, mass, low, n):
-    """The same as `spread`, with the rows of a kernel made before."""
+def scatter_rows(first, end, masses, mass, low, n):
+    """As `scatter`, with the rows of a `transition_kernel`."""
     out = np.zeros(n)
     for i in range(mass.size):
         if mass[i] > 0.0 and end[i] < end[i + 1]:
             row = masses[end[i] : end[i + 1]]
             target = out[first[i] - low : first[i] - low + row.size]
-            share = mass[i]
+            source_mass = mass[i]
             for b in range(row.size):
-                target[b] += share * row[b]
+                target[b] += source_mass * row[b]
     return out
 
 
 @njit_reassoc
 def _mean_over_gaussian(first, spacing, mean, sd, values):
-    """What `_add_gaussian` would add of a unit mass, times ``values``, summed."""
+    """Sum of ``values`` times the masses that `_add_gaussian` gives a unit mass."""
     scale = spacing / sd
     start = (first * spacing - mean) / sd
     result = 0.0
@@ -134,7 +133,7 @@ def _mean_over_gaussian(first, spacing, mean, sd, values):
 
 @njit_internal
 def gather(low, spacing, values, mean, sd, reach):
-    """Mean of ``values``, on a lattice, over N(mean_i, sd_i^2): the transpose of `spread`."""
+    """Means of ``values`` on a grid under N(mean_i, sd_i^2): the transpose of `scatter`."""
     out = np.zeros(mean.size)
     for i in range(mean.size):
         first, last = _target(mean[i], sd[i], spacing, reach)
@@ -147,7 +146,7 @@ def gather(low, spacing, values, mean, sd, reach):
 
 @njit_reassoc
 def gather_rows(first, end, masses, low, values, n):
-    """The same as `gather`, with the first ``n`` rows of a kernel made before."""
+    """As `gather`, with the first ``n`` rows of a `transition_kernel`."""
     out = np.empty(n)
     for i in range(n):
         start = max(first[i], low)
@@ -162,7 +161,7 @@ def gather_rows(first, end, masses, low, values, n):
 
 @njit_internal
 def significant(mass, share):
-    """The range [first, last) outside of which masses are below a share of the largest."""
+    """The range [first, last) outside of which masses are below ``share`` times the largest."""
     largest = 0.0
     for value in mass:
         largest = max(largest, value)
@@ -176,11 +175,11 @@ def significant(mass, share):
 
 @inline_always
 def aliasing(mean, sd, source_spacing, spacing):
-    """Share of each source's mass that the trapezoidal rule may misplace in one step.
+    """Aliasing error of the trapezoidal rule in one step, as a share of each source's mass.
 
     As a function of the source, the mass that arrives at a point is a density at least as wide as
-    the noise, sd, times a Gaussian of sd over the slope of the mean. Their product's spectrum at
-    2 pi / spacing is the error. Infinite where there is no noise.
+    the noise, sd, times a Gaussian of sd over the slope of the mean. The error is the spectrum of
+    this product at 2 pi / spacing. Infinite where there is no noise.
     """
     n = mean.size
     shares = np.zeros(n)
@@ -200,7 +199,7 @@ def aliasing(mean, sd, source_spacing, spacing):
 
 @njit_reassoc
 def total(mass, shares):
-    """Sum of mass * share, in which a share without mass, infinite too, does not count."""
+    """Sum of mass * share over the points with mass; shares elsewhere may be infinite."""
     result = 0.0
     for i in range(mass.size):
         result += mass[i] * shares[i] if mass[i] > 0.0 else 0.0
@@ -209,7 +208,7 @@ def total(mass, shares):
 
 @inline_always
 def weigh(mass, log_density):
-    """Log of sum_i mass_i exp(log_density_i), and the terms over the largest; NaN, inf are zero."""
+    """Log of sum_i mass_i exp(log_density_i), and its terms over the largest; NaN, inf give 0."""
     terms = np.empty(mass.size)
     largest = -np.inf
     for i in range(mass.size):
@@ -237,7 +236,7 @@ def highest(log_density):
 
 @inline_always
 def normalise(mass):
-    """Make the sum one, in place."""
+    """Scale the masses to sum to one, in place."""
     whole = 0.0
     for value in mass:
         whole += value
@@ -247,10 +246,9 @@ def normalise(mass):
 
 @inline_always
 def coarseness(mass):
-    """How much the sums of every third point disagree: the spectrum at 2 pi / (3 spacing).
+    """Relative disagreement of the sums over every third point: the spectrum at 2 pi / (3 spacing).
 
-    A bound on the error of the sum of all points, and one that no position of a peak between the
-    points can hide from.
+    It bounds the error of the sum over all points, wherever a peak lies between the points.
     """
     a, b, c = 0.0, 0.0, 0.0
     for value in mass:

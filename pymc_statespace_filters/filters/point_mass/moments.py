@@ -1,33 +1,33 @@
-"""What is asked of a density that is known by its masses on a lattice: moments, and a draw."""
+"""Moments and draws of a density given by its masses on a grid."""
 
 import math
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
 
-_HALVINGS = 40  # of a cell, in which a draw is looked for
+_HALVINGS = 40  # of the bisection for a draw within a cell
 
 
 @njit_internal
 def mean_and_sd(low, spacing, mass):
-    """Mean and standard deviation, by the trapezoidal rule; masses need not sum to one."""
-    whole = mass_of(mass)
-    centre = _moment(mass, 0.0, 1) / whole
-    variance = _moment(mass, centre, 2) / whole
+    """Mean and standard deviation by the trapezoidal rule; the masses need not sum to one."""
+    total = total_mass(mass)
+    centre = _moment(mass, 0.0, 1) / total
+    variance = _moment(mass, centre, 2) / total
     return (low + centre) * spacing, abs(spacing) * math.sqrt(variance)
 
 
 @njit_reassoc
-def mass_of(mass):
+def total_mass(mass):
     """Sum of the masses."""
-    whole = 0.0
+    total = 0.0
     for i in range(mass.size):
-        whole += mass[i]
-    return whole
+        total += mass[i]
+    return total
 
 
 @njit_reassoc
 def _moment(mass, centre, power):
-    """Sum of the masses times a power of the distance, in points, from point ``centre``."""
+    """Sum of the masses times a power of the distance from ``centre``, in grid spacings."""
     result = 0.0
     for i in range(mass.size):
         distance = i - centre
@@ -37,20 +37,20 @@ def _moment(mass, centre, power):
 
 @njit_internal
 def draw(low, spacing, mass, u):
-    """Draw by inversion of the distribution function at u, in (0, 1).
+    """Invert the distribution function at u, in (0, 1).
 
-    In the cell around each point the density is the parabola through it and its two neighbours.
-    The parabolas' mean and variance are those of the masses: summed by parts, what they add
-    cancels. Where the density falls so fast that a parabola is negative, in the tails, its
-    integral is read as the nearest one that grows: on the coarsest lattice in use, of 1.2 points
-    to the deviation, this makes the variance 0.1 % too large.
+    In the cell around each point the density is the parabola through the point and its two
+    neighbours. Mean and variance of the parabolas are those of the masses: summation by parts shows
+    that the corrections cancel. In the tails, where the density may fall so fast that a parabola is
+    negative, its integral is taken as the nearest increasing one: on the coarsest grid in use, with
+    1.2 points per standard deviation, this makes the variance 0.1 % too large.
     """
     n = mass.size
     if n == 1:
         return low * spacing
-    # A cell's share is its mass and 1/24 of the second difference, which telescopes in sums.
-    whole = mass_of(mass) - (mass[0] + mass[-1]) / 24.0
-    wanted = u * whole
+    # The integral over a cell is its mass plus 1/24 of the second difference, which telescopes.
+    total = total_mass(mass) - (mass[0] + mass[-1]) / 24.0
+    wanted = u * total
     i, before, masses = 0, 0.0, mass[0]
     end = masses + (mass[1] - mass[0] - mass[0]) / 24.0
     while i + 2 < n and end < wanted:
@@ -59,12 +59,12 @@ def draw(low, spacing, mass, u):
         before, end = end, masses + (mass[i + 1] - mass[i] - mass[0]) / 24.0
     if end < wanted:
         i, before = n - 1, end
-    return (low + i + _place(mass, i, wanted - before)) * spacing
+    return (low + i + _position_in_cell(mass, i, wanted - before)) * spacing
 
 
 @inline_always
-def _place(mass, i, wanted):
-    """The v in [-1/2, 1/2] up to which the parabola's integral over the cell is as wanted."""
+def _position_in_cell(mass, i, wanted):
+    """The v in [-1/2, 1/2] at which the parabola's integral from -1/2 on is ``wanted``."""
     here = mass[i]
     before = mass[i - 1] if i > 0 else 0.0
     after = mass[i + 1] if i + 1 < mass.size else 0.0

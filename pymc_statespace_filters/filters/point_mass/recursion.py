@@ -1,10 +1,10 @@
-"""The verbs of the point-mass filter: begin, forecast, see.
+"""The steps of the point-mass filter: initialise, predict, update.
 
-A *grid* is (low, spacing, masses), see `_lattice`; its *source* is the mixture of Gaussians
-(means, deviations, masses) that the masses were taken from, which has a density at any point: where
-an observation asks for a finer grid, it is made of the source. A known state is the grid whose
-point number 1, of spacing x_0, is x_0. A *table* keeps the kernel of a step that is the same at
-every time, for the points from its first on.
+A *grid* is (low, spacing, masses), see the module `grid`. Its *source* is the mixture of Gaussians
+(means, standard deviations, masses) that was evaluated on it; the source has a density at any
+point, so a finer grid, where an observation requires one, is evaluated from it. A state known
+exactly, x_0, is the grid of the single point 1 with spacing x_0. A *table* stores the transition
+kernel of a step that is the same at every time: (first point, mean, sd, shares, rows).
 """
 
 import math
@@ -23,33 +23,33 @@ from pymc_statespace_filters.filters.point_mass.grid import (
     MAX_POINTS,
     aliasing,
     coarseness,
+    extent_of,
+    grid_points,
     highest,
-    kernel,
-    lattice,
-    move,
     normalise,
-    reached,
+    scatter,
+    scatter_rows,
     significant,
-    spread,
     total,
+    transition_kernel,
     weigh,
 )
 from pymc_statespace_filters.filters.system_table import log_density, step_moments
 
-# Reasons to begin again, beside the failures.
+# Reasons to repeat the pass on another grid; all other codes are those of `outcomes`.
 TOO_COARSE, TOO_SHORT = -1, -2
 
 REFINEMENT = 0.7
-"""Factor of the spacing where it is too coarse."""
+"""Factor by which a spacing that is too coarse is reduced."""
 
-_KNOWN = 1e-15  # a deviation below this share of the mean is lost in the mean's rounding
+_KNOWN = 1e-15  # a smaller standard deviation, relative to the mean, is lost in rounding
 
 
 @njit_internal
-def no_table():
-    """A table of no points."""
-    nothing, none = np.empty(0), np.empty(0, np.int64)
-    return np.int64(0), nothing, nothing, nothing, (none, none, nothing)
+def empty_table():
+    """A table without points."""
+    values, indices = np.empty(0), np.empty(0, np.int64)
+    return np.int64(0), values, values, values, (indices, indices, values)
 
 
 @inline_always
@@ -68,67 +68,69 @@ def initial_moments(system):
 
 
 @inline_always
-def cut_of(reach):
-    """The share of the largest mass below which masses are dropped."""
+def truncation_of(reach):
+    """Masses below this share of the largest are dropped."""
     return math.exp(-0.5 * reach * reach)
 
 
 @njit_internal
-def begin(system, spacing, reach):
-    """The grid at step 0, and the mixture (of one) that its masses are taken from."""
+def initialise(system, spacing, reach):
+    """(code, grid, source) at step 0; the source is one Gaussian."""
     (mean, sd), one = initial_moments(system), np.full(1, 1.0)
     source = np.full(1, mean), np.full(1, sd), one
     if not (np.isfinite(mean) and np.isfinite(sd)):
         return NO_FINITE_MEMBER, (np.int64(0), 1.0, one), source
     if sd <= _KNOWN * abs(mean):
-        return NONE, (np.int64(1), mean, one), source  # point 1 of this spacing
+        return NONE, (np.int64(1), mean, one), source
     spacing = min(spacing, 0.6 * sd)
-    low, n = reached(*source, spacing, reach)
+    low, n = extent_of(*source, spacing, reach)
     if n > MAX_POINTS:
         return GRID_TOO_LARGE, (low, spacing, one), source
-    return NONE, (low, spacing, spread(low, n, spacing, *source, reach)), source
+    return NONE, (low, spacing, scatter(low, n, spacing, *source, reach)), source
 
 
 @njit_internal
-def forecast(system, k, t, spacing, reach, grid, table):
-    """One step: (code, grid, the mixture that it was taken from, table, share of error)."""
+def predict(system, k, t, spacing, reach, grid, table):
+    """One step: (code, grid, source, table, mass that the step may misplace)."""
     low, _, mass = grid
-    tabled, mean, sd, shares, table = step_from(system, k, t, spacing, reach, grid, table)
+    tabled, mean, sd, shares, table = transition_at(system, k, t, spacing, reach, grid, table)
     lost = total(mass, shares)
     if lost == np.inf:
         return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
-    target, n = reached(mean, sd, mass, spacing, reach)
+    target, n = extent_of(mean, sd, mass, spacing, reach)
     if n > MAX_POINTS:
-        target, n = _drop_escaping(system, k, t, mean, sd, mass, spacing, reach)
+        target, n = _drop_diverging(system, k, t, mean, sd, mass, spacing, reach)
     source = mean, sd, mass
     if n == 0 or n > MAX_POINTS:
         code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
         return code, grid, source, table, lost
     if tabled:
         starts, ends, masses = rows_from(low, table)
-        out = move(starts, ends, masses, mass, target, n)
+        out = scatter_rows(starts, ends, masses, mass, target, n)
     else:
-        out = spread(target, n, spacing, *source, reach)
-    i, j = significant(out, cut_of(reach))
+        out = scatter(target, n, spacing, *source, reach)
+    i, j = significant(out, truncation_of(reach))
     return NONE, (target + i, spacing, out[i:j]), source, table, lost
 
 
 @inline_always
-def step_from(system, k, t, spacing, reach, grid, table):
-    """What one step does to every point: (is it in the table?, mean, sd, shares, table)."""
-    low, here, mass = grid
-    tabled = system.is_time_invariant and here == spacing and mass.size > 1
+def transition_at(system, k, t, spacing, reach, grid, table):
+    """The transition from every point: (whether it is tabled, mean, sd, shares, table)."""
+    low, grid_spacing, mass = grid
+    tabled = system.is_time_invariant and grid_spacing == spacing and mass.size > 1
     first, mean, sd, shares, rows = table
     if not tabled or low < first or low + mass.size > first + mean.size:
         first, n = low, mass.size
-        if tabled:  # room for the density to move
+        if tabled:  # a margin for the density to move within
             first, n = low - n // 4, n + n // 2
-        mean, sd, shares = _moments(system, k, t, lattice(first, n, here), here, spacing)
+        mean, sd, shares = _moments(
+            system, k, t, grid_points(first, n, grid_spacing), grid_spacing, spacing
+        )
         if tabled:
-            rows = kernel(spacing, mean, sd, reach)
+            rows = transition_kernel(spacing, mean, sd, reach)
             table = first, mean, sd, shares, rows
-    here_on = slice(low - first, low - first + mass.size)
-    return tabled, mean[here_on], sd[here_on], shares[here_on], table
+    points = slice(low - first, low - first + mass.size)
+    return tabled, mean[points], sd[points], shares[points], table
 
 
 @inline_always
@@ -140,7 +142,7 @@ def rows_from(low, table):
 
 @inline_always
 def _moments(system, k, t, X, source_spacing, spacing):
-    """Mean and deviation of the next state from every point, and what a step may misplace."""
+    """Mean and sd of the next state from every point, and the share that a step may misplace."""
     M = np.empty((2, X.shape[1]))
     step_moments(system, k, t, X, M)
     mean, sd = M[0], M[1]
@@ -150,10 +152,10 @@ def _moments(system, k, t, X, source_spacing, spacing):
 
 
 @njit_internal
-def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
-    """Take the mass off exploding points, the fastest first, until a lattice holds the rest.
+def _drop_diverging(system, k, t, mean, sd, mass, spacing, reach):
+    """Remove the mass of diverging points, the fastest first, until a grid holds the rest.
 
-    Those are points whose path without noise is infinite some steps later.
+    A point diverges if its path without noise becomes infinite within some steps.
     """
     X, M = np.empty((1, mean.size)), np.empty((2, mean.size))
     for i in range(mean.size):
@@ -166,29 +168,27 @@ def _drop_escaping(system, k, t, mean, sd, mass, spacing, reach):
         for i in range(mass.size):
             if not np.isfinite(M[0, i]):
                 mass[i] = 0.0
-        low, n = reached(mean, sd, mass, spacing, reach)
+        low, n = extent_of(mean, sd, mass, spacing, reach)
         if n <= MAX_POINTS:
             break
     return low, n
 
 
 @njit_internal
-def see(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
-    """Update: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
+def update(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
+    """Bayes' rule: (code, grid, log p(d_j | d_1 .. d_{j-1})), on a finer grid where needed.
 
-    ``error`` is the mass that the steps since the last update may have misplaced, and of each of
-    the ``n_grids`` since then the ends were cut off: they may lie where the observation looks.
+    ``error`` is the mass that the steps since the last update may have misplaced, and each of the
+    ``n_grids`` grids since then was truncated: the lost mass may lie where the observation puts
+    the state, so both are compared with the tolerance after weighting.
     """
     low, spacing, mass = grid
-    cut = cut_of(reach)
-    log_cut, log_error, log_tolerance = (
-        math.log(n_grids * cut),
-        math.log(error),
-        math.log(tolerance),
-    )
+    cut = truncation_of(reach)
+    log_cut, log_error = math.log(n_grids * cut), math.log(error)
+    log_tolerance = math.log(tolerance)
     while True:
         log_likelihood = np.empty(mass.size)
-        log_density(system, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
+        log_density(system, k, t, d, grid_points(low, mass.size, spacing), log_likelihood)
         term, posterior = weigh(mass, log_likelihood)
         if term == -np.inf:
             return ZERO_WEIGHTS, grid, term
@@ -210,4 +210,4 @@ def see(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
         n = np.int64(math.ceil(end / spacing)) - low + 1
         if n > MAX_POINTS:
             return GRID_TOO_LARGE, grid, term
-        mass = spread(low, n, spacing, *source, reach)
+        mass = scatter(low, n, spacing, *source, reach)

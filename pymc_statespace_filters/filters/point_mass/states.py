@@ -1,16 +1,17 @@
-"""States of the point-mass filter: laws of the state at chosen steps, and draws from them.
+"""States of the point-mass filter: moments of the state at chosen steps, and draws.
 
-Forwards the filter's own pass leaves its grids, of masses p(x_k | d_1 .. d_k), on a tape. Back from
-the last of them goes, on the same points and with the same kernels, the ratio
+The forward pass leaves its grids, with masses of p(x_k | d_1 .. d_k), on a tape. For smoothing the
+ratio
 
     b_k(x_k) = p(x_k | D) / p(x_k | d_1 .. d_k)
              = integral of N(x_{k+1}; g(x_k, 0), s(x_k)^2) p(d_{k+1} | x_{k+1}) b_{k+1}(x_{k+1})
                dx_{k+1} / p(d_{k+1} | d_1 .. d_k),
 
-in which steps without an observation have no factor of p(d | x). It is one at the last observation
-(G. Kitagawa, "Non-Gaussian state-space modeling of nonstationary time series", JASA 82, 1987). A
-trajectory is drawn back along the tape too, from p(x_k | x_{k+1}, d_1 .. d_k), which does not use
-the ratio: masses times the kernel at the x_{k+1} that was drawn.
+runs backward from the last observation, where it is one, on the same points and with the same
+kernels; steps without an observation have no factor of p(d | x) (G. Kitagawa, "Non-Gaussian
+state-space modeling of nonstationary time series", JASA 82, 1987). A trajectory is drawn backward
+too, from p(x_k | x_{k+1}, d_1 .. d_k): the masses times the kernel at the x_{k+1} drawn before,
+without the ratio.
 """
 
 import math
@@ -44,17 +45,17 @@ from pymc_statespace_filters.filters.outcomes import (
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
-    first_lattice,
-    next_lattice,
+    first_grid,
+    next_grid,
 )
-from pymc_statespace_filters.filters.point_mass.grid import gather, gather_rows, lattice
-from pymc_statespace_filters.filters.point_mass.moments import draw, mass_of, mean_and_sd
+from pymc_statespace_filters.filters.point_mass.grid import gather, gather_rows, grid_points
+from pymc_statespace_filters.filters.point_mass.moments import draw, mean_and_sd, total_mass
 from pymc_statespace_filters.filters.point_mass.recursion import (
     TOO_SHORT,
+    empty_table,
     has_valid_covariances,
-    no_table,
     rows_from,
-    step_from,
+    transition_at,
 )
 from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
 from pymc_statespace_filters.filters.system_table import (
@@ -66,7 +67,7 @@ from pymc_statespace_filters.filters.system_table import (
 
 PREDICTED, FILTERED, SMOOTHED = range(3)
 MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
-"""Given the observations of earlier steps, of the step's own too, of all."""
+"""Given the observations before the step, up to and at the step, or all."""
 
 STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "tolerance": types.float64, "moment": types.intp,
@@ -79,7 +80,7 @@ StatesArguments = arguments_class("StatesArguments", STATES_ARGUMENTS, __name__)
 
 
 class _Rows(NamedTuple):
-    """What is written: the mean, the deviation and a draw of the state at the steps ``at``."""
+    """Results: mean, standard deviation and a draw of the state at the steps ``at``."""
 
     at: np.ndarray
     draw_seed: int
@@ -112,48 +113,48 @@ def _grid_states(
 
 @inline_always
 def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
-    """Write rows and terms: (NONE, J), or (a reason, the observation that failed)."""
+    """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
     if not has_valid_covariances(system):
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    kept = rows.at
+    stored = rows.at
     if moment == SMOOTHED and rows.at.size:
-        kept = np.arange(rows.at[0], steps[-1] + 1)
-    spacing, reach = first_lattice(system, steps, t0, tolerance)
+        stored = np.arange(rows.at[0], steps[-1] + 1)
+    spacing, reach = first_grid(system, steps, t0, tolerance)
     while True:
-        grids = [(np.int64(0), 1.0, terms)]  # tells the type
+        grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
         grids.clear()
-        tape = grids, kept, moment
+        tape = grids, stored, moment
         code, j = attempt(
             system, steps, observed, t0, spacing, reach, tolerance, terms, _keep, tape
         )
         if moment == SMOOTHED and code == NONE and rows.at.size:
-            code, j = _back(
+            code, j = _smooth(
                 system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows
             )
-        again, spacing, reach = next_lattice(code, spacing, reach)
+        again, spacing, reach = next_grid(code, spacing, reach)
         if not again:
             break
     if moment != SMOOTHED:
-        _write_all(rows, grids)
+        _write_rows(rows, grids)
     return code, j
 
 
 @njit_internal
-def _keep(tape, k, grid, seen):
-    """Put a grid on the tape, or in the place of the forecast what was seen there made of it."""
-    grids, kept, moment = tape
+def _keep(tape, k, grid, updated):
+    """Append the grid of a stored step to the tape; an updated grid replaces the predicted one."""
+    grids, stored, moment = tape
     n = len(grids)
     low, spacing, mass = grid
-    if not seen:
-        if n < kept.size and kept[n] == k:
-            grids.append((low, spacing, mass.copy()))  # the next step may take mass off
-    elif moment != PREDICTED and n > 0 and kept[n - 1] == k:
+    if not updated:
+        if n < stored.size and stored[n] == k:
+            grids.append((low, spacing, mass.copy()))  # the next step may change the masses
+    elif moment != PREDICTED and n > 0 and stored[n - 1] == k:
         grids[n - 1] = low, spacing, mass.copy()
 
 
 @njit_internal
-def _write_all(rows, grids):
-    """Write the law of each grid; rows that were not reached are NaN."""
+def _write_rows(rows, grids):
+    """Write moments and a draw of each grid; rows that were not reached are NaN."""
     for i in range(rows.at.size):
         rows.mean[i], rows.sd[i], rows.drawn[i] = np.nan, np.nan, np.nan
         if i < len(grids):
@@ -164,43 +165,43 @@ def _write_all(rows, grids):
 
 
 @njit_internal
-def _back(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows):
-    """The pass back, which writes the smoothed rows: (NONE, J), or (why it stopped, where)."""
-    grids, kept, _ = tape
-    table, later = no_table(), grids[-1]
+def _smooth(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows):
+    """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
+    grids, stored, _ = tape
+    table, later = empty_table(), grids[-1]
     weights, ratio = later[2], np.ones(later[2].size)
     drawn = 0.0
     i, j = rows.at.size - 1, steps.size - 1
-    for place in range(kept.size - 1, -1, -1):
-        k, grid = kept[place], grids[place]
-        low, here, mass = grid
+    for row in range(stored.size - 1, -1, -1):
+        k, grid = stored[row], grids[row]
+        low, grid_spacing, mass = grid
         t = t0 + k * system.dt
-        if k < kept[-1]:
-            mean, sd, ratio, table = _step_back(
+        if k < stored[-1]:
+            mean, sd, ratio, table = _predict_adjoint(
                 system, k, t, spacing, reach, grid, table, later, ratio
             )
-            weights = _given_next(mass, mean, sd, drawn)
+            weights = _backward_weights(mass, mean, sd, drawn)
         smoothed = mass * ratio
-        if not _holds(smoothed, tolerance):
+        if not _is_contained(smoothed, tolerance):
             return TOO_SHORT, min(j + 1, steps.size - 1)
-        drawn = draw(low, here, weights, uniform_at(rows.draw_seed, STATES, k, 0))
+        drawn = draw(low, grid_spacing, weights, uniform_at(rows.draw_seed, STATES, k, 0))
         if rows.at[i] == k:
-            rows.mean[i], rows.sd[i] = mean_and_sd(low, here, smoothed)
+            rows.mean[i], rows.sd[i] = mean_and_sd(low, grid_spacing, smoothed)
             rows.drawn[i] = drawn
             i -= 1
         if j >= 0 and steps[j] == k:
             if not is_missing(observed, j):
-                _see_back(system, k, t, observed[j], grid, terms[j], ratio)
+                _update_adjoint(system, k, t, observed[j], grid, terms[j], ratio)
             j -= 1
         later = grid
     return NONE, steps.size
 
 
 @njit_internal
-def _step_back(system, k, t, spacing, reach, grid, table, later, ratio):
-    """From the ratio on the grid ``later`` to that one step before: (mean, sd, ratio, table)."""
+def _predict_adjoint(system, k, t, spacing, reach, grid, table, later, ratio):
+    """Carry the ratio from the grid ``later`` one step back: (mean, sd, ratio, table)."""
     low, _, mass = grid
-    tabled, mean, sd, _, table = step_from(system, k, t, spacing, reach, grid, table)
+    tabled, mean, sd, _, table = transition_at(system, k, t, spacing, reach, grid, table)
     if tabled and later[1] == spacing:
         starts, ends, masses = rows_from(low, table)
         ratio = gather_rows(starts, ends, masses, later[0], ratio, mass.size)
@@ -210,34 +211,34 @@ def _step_back(system, k, t, spacing, reach, grid, table, later, ratio):
 
 
 @njit_internal
-def _given_next(mass, mean, sd, x):
+def _backward_weights(mass, mean, sd, x):
     """Masses times the densities of the state x one step later."""
     out = np.empty(mass.size)
     for i in range(mass.size):
         z = (x - mean[i]) / sd[i]
         weight = mass[i] / sd[i] * exp(-0.5 * z * z)
-        out[i] = weight if weight > 0.0 else 0.0  # what has gone to infinity gives NaN
+        out[i] = weight if weight > 0.0 else 0.0  # a diverged point gives NaN
     return out
 
 
 @inline_always
-def _holds(smoothed, tolerance):
-    """Whether a grid holds the smoothed density, and has not lost it beyond an end."""
-    whole = mass_of(smoothed)
-    if not (whole > 0.0 and whole < np.inf):
+def _is_contained(smoothed, tolerance):
+    """Whether the smoothed density has mass, and none of it is lost beyond the ends of the grid."""
+    total = total_mass(smoothed)
+    if not (total > 0.0 and total < np.inf):
         return False
-    return smoothed.size == 1 or smoothed[0] + smoothed[-1] <= tolerance * whole
+    return smoothed.size == 1 or smoothed[0] + smoothed[-1] <= tolerance * total
 
 
 @njit_internal
-def _see_back(system, k, t, d, grid, term, ratio):
-    """Multiply by p(d | x) / p(d | d_1 ..), in place; what has no mass has no ratio."""
+def _update_adjoint(system, k, t, d, grid, term, ratio):
+    """Multiply the ratio by p(d | x) / p(d | d_1 ..), in place; zero at points without mass."""
     low, spacing, mass = grid
     log_likelihood = np.empty(mass.size)
-    log_density(system, k, t, d, lattice(low, mass.size, spacing), log_likelihood)
+    log_density(system, k, t, d, grid_points(low, mass.size, spacing), log_likelihood)
     for i in range(mass.size):
-        is_seen = mass[i] > 0.0 and log_likelihood[i] < np.inf
-        ratio[i] *= math.exp(log_likelihood[i] - term) if is_seen else 0.0
+        is_possible = mass[i] > 0.0 and log_likelihood[i] < np.inf
+        ratio[i] *= math.exp(log_likelihood[i] - term) if is_possible else 0.0
 
 
 GRID_STATES = EntryPoint(_grid_states, STATES_ARGUMENTS, "grid_states", digest("grid_states"))

@@ -1,4 +1,4 @@
-"""Kernel densities by way of the lattice, against plain exact sums, target by target.
+"""Kernel densities through the grid, against plain exact sums, target by target.
 
 The error is that of the density itself, |f / exact - 1|, wherever the target is.
 """
@@ -13,8 +13,8 @@ from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
     FLOOR,
-    lattice_sums,
-    lattice_workspace,
+    gridded_sum_workspace,
+    gridded_sums,
 )
 from pymc_statespace_filters.filters.kernel_density.points import Points
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
@@ -31,15 +31,15 @@ REACHED = 2e-9  # what the module promises of a pair, and a little for what wind
 def _sums(sources, targets, work):
     layout, n_members, n_dims = RankLayout(0, 1, 0), sources.shape[1], sources.shape[0] - 1
     sources, targets = Points(sources, n_members, True), Points(targets, n_members, True)
-    return lattice_sums(layout, sources, targets, n_dims, work)
+    return gridded_sums(layout, sources, targets, n_dims, work)
 
 
 def sums(w, Y, V):
-    """The lattice alone: whether it was used, and its sums, in units of the kernel."""
-    return lattice(w, Y, V, lattice_workspace(1, padded(w.size)))
+    """The gridded sums alone: whether they were used, and their values, in units of the kernel."""
+    return gridded(w, Y, V, gridded_sum_workspace(1, padded(w.size)))
 
 
-def lattice(w, Y, V, work):
+def gridded(w, Y, V, work):
     sources, targets = np.vstack([w, Y / np.sqrt(2)]), np.vstack([w, V / np.sqrt(2)])
     return _sums(sources, targets, work), targets[0]
 
@@ -66,7 +66,7 @@ def cloud(n, N, seed=0):
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_every_pair_has_the_same_relative_error(n):
-    # One member, and targets around it at all phases of the lattice, down to the floor
+    # One member, and targets around it at all phases of the grid, down to the floor
     rng = np.random.default_rng(1)
     N = 4000
     Y = np.repeat(rng.standard_normal((n, 1)), N, axis=1)
@@ -81,7 +81,7 @@ def test_every_pair_has_the_same_relative_error(n):
 
 
 def test_a_plain_interpolation_would_not_pass():
-    # Where the density falls to a fifth from one lattice point to the next
+    # Where the density falls to a fifth from one grid point to the next
     N = 1000
     Y, V = np.zeros((1, N)), np.linspace(-12, -10, N)[None]
     V[:, ::2] = np.linspace(4, 5, N // 2)
@@ -180,7 +180,7 @@ def test_no_target_near_any_member(n):
     assert errors(X, w, V).max() < GOAL  # the sums are exact, their exponents of order 1e6
 
 
-def test_a_lattice_that_would_be_too_large_is_refused():
+def test_a_grid_that_would_be_too_large_is_refused():
     _, X, w = cloud(2, 300)
     assert sums(w, X, X)[0]
     assert not sums(w, 100 * X, 100 * X)[0]
@@ -188,9 +188,9 @@ def test_a_lattice_that_would_be_too_large_is_refused():
 
 def test_workspace_can_change_from_two_directions_to_one():
     _, X, w = cloud(2, 400)
-    work = lattice_workspace(1, padded(400))
-    assert lattice(w, X, X, work)[0]
-    used, second = lattice(w, X[:1], X[:1], work)
+    work = gridded_sum_workspace(1, padded(400))
+    assert gridded(w, X, X, work)[0]
+    used, second = gridded(w, X[:1], X[:1], work)
     assert used
     assert np.array_equal(second, sums(w, X[:1], X[:1])[1])
 
