@@ -1,4 +1,4 @@
-"""Frozen graphs: equal if the equations are equal, picklable, described alike in every process."""
+"""Frozen graphs of equations, and their canonical text, the same in every process."""
 
 import hashlib
 from collections.abc import Sequence
@@ -19,15 +19,16 @@ def freeze(inputs: Sequence[Variable], outputs: Sequence[Variable]) -> FrozenFun
     for variable in graph_inputs(outputs):
         if variable not in inputs and not isinstance(variable, Constant):
             raise ModelError(
-                f"a function of the system uses the {_kind(variable, outputs)} from outside; pass "
-                f"it as a parameter, or as a plain number or numpy array if it is a constant"
+                f"a function of the system must use its arguments and constants only, got the "
+                f"{_kind(variable, outputs)}; pass it as a parameter, or as a number or array if "
+                f"it is constant"
             )
     _check_indices(outputs)
     return FrozenFunctionGraph.from_io(inputs, outputs)
 
 
 def _kind(variable: Variable, outputs: Sequence[Variable]) -> str:
-    """What a variable from outside is, in words; a generator is there for what it draws."""
+    """How to call an outside variable in a message; a generator is named by what it draws."""
     if not isinstance(variable, SharedVariable):
         return f"symbol {variable}"
     if not isinstance(variable.type, RandomType):
@@ -37,7 +38,7 @@ def _kind(variable: Variable, outputs: Sequence[Variable]) -> str:
 
 
 def _check_indices(outputs: Sequence[Variable]) -> None:
-    """Find an index beyond the end here, where the message still reaches the one who wrote it."""
+    """Raise for a constant index out of range; machine code would not check it."""
     for variable in ancestors(outputs):
         if variable.owner is None or not isinstance(variable.owner.op, Subtensor):
             continue
@@ -48,8 +49,8 @@ def _check_indices(outputs: Sequence[Variable]) -> None:
             whole = isinstance(index, np.ndarray | np.integer | int)
             if whole and size is not None and not -size <= index < size:
                 raise ModelError(
-                    f"a function of the system uses the index {int(index)} of {source}, which has "
-                    f"{size} entries, 0 to {size - 1}"
+                    f"a function of the system must index {source} from 0 to {size - 1}, got the "
+                    f"index {int(index)}"
                 )
 
 

@@ -16,7 +16,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.inspection import noise_seeds, smooth_filters, with_filter
+from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters, with_filter
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,6 @@ from pytensor.graph.type import Type
 from pytensor.tensor.random.type import RandomType
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 def model_fingerprint(model: pm.Model) -> str:
@@ -227,11 +226,6 @@ def _(value: FunctionType) -> str:
     if found is not value:
         raise _UnstableError(f"the function {value!r}")
     return _name(value)
-
-
-@describe.register
-def _(value: StateSpaceModel) -> str:
-    return _of(value, {name: getattr(value, name) for name in StateSpaceModel.__annotations__})
 
 
 @describe.register

@@ -10,12 +10,8 @@ from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.pymc_model.inspection import (
-    noise_seeds,
-    noisy_filters,
-    resized,
-    with_filter,
-)
+from pymc_statespace_filters.pymc_model.graph_rewrites import with_filter
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds, noisy_filters, resized
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     TARGET,

@@ -1,10 +1,10 @@
-"""The multiplier of small deviations along a system's path, against what it is by hand."""
+"""Eigenvalues of the step's Jacobian along a system's path, against what they are by hand."""
 
 import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.pymc_model.overshoot import smallest_multiplier
+from pymc_statespace_filters.pymc_model.step_refinement import path_eigenvalues
 
 OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
 
@@ -20,9 +20,14 @@ def euler(drift, n=1, substeps=1, mean=1.0, **kwargs):
 
 
 def multiplier(system, theta, n_steps=100, inputs=None, t0=0.0):
+    """Smallest real part of an eigenvalue, which decides on Euler-Maruyama steps."""
+    return eigenvalues(system, theta, n_steps, inputs, t0).real.min(axis=(1, 2))
+
+
+def eigenvalues(system, theta, n_steps=100, inputs=None, t0=0.0):
     m = len(theta)
     inputs = np.zeros((0, system.n_inputs)) if inputs is None else inputs
-    return smallest_multiplier(
+    return path_eigenvalues(
         system,
         np.asarray(theta),
         np.tile(np.arange(n_steps + 1), (m, 1)),
@@ -45,10 +50,12 @@ def test_the_path_finds_the_well():
     np.testing.assert_allclose(found, [1 - 0.6, 1 - 1.2], atol=1e-4)
 
 
-def test_a_path_without_end_is_minus_infinity():
-    found = multiplier(euler(lambda x, a: [a * x[0] ** 3], mean=5.0), [[-1.0], [-0.01]])
-    assert found[0] == -np.inf
-    assert np.isfinite(found[1])
+def test_a_path_that_diverges_is_not_stable():
+    system = euler(lambda x, a: [a * x[0] ** 3], mean=5.0)
+    found = eigenvalues(system, [[-1.0], [-0.01]])
+    assert np.isnan(found[0]).any()
+    assert np.isfinite(found[1]).all()
+    assert list(system.integrator.is_stable_at(found).all(axis=1)) == [False, True]
 
 
 def test_an_oscillator_does_not_overshoot():
@@ -62,3 +69,9 @@ def test_inputs_and_time_move_the_path():
     system = euler(lambda x, u, t, b: [-(u[0] + t) * b * x[0]], substeps=2, inputs=["u"])
     found = multiplier(system, [[1.0]], 10, np.arange(10.0)[:, None], t0=3.0)
     np.testing.assert_allclose(found, 1 - (9 + 4.0) * 0.05, rtol=1e-9)
+
+
+def test_an_euler_step_is_stable_while_no_eigenvalue_is_negative():
+    step = psf.EulerMaruyama(lambda x, a: [a * x[0]], [[0.3]], dt=0.1)
+    eigenvalues = np.array([[0.5, -0.1], [0.5, 0.0], [0.5, 0.1 + 2j], [0.5, np.nan]])
+    assert list(step.is_stable_at(eigenvalues)) == [False, True, True, False]
