@@ -1,14 +1,14 @@
 """Checks of single numbers that users give: integers, positive numbers, seeds."""
 
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 
 
-def is_integer(value: Any) -> bool:
+def is_integer(value: Any) -> TypeGuard[int]:
     """Whether a value is an integer, Python's or NumPy's, and not a truth value."""
     return isinstance(value, Integral) and not isinstance(value, bool)
 

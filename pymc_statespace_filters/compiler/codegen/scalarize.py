@@ -142,7 +142,7 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     (array,) = arguments
     axes = tuple(range(array.ndim)) if node.op.axis is None else tuple(node.op.axis)
     kept = [axis for axis in range(array.ndim) if axis not in axes]
-    # A sum of truth values counts them.
+    # A sum of booleans is a count.
     counts = node.inputs[0].type.dtype == "bool" and node.outputs[0].type.dtype != "bool"
     cast = ps.Cast(ps.get_scalar_type(node.outputs[0].type.dtype))
     rows = np.transpose(array, (*kept, *axes)).reshape(*(array.shape[a] for a in kept), -1)
@@ -167,7 +167,7 @@ def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
 
 
 def _cholesky(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """Row by row; a negative pivot gives NaN through its square root, as LAPACK's wrapper does."""
+    """Row by row; a negative pivot gives NaN through its square root, like LAPACK's wrapper."""
     (a,) = arguments
     n = a.shape[0]
     chol = np.full((n, n), 0.0, dtype=object)
