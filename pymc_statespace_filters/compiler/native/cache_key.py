@@ -4,8 +4,8 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
-# No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it folds
-# x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.
+# No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it
+# folds x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.
 FAST_MATH = {"contract", "nsz", "arcp"}
 
 

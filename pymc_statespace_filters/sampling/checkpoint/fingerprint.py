@@ -41,7 +41,7 @@ def model_fingerprint(model: pm.Model) -> str:
         versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
         deterministic, name, dimension, coordinate and initial value, with the equations of a
         `StateSpace` and with the settings of its filter. Of observed values and other data it holds
-        type and name: see `model_data_fingerprint`. The Python code inside an operation of the user's own
+        type and name: see `values_fingerprint`. The Python code inside an operation of a user
         is not seen, only what the operation is made of.
 
     Raises
@@ -64,7 +64,7 @@ def model_fingerprint(model: pm.Model) -> str:
     return _digest(*described, _graph_digest(_outputs(model), known))
 
 
-def model_data_fingerprint(model: pm.Model) -> str:
+def values_fingerprint(model: pm.Model) -> str:
     """Hash all numbers that a model was given as data.
 
     Parameters
