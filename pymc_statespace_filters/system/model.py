@@ -1,13 +1,12 @@
 """The system: a user's functions, traced once and checked; immutable."""
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.graph_digest import describe
+from pymc_statespace_filters.system.graph_digest import describe, digest
 from pymc_statespace_filters.system.integrators import Integrator
 from pymc_statespace_filters.system.signature import carried_names, checked_names, size_of
 from pymc_statespace_filters.system.tracing import (
@@ -222,6 +221,4 @@ class StateSpaceModel:
     @cached_property
     def fingerprint(self) -> str:
         """A digest of the equations and settings, the same in every process."""
-        settings = [repr(v) for name, v in self._identity().items() if name != "equations"]
-        graphs = [describe(graph) for graph in vars(self.equations).values()]
-        return hashlib.sha256("\n".join([*settings, *graphs]).encode()).hexdigest()
+        return digest(describe(self))

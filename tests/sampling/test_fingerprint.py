@@ -16,10 +16,10 @@ from pytensor.graph.op import Op
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
-    describe,
     model_fingerprint,
     values_fingerprint,
 )
+from pymc_statespace_filters.system.graph_digest import describe
 from tests.small_systems import PAIR_DATA, STEPS, pair
 
 X, Y = np.array([0.5, 1.0, -0.3]), np.array([1.0, 2.5, -0.5])
