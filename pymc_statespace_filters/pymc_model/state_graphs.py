@@ -1,4 +1,4 @@
-"""What the states along a record are, as graphs of a model's variables."""
+"""Graphs of the states of StateSpace variables, as functions of a model's variables."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 class StateSpaceVariable(NamedTuple):
-    """One variable of a model: its equations, its filter, and the symbols of its record.
+    """One variable of a model: its system, its filter, and the symbols of its record.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class StateSpaceVariable(NamedTuple):
     dims : tuple of str
         Names of its dimensions, time and observable.
     theta, steps, inputs, t0, seed : TensorVariable
-        As a likelihood takes them; theta and inputs may depend on the free variables.
+        Inputs of the likelihood; theta and inputs may depend on the free variables.
     observed : TensorVariable
         The data.
     """
@@ -56,7 +56,7 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
 
 
 def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpaceVariable:
-    """The same record read by another filter."""
+    """The same variable with another filter."""
     check_kinds(variable.system, filter)
     return variable._replace(filter=filter)
 
@@ -64,7 +64,7 @@ def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpac
 def states_of(
     variable: StateSpaceVariable, moment: str, rows: Variable, draw_seed: Variable
 ) -> Sequence[TensorVariable]:
-    """Mean, sd and a draw of the state at steps `rows`, effective number, health."""
+    """Mean, sd and a draw of the state at steps `rows`, effective sample size and health."""
     record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
     operation = States(variable.system, variable.filter, moment)
     return operation(variable.theta, *record, rows, draw_seed, return_list=True)

@@ -46,8 +46,8 @@ def model_fingerprint(model: pm.Model) -> str:
         "coords": dict(model.coords),
         "starts": {rv.name: value for rv, value in model.rvs_to_initial_values.items()},
     }
-    described = [described(f"the model's {what}", value) for what, value in names.items()]
-    return digest(*described, graph_digest(_outputs(model), known))
+    texts = [described(f"the model's {what}", value) for what, value in names.items()]
+    return digest(*texts, graph_digest(_outputs(model), known))
 
 
 def values_fingerprint(model: pm.Model) -> str:
