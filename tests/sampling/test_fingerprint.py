@@ -307,7 +307,7 @@ def test_wrapped_python_functions_are_refused():
     with pm.Model() as model:
         pm.Potential("p", wrapped(pm.Normal("a")))
     with pytest.raises(
-        ModelError, match=r"of the operation pytensor.*FromFunctionOp holds the fun"
+        ModelError, match=r"of the operation pytensor.*FromFunctionOp must have .* got the fun"
     ):
         model_fingerprint(model)
 
