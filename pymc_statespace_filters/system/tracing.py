@@ -133,7 +133,7 @@ def size(functions: Functions, signature: Signature) -> Symbols:
     m0 = as_vector("initial_mean", mean(values) if isinstance(mean, Equation) else mean)
     n = m0.type.shape[0]
     if n == 0:
-        raise ModelError("initial_mean is empty: a system has at least one state")
+        raise ModelError("initial_mean must have an entry for at least one state, got none")
     values |= {
         "x": pt.tensor("x", shape=(n,), dtype="float64"),
         "u": pt.tensor("u", shape=(len(signature.inputs),), dtype="float64"),
