@@ -1,13 +1,12 @@
-"""One small tree of named errors and warnings.
+"""The errors and warnings of the package.
 
-A mistake in what the user wrote is an exception raised before any number is computed. A failure
-inside a filter is a value (minus infinity and a counted reason); what is said about it afterwards
-is a warning.
+A wrong argument raises an exception before anything is computed. A failure inside a filter is a
+value (minus infinity and a counted reason), reported by a warning afterwards.
 """
 
 
 class StateSpaceFiltersError(Exception):
-    """Root of every error that the package raises on purpose.
+    """Base class of all errors that the package raises deliberately.
 
     Examples
     --------
@@ -21,19 +20,19 @@ class StateSpaceFiltersError(Exception):
 
 
 class ModelError(StateSpaceFiltersError, ValueError):
-    """An argument of a system, a filter or a data set is wrong; the message names it.
+    """A wrong argument of a system, a filter or a data set; the message names the argument.
 
     Examples
     --------
     >>> import pymc_statespace_filters as psf
     >>> psf.EnKF(1)
     Traceback (most recent call last):
-    pymc_statespace_filters.errors.ModelError: n_members must be an integer of at least 2, got 1.
+    pymc_statespace_filters.errors.ModelError: n_members must be an integer of at least 2, got 1...
     """
 
 
 class DataMismatchError(StateSpaceFiltersError, ValueError):
-    """Results that belong to different data or different models were brought together.
+    """Results of different data or different models were combined.
 
     Examples
     --------
@@ -51,7 +50,7 @@ class DataMismatchError(StateSpaceFiltersError, ValueError):
 
 
 class LoweringError(StateSpaceFiltersError):
-    """A user's function contains an operation that cannot be turned into machine code.
+    """A user's function contains an operation that cannot be compiled.
 
     Examples
     --------
@@ -75,10 +74,10 @@ class LoweringError(StateSpaceFiltersError):
 
 
 class GradientUnavailableError(StateSpaceFiltersError):
-    """A gradient sampler was pointed at a likelihood that is an estimate and has no gradient.
+    """A gradient sampler was used on an estimated likelihood, which has no gradient.
 
-    Not a subclass of ``NotImplementedError``: PyMC takes that one for "sample this variable with
-    Slice", which on an estimated likelihood gives silently wrong answers.
+    Not a subclass of ``NotImplementedError``, on which PyMC would fall back to its slice sampler:
+    with an estimated likelihood that sampler is wrong without any error.
 
     Examples
     --------
@@ -104,7 +103,7 @@ class GradientUnavailableError(StateSpaceFiltersError):
 
 
 class ParallelError(StateSpaceFiltersError, RuntimeError):
-    """MPI cannot be used as it was asked for, or another rank has stopped the run.
+    """MPI cannot be used as requested, or another rank has stopped the run.
 
     Examples
     --------
@@ -115,11 +114,11 @@ class ParallelError(StateSpaceFiltersError, RuntimeError):
 
 
 class ParallelWarning(UserWarning):
-    """The ranks of a run are not what a reproducible run needs.
+    """The ranks of a run differ, so that its results are not reproducible to the bit.
 
     Examples
     --------
-    To stop instead:
+    To raise an error instead:
 
     >>> import warnings
     >>> import pymc_statespace_filters as psf
@@ -129,11 +128,11 @@ class ParallelWarning(UserWarning):
 
 
 class FilterWarning(UserWarning):
-    """A filter's numbers should not be trusted as they stand.
+    """A filter failed or collapsed, so its results may be unreliable.
 
     Examples
     --------
-    Where a doubt should stop a script:
+    To raise an error instead:
 
     >>> import warnings
     >>> import pymc_statespace_filters as psf
@@ -143,11 +142,11 @@ class FilterWarning(UserWarning):
 
 
 class EvidenceWarning(UserWarning):
-    """An evidence estimate is less certain than its number looks.
+    """An evidence estimate may be less accurate than its standard error says.
 
     Examples
     --------
-    A doubt that is known and accepted:
+    To silence the warning:
 
     >>> import warnings
     >>> import pymc_statespace_filters as psf
@@ -157,11 +156,11 @@ class EvidenceWarning(UserWarning):
 
 
 class CheckpointWarning(UserWarning):
-    """A part of a checkpoint is damaged; the chain goes on from what stands before it.
+    """A part of a checkpoint is damaged; the chain resumes from the last intact record.
 
     Examples
     --------
-    To stop instead and look at the folder:
+    To raise an error instead, and inspect the folder:
 
     >>> import warnings
     >>> import pymc_statespace_filters as psf

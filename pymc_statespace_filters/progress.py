@@ -41,9 +41,9 @@ class _Bar:
 
 
 class Watched(Protocol):
-    """Who tells ``watch``, in the main thread, how many rows were done since last told."""
+    """Work that calls ``on_progress``, in the main thread, with the number of new rows done."""
 
-    watch: Callable[[int], None]
+    on_progress: Callable[[int], None]
 
 
 @contextmanager
@@ -55,5 +55,5 @@ def watched(work: Watched, *, enabled: bool) -> Iterator[Callable[[str, int], No
     with ExitStack() as stack:
         bar = _Bar(stack)
         if enabled:
-            work.watch = bar.advance
+            work.on_progress = bar.advance
         yield bar.announce

@@ -1,5 +1,6 @@
 """What the project promises about itself rather than about numbers."""
 
+import ast
 import doctest
 import inspect
 import os
@@ -37,6 +38,55 @@ def test_lock_holds_every_dependency_within_its_bounds():
     for requirement in wanted:
         version = locked[canonicalize_name(requirement.name)].removeprefix("==")
         assert version in requirement.specifier, f"{requirement}, locked at {version}"
+
+
+def imports_from_elsewhere():
+    """Every module that the package imports from elsewhere, and the file that does."""
+    for file in (ROOT / "pymc_statespace_filters").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                modules = [node.module]
+            else:
+                continue
+            for module in modules:
+                if module.partition(".")[0] not in {*sys.stdlib_module_names, psf.__name__}:
+                    yield module, file.relative_to(ROOT / psf.__name__).as_posix()
+
+
+def test_imported_distributions_are_the_declared_dependencies():
+    declared = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependencies"]}
+    imported = {
+        canonicalize_name(module.partition(".")[0]) for module, _ in imports_from_elsewhere()
+    }
+    assert imported == declared
+
+
+# import-linter sees only whole external packages.
+INSIDES = ("llvmlite", "numba.core", "numba.extending", "pytensor.link")
+TOUCH_INSIDES = {
+    # how operations and the random variable become machine code
+    "ops/base.py": "pytensor.link",
+    "pymc_model/dispatch.py": "pytensor.link",
+    # the name of the processor that numba compiles for
+    "parallel/environment.py": "numba.core",
+    # vector instructions that numba does not have
+    "filters/kernel_density/simd_windows.py": ("llvmlite", "numba.core", "numba.extending"),
+    # functions that run in Python too
+    "sampling/kernel/adaptation_state.py": "numba.extending",
+}
+
+
+def test_the_insides_of_numba_and_pytensor_are_met_in_the_compiler_alone():
+    outside = {
+        (module, file)
+        for module, file in imports_from_elsewhere()
+        if module.startswith(INSIDES)
+        and not file.startswith("compiler/")
+        and not module.startswith(TOUCH_INSIDES.get(file, ("nothing",)))
+    }
+    assert outside == set()
 
 
 def test_importing_is_silent_and_leaves_mpi_alone():

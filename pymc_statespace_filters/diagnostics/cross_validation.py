@@ -17,7 +17,7 @@ from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.variable import chosen_variables
-from pymc_statespace_filters.system.record import is_whole
+from pymc_statespace_filters.system.checks import is_integer
 
 Refit = Callable[[pm.Model], xr.DataTree]
 
@@ -151,7 +151,7 @@ def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
 
 
 def _check_number(given: int, least: int, n_observations: int, name: str) -> None:
-    if not (is_whole(given) and least <= given < n_observations):
+    if not (is_integer(given) and least <= given < n_observations):
         raise ModelError(
             f"min_observations must be an integer from {least} to {n_observations - 1}, as "
             f"{name!r} has {n_observations} observations, got {given!r}"

@@ -21,7 +21,7 @@ from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
 from pymc_statespace_filters.states.groups import with_group
 from pymc_statespace_filters.states.variable import States, VariableAtDraws, chosen_variables
-from pymc_statespace_filters.system.record import check_random_seed
+from pymc_statespace_filters.system.checks import check_random_seed
 
 Array = NDArray[np.float64]
 

@@ -6,18 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.filters.outcomes import warn_about
-from pymc_statespace_filters.filters.protocol import Filter, check_filter
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
+from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
 from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_seed, check_system, checked_record
+from pymc_statespace_filters.system.record import check_seed, checked_record
 
 
 def log_likelihood(
@@ -91,7 +90,7 @@ def log_likelihood(
     >>> terms.shape
     (2,)
     """
-    check_kinds(system, filter)
+    check_system_and_filter(system, filter)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
@@ -147,10 +146,3 @@ def _evaluate(
     for i, point in enumerate(points):
         terms[i], health[i] = evaluate(point, *record, np.asarray(seeds[i]))
     return terms, health
-
-
-def check_kinds(system: Any, filter: Any) -> None:
-    """Raise unless these are a system and a filter that can treat it."""
-    check_system(system)
-    check_filter(filter)
-    filter.check(compile_system(system))

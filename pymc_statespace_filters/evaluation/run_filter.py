@@ -7,10 +7,9 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
 from pymc_statespace_filters.filters.outcomes import warn_about
 from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -99,7 +98,7 @@ def run_filter(
     >>> run["particles"].sizes
     Frozen({'time': 2, 'particle': 500, 'state': 1})
     """
-    check_kinds(system, filter)
+    check_system_and_filter(system, filter)
     check_at(at)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)

@@ -13,13 +13,12 @@ from pymc_statespace_filters.compiler.lowering.observation_sampler import observ
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import check_finite, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import (
     check_inputs,
-    check_random_seed,
     check_system,
-    check_t0,
     steps_of,
 )
 
@@ -160,7 +159,7 @@ def simulate(
     {'step': 41, 'state': 1, 'obs': 3, 'observable': 1}
     """
     check_system(system)
-    t0 = check_t0(t0)
+    t0 = check_finite("t0", t0)
     at = steps_of(steps, times, system.dt, t0)
     forces = check_inputs(inputs, system, at)
     theta = flat_parameters(system, params)

@@ -179,8 +179,8 @@ class PFEnKF(ParticleFilter):
         Returns
         -------
         str
-            "lattice" (O(N)), "exact" (O(N^2)), or "none" where no particle is moved and the filter is
-            the bootstrap filter.
+            "lattice" (O(N)), "exact" (O(N^2)), or "none" where no particle is moved and the filter
+            is the bootstrap filter.
 
         Examples
         --------

@@ -1,19 +1,19 @@
 """Checks of a filter's settings, made once when the filter is constructed."""
 
 from collections.abc import Iterable
-from numbers import Integral, Real
+from numbers import Real
 
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import is_integer
 
 
 def check_count(name: str, value: object) -> int:
     """Return ``value`` as an int of at least 2."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
-    if not is_integer or int(value) < 2:  # type: ignore[call-overload]
+    if not is_integer(value) or value < 2:
         raise ModelError(f"{name} must be an integer of at least 2, got {value!r}.")
-    return int(value)  # type: ignore[call-overload]
+    return int(value)
 
 
 def check_fraction(name: str, value: object) -> float:

@@ -25,8 +25,9 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import (
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.record import check_system
 
 HEALTH_SIZE = 3
 
@@ -38,6 +39,13 @@ RECORD_INPUTS = (
     ("t0", "float64", 0),
     ("seed", "int64", 0),
 )
+
+
+def check_system_and_filter(system: Any, filter: Any) -> None:
+    """Raise unless these are a system and a filter that can treat it."""
+    check_system(system)
+    check_filter(filter)
+    filter.check(compile_system(system))
 
 
 class FilterOp(Op):

@@ -19,13 +19,13 @@ from pymc_statespace_filters.plots.marks import (
     write_key,
 )
 from pymc_statespace_filters.plots.results import (
-    check_count,
     data_of,
     group_of,
     named,
     truth_of,
     variable_of,
 )
+from pymc_statespace_filters.system.checks import check_count
 
 PAST = 2.0  # so much of the record, in lengths of the forecast, is drawn
 FEWEST_OF_PAST = 10
@@ -96,7 +96,7 @@ def plot_forecast(
     >>> collection.savefig("forecast.png")  # doctest: +SKIP
     """
     if n_past is not None:
-        check_count("n_past", n_past)
+        check_count("n_past", n_past, 0)
     _, results = group_of(idata, "predictions")
     predicted = results[[name for name in results if not str(name).endswith("_states")]]
     name = variable_of(predicted, var_name)

@@ -23,13 +23,13 @@ from pymc_statespace_filters.plots.marks import (
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     are_paths,
-    check_count,
     chosen,
     group_of,
     named,
     truth_of,
     variable_of,
 )
+from pymc_statespace_filters.system.checks import check_count
 
 
 def plot_phase(
@@ -100,7 +100,7 @@ def plot_phase(
     >>> loop = plot_phase(idata, "position", force)
     >>> loop.savefig("loop.png")  # doctest: +SKIP
     """
-    check_count("n_draws", n_draws)
+    check_count("n_draws", n_draws, 0)
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")

@@ -56,12 +56,6 @@ def are_paths(group: str, results: xr.Dataset) -> bool:
     return group != "filtered_states" and results.attrs.get("at") != "observations"
 
 
-def check_count(argument: str, count: Any) -> None:
-    """Raise an error for what is no number of things."""
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
-        raise ModelError(f"{argument} must be an integer of at least 0, got {count!r}")
-
-
 def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:
     """Return `names`, all of them if None, checked against what there is."""
     if names is None:

@@ -24,7 +24,6 @@ from pymc_statespace_filters.plots.marks import (
 )
 from pymc_statespace_filters.plots.results import (
     are_paths,
-    check_count,
     chosen,
     data_of,
     group_of,
@@ -33,6 +32,7 @@ from pymc_statespace_filters.plots.results import (
     truth_of,
     variable_of,
 )
+from pymc_statespace_filters.system.checks import check_count
 
 
 def plot_states(
@@ -104,7 +104,7 @@ def plot_states(
     >>> collection = plot_states(idata, truth=np.sin(times))
     >>> collection.savefig("states.png")  # doctest: +SKIP
     """
-    check_count("n_draws", n_draws)
+    check_count("n_draws", n_draws, 0)
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")

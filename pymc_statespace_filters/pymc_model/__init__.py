@@ -1,1 +1,1 @@
-"""A system and its record in a PyMC model."""
+"""State-space systems as variables of a PyMC model."""

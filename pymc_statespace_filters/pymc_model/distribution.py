@@ -1,4 +1,4 @@
-"""Data from a state-space system as a PyMC random variable."""
+"""`StateSpace`: data from a state-space system as a PyMC random variable."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,30 +13,23 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
 from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.pymc_model import (
+    dispatch as dispatch,  # registers the draw and density
+)
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.parameters import (
-    check_names,
-    missing_parameters,
-    parameter_numbers,
-)
-from pymc_statespace_filters.system.record import (
-    check_inputs,
-    check_observed,
-    check_seed,
-    check_t0,
-    steps_of,
-)
+from pymc_statespace_filters.system.parameters import check_names, symbolic_parameters
+from pymc_statespace_filters.system.record import check_seed, symbolic_record
 
 
 class StateSpace(Continuous):
-    r"""A record of a state-space system, as a random variable of shape (J, p).
+    r"""Observations of a state-space system, a random variable of shape (J, p).
 
-    Its log-density is the log-likelihood by a filter, one term log p(d_j | d_1 .. d_{j-1}) per
-    observation; its draws are forward simulations. The terms are sequential: PSIS-LOO on them is
-    not leave-one-out.
+    Its log-density is the log-likelihood that a filter computes, one term
+    log p(d_j | d_1 .. d_{j-1}) per observation; its draws are forward simulations. The terms are
+    sequential: PSIS-LOO on them is not leave-one-out.
 
     Parameters
     ----------
@@ -45,30 +38,31 @@ class StateSpace(Continuous):
     system : StateSpaceModel
         The equations.
     filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter
-        How the likelihood is computed.
+        The filter that computes the likelihood.
     params : mapping, optional
         Parameters by name, numbers or expressions. A parameter not named here is the variable of
         that name in the PyMC model, else the default in the function's signature.
     steps, times : array_like, shape (J,)
-        When observations were taken; give one of them. See `log_likelihood`.
+        Steps or times of the observations; give exactly one of them. See `log_likelihood`.
     observed : array_like, shape (J, p) or (J,), optional
-        The data. NaN means missing and is never imputed; a wholly missing row has the term 0.
-        To exchange data later give `steps`, `observed` and `inputs` as ``pm.Data``, with
-        ``dims=("{name}_time", "observable")``; ``pm.Data`` holds no NaN, ``pytensor.shared`` does.
+        The data. NaN marks a missing component and is never imputed; a wholly missing row has the
+        term 0. To replace the data later, give `steps`, `observed` and `inputs` as ``pm.Data``,
+        with ``dims=("{name}_time", "observable")``; ``pm.Data`` refuses NaN, ``pytensor.shared``
+        accepts it.
     inputs : array_like, shape (rows, n_inputs), optional
         Row k holds during step k.
     t0 : float
         Time of step 0.
     seed : int
-        The noise inside the filter, held by the model as data of the name ``{name}_seed``;
-        sampling does not change it.
+        Seed of the noise inside the filter. The model stores it as shared data ``{name}_seed``,
+        which sampling does not change.
     dims : (str, str), optional
-        Names of the dimensions, ``({name}_time, observable)`` if not given.
+        Names of the dimensions, default ``({name}_time, observable)``.
 
     Raises
     ------
     ModelError
-        If data, steps, inputs and system disagree, or a parameter has no value.
+        If data, steps or inputs do not fit the system, or a parameter has no value.
 
     Examples
     --------
@@ -107,37 +101,37 @@ class StateSpace(Continuous):
     ) -> TensorVariable:
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
-        check_kinds(system, filter)
-        t0 = check_t0(t0)
-        theta = _theta(system, {} if params is None else params, model)
-        symbolic_steps, at = _steps(steps, times, system.dt, t0)
-        data = _observed(observed, system, at)
-        forces = _inputs(inputs, system, at)
+        check_system_and_filter(system, filter)
+        given = {} if params is None else params
+        check_names(system, given)
+        values = dict(system.defaults) | _model_variables(system, model) | dict(given)
+        theta = symbolic_parameters(system, values)
+        record = symbolic_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
         full_name = model.name_for(name)
         time_dim, component_dim = _dims(full_name, dims)
-        _add_coord(model, time_dim, t0 + at * system.dt, name)
+        _add_coord(model, time_dim, record.t0 + record.current_steps * system.dt, name)
         _add_coord(model, component_dim, list(system.observables), name)
         noise_seed = _add_seed(model, full_name, seed_array) if filter.noisy else seed_array
         return super().__new__(
             cls,
             name,
             theta,
-            symbolic_steps,
-            forces,
-            t0,
+            record.steps,
+            record.inputs,
+            record.t0,
             noise_seed,
             system=system,
             filter=filter,
-            observed=data,
+            observed=record.observed,
             dims=(time_dim, component_dim),
         )
 
     @classmethod
     def dist(cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any) -> Any:
-        """The variable outside a model; parameters are theta, steps, inputs, t0 and seed."""
+        """Make the variable without a model; parameters are theta, steps, inputs, t0 and seed."""
         dtypes = ("float64", "int64", "float64", "float64", "int64")
         symbols = [
             pt.cast(p, dtype) if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype))
@@ -156,36 +150,12 @@ class StateSpace(Continuous):
         return draw
 
     def support_point(rv: TensorVariable, *params: Any) -> TensorVariable:
-        """A finite record to start from, where the record itself is not observed."""
+        """Finite data as initial value of a variable that is not observed."""
         return pt.zeros_like(rv)
 
 
-def _theta(system: StateSpaceModel, params: Mapping[str, Any], model: pm.Model) -> TensorVariable:
-    check_names(system, params)
-    found = dict(system.defaults) | _model_variables(system, model) | dict(params)
-    if any(name not in found for name in system.parameters):
-        raise missing_parameters(system, found)
-    parts = []
-    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        value = found[name]
-        symbol = (
-            value if isinstance(value, Variable) else pt.as_tensor(parameter_numbers(name, value))
-        )
-        same = symbol.type.ndim == len(shape) and all(
-            s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
-        )
-        if not same:
-            raise ModelError(
-                f"parameter {name!r} must have shape {shape}, got {symbol.type.shape}"
-                f"{'' if shape else ' (declare shapes={...} in the system for an array)'}"
-            )
-        parts.append(pt.cast(symbol, "float64").ravel())
-    theta = pt.concatenate(parts) if parts else pt.as_tensor(np.zeros(0))
-    return pt.specify_shape(theta, (system.n_theta,))
-
-
 def _model_variables(system: StateSpaceModel, model: pm.Model) -> dict[str, Variable]:
-    """Parameters that the model names; what a submodel lacks, the model around it may have."""
+    """The model's variables with names of parameters; a submodel's precede its parent's."""
     enclosing = _model_variables(system, model.parent) if model.parent is not None else {}
     names = {name: model.name_for(name) for name in system.parameters}
     return enclosing | {
@@ -193,61 +163,17 @@ def _model_variables(system: StateSpaceModel, model: pm.Model) -> dict[str, Vari
     }
 
 
-def _steps(steps: Any, times: Any, dt: float, t0: float) -> tuple[Any, np.ndarray]:
-    """The steps as given to the graph, and their present numbers."""
-    if isinstance(times, Variable):
-        raise ModelError("times cannot be symbolic; give steps=pm.Data(...) of step numbers")
-    if isinstance(steps, Variable):
-        if times is not None:
-            raise ModelError("give exactly one of steps and times")
-        return steps, steps_of(steps.eval(), None, dt, t0)
-    numbers = steps_of(steps, times, dt, t0)
-    return numbers, numbers
-
-
-def _observed(observed: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
-    """Data as a symbol: PyMC would mask and impute the NaN of an array."""
-    if observed is None:
-        return None
-    if isinstance(observed, Variable):
-        if observed.type.ndim != 2:
-            raise ModelError(
-                f"symbolic observed must have 2 dimensions (observations, observables), "
-                f"got {observed.type.ndim}"
-            )
-        if isinstance(observed, SharedVariable):
-            check_observed(observed.get_value(), system, steps.size)
-        return observed
-    return pt.as_tensor(check_observed(observed, system, steps.size))
-
-
-def _inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
-    """Inputs as numbers, or as a symbol of two dimensions: data, or an expression of parameters."""
-    if not isinstance(inputs, Variable):
-        return check_inputs(inputs, system, steps)
-    if isinstance(inputs, SharedVariable):
-        check_inputs(inputs.get_value(), system, steps)
-    if inputs.type.ndim == 1 and system.n_inputs == 1:
-        inputs = inputs[:, None]
-    if not system.n_inputs or inputs.type.ndim != 2:
-        raise ModelError(
-            f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
-            f"{list(system.inputs)}, got {inputs.type}"
-        )
-    return inputs
-
-
 def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:
     if dims is None:
         return f"{name}_time", "observable"
     if isinstance(dims, str) or len(dims) != 2 or not all(isinstance(d, str) for d in dims):
-        raise ModelError(f"dims must be two names, (time, observable), got {dims!r}")
+        raise ModelError(f"dims must be two names (time, observable), got {dims!r}")
     time_dim, component_dim = dims
     return time_dim, component_dim
 
 
 def _add_seed(model: pm.Model, name: str, seed: np.ndarray) -> SharedVariable:
-    # What pm.Data does, which would cut the seed to 32 bits.
+    # As pm.Data does, which would truncate the seed to 32 bits.
     shared = pytensor.shared(seed, name=f"{name}_seed")
     model.register_data_var(shared)
     return shared
@@ -257,10 +183,10 @@ def _add_coord(model: pm.Model, dim: str, values: Any, name: str) -> None:
     if dim not in model.coords:
         model.add_coord(dim, values)
         return
-    known = model.coords[dim]  # None for a dimension that the user made without coordinates
+    known = model.coords[dim]  # None if the user added the dimension without coordinates
     length = model.dim_lengths[dim].eval() if known is None else len(known)
     if length != len(values) or (known is not None and list(known) != list(values)):
         raise ModelError(
-            f"the model has a dimension {dim!r} of length {length} with other coordinates; "
-            f"give {name!r} its own names with dims=(..., ...)"
+            f"dims of {name!r} must be new, or dimensions with the same coordinates, got {dim!r}, "
+            f"a dimension of length {length} with other coordinates; give others as dims=(..., ...)"
         )

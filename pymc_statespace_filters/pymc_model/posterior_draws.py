@@ -1,7 +1,7 @@
-"""What a DataTree of posterior draws must hold, whoever made it, and its draws unconstrained.
+"""Posterior draws from a DataTree: checks of its contents, and the draws unconstrained.
 
-The unconstrained space is that of the model's value variables: every free variable goes through its
-transform, vectors and matrices are flattened.
+The unconstrained space is that of the model's value variables: every free variable is transformed,
+and vectors and matrices are flattened.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
     Raises
     ------
     ModelError
-        If `idata` is no DataTree, or has no such group.
+        If `idata` is not a DataTree, or has no posterior group.
     """
     if not isinstance(idata, xr.DataTree):
         raise ModelError(
@@ -29,18 +29,18 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
             f"got {type(idata).__name__}"
         )
     if "posterior" not in idata.children:
-        raise ModelError(f"idata must have a group 'posterior', it has {sorted(idata.children)}")
+        raise ModelError(f"idata must have a group 'posterior', got {sorted(idata.children)}")
     posterior = idata["posterior"].to_dataset()
     if not {"chain", "draw"} <= set(posterior.dims):
         raise ModelError(
-            "the posterior of idata must have the dimensions chain and draw, it has "
+            "the posterior of idata must have the dimensions chain and draw, got "
             f"{sorted(map(str, posterior.dims))}: select one chain as isel(chain=[0])"
         )
     return posterior
 
 
 def noise_was_moved(idata: xr.DataTree) -> bool:
-    """Whether a chain moved the noise of its estimates, so that no seed gives them again."""
+    """Whether the chain moved the noise of its estimates, so that no seed reproduces them."""
     return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
 
 
@@ -59,8 +59,8 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
     missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
     if missing:
         raise DataMismatchError(
-            f"idata has no draws of {missing}, free variables of the model; "
-            f"its posterior holds {sorted(map(str, posterior.data_vars))}"
+            f"idata must have draws of {missing}, free variables of the model, got "
+            f"{sorted(map(str, posterior.data_vars))}"
         )
     n_chains, n_draws = posterior.sizes["chain"], posterior.sizes["draw"]
     if n_draws < MIN_DRAWS:
@@ -72,9 +72,9 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
         expected = tuple(int(length) for length in shapes[rv.name])
         if drawn != expected:
             raise DataMismatchError(
-                f"{rv.name!r} has shape {expected} in the model and {drawn} in idata"
+                f"{rv.name!r} in idata must have the model's shape {expected}, got {drawn}"
             )
-    # One call for all draws: not worth machine code.
+    # A single call for all draws does not repay compilation to machine code.
     unconstrained = unconstrain_values(
         posterior, model=model, compile_kwargs={"mode": "FAST_COMPILE"}
     )
@@ -86,7 +86,8 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
     outside = int((~np.isfinite(draws).all(axis=-1)).sum())
     if outside:
         raise DataMismatchError(
-            f"{outside} of {n_chains * n_draws} draws lie on or outside the support of the model's "
-            "free variables: idata belongs to another model"
+            "draws in idata must lie inside the support of the model's free variables, got "
+            f"{outside} of {n_chains * n_draws} draws outside or on its boundary: idata belongs to "
+            "another model"
         )
     return draws

@@ -1,4 +1,4 @@
-"""What the states along a record are, as graphs of a model's variables."""
+"""Graphs of the states of StateSpace variables, as functions of a model's variables."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,15 +8,15 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.evaluation.log_likelihood import check_kinds
 from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
+from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 class StateSpaceVariable(NamedTuple):
-    """One variable of a model: its equations, its filter, and the symbols of its record.
+    """One variable of a model: its system, its filter, and the symbols of its record.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class StateSpaceVariable(NamedTuple):
     dims : tuple of str
         Names of its dimensions, time and observable.
     theta, steps, inputs, t0, seed : TensorVariable
-        As a likelihood takes them; theta and inputs may depend on the free variables.
+        Inputs of the likelihood; theta and inputs may depend on the free variables.
     observed : TensorVariable
         The data.
     """
@@ -62,15 +62,15 @@ def smoothing_method(variable: StateSpaceVariable) -> str:
 
 
 def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpaceVariable:
-    """The same record read by another filter."""
-    check_kinds(variable.system, filter)
+    """The same variable with another filter."""
+    check_system_and_filter(variable.system, filter)
     return variable._replace(filter=check_states_filter(filter))
 
 
 def states_of(
     variable: StateSpaceVariable, moment: str, rows: Variable, draw_seed: Variable
 ) -> Sequence[TensorVariable]:
-    """Mean, sd and a draw of the state at steps `rows`, effective number, health."""
+    """Mean, sd and a draw of the state at steps `rows`, effective sample size and health."""
     check_states_filter(variable.filter)
     record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
     operation = States(variable.system, variable.filter, moment)

@@ -1,91 +1,159 @@
-"""What the evidence needs to know of the integration steps in a model."""
+"""Whether a model's integration steps are stable, and its log-density with steps half as long."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor
+import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
-from pytensor.graph.replace import clone_replace
+from pytensor.graph.replace import clone_replace, vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import EKF, Filter
+from pymc_statespace_filters.filters.ekf import EKF
+from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
-from pymc_statespace_filters.pymc_model.overshoot import smallest_multiplier
-from pymc_statespace_filters.system.integrators import EulerMaruyama
 from pymc_statespace_filters.system.model import StateSpaceModel
+
+MAX_STEPS = 500
+STEPS_PER_JACOBIAN = 10
 
 Array = NDArray[np.float64]
 
 
 def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable] | None:
-    """A model's log-density by its Euler-Maruyama steps, and by steps half as long.
+    """A model's log-density with its integration steps, and with steps half as long.
 
-    Both by deterministic filters, the EKF where it can treat the system, else the variable's own.
-    None if no variable has such steps, or if one has no deterministic filter.
+    Both use deterministic filters: the EKF where it can treat the system, else the variable's own.
+    None if no variable has an integrator, or if one has no deterministic filter.
     """
     log_density = model.logp()
-    by_steps: list[dict[Variable, Variable]] = [{}, {}]
+    coarse: dict[Variable, Variable] = {}
+    fine: dict[Variable, Variable] = {}
     nodes = likelihood_nodes([log_density])
-    if not any(_has_steps(node) for node in nodes):
+    if not any(node.op.system.integrator for node in nodes):
         return None
     for node in nodes:
         system = refined = node.op.system
-        if _has_steps(node):
-            integrator = system.integrator
-            refined = system.with_integrator(replace(integrator, substeps=2 * integrator.substeps))
+        if system.integrator is not None:
+            refined = system.with_integrator(system.integrator.refined())
         filter = _deterministic_filter(system, refined, node.op.filter)
         if filter is None:
             return None
-        for replaced, of in zip(by_steps, (system, refined), strict=True):
-            outputs = LogLikelihood(of, filter)(*node.inputs)
+        for replaced, version in ((coarse, system), (fine, refined)):
+            outputs = LogLikelihood(version, filter)(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
-    coarse, fine = (clone_replace(log_density, replaced) for replaced in by_steps)
-    return coarse, fine
+    return clone_replace(log_density, coarse), clone_replace(log_density, fine)
 
 
-def step_multipliers(model: pm.Model) -> Callable[[Array], Array] | None:
-    """By which the steps of a model's integrators multiply a small deviation, at worst.
+def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | None:
+    """Whether the steps of all integrators in a model are stable along the path without noise.
 
-    The function takes points of the joined value variables (m, k) and gives numbers (m,), see
-    `overshoot.smallest_multiplier`; the smallest of all variables with Euler-Maruyama steps. None
-    if there are no such variables.
+    The returned function takes points of the joined value variables, shape (m, k), and returns
+    booleans of shape (m,). None if no variable has an integrator.
     """
-    nodes = [node for node in likelihood_nodes([model.logp()]) if _has_steps(node)]
+    nodes = [n for n in likelihood_nodes([model.logp()]) if n.op.system.integrator is not None]
     if not nodes:
         return None
     values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    asked = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]  # without data and seed
-    outputs, joined = join_nonshared_inputs(model.initial_point(), asked, values)
+    # theta, steps, inputs and t0, but not data and seed.
+    needed = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]
+    outputs, joined = join_nonshared_inputs(model.initial_point(), needed, values)
     record = compile_pymc([joined], outputs, mode="FAST_COMPILE")
 
-    def multipliers(x: Array) -> Array:
+    def is_stable(x: Array) -> NDArray[np.bool_]:
         columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]
-        found = [
-            smallest_multiplier(node.op.system, *columns[4 * i : 4 * i + 4])
-            for i, node in enumerate(nodes)
-        ]
-        return np.stack(found).min(axis=0)
+        stable = np.ones(len(x), dtype=bool)
+        for i, node in enumerate(nodes):
+            system = node.op.system
+            eigenvalues = path_eigenvalues(system, *columns[4 * i : 4 * i + 4])
+            stable &= system.integrator.is_stable_at(eigenvalues).all(axis=1)
+        return stable
 
-    return multipliers
+    return is_stable
 
 
-def _has_steps(node: Any) -> bool:
-    return isinstance(node.op.system.integrator, EulerMaruyama)
+def path_eigenvalues(
+    system: StateSpaceModel, theta: Array, steps: Array, inputs: Array, t0: Array
+) -> NDArray[np.complex128]:
+    """Eigenvalues of the Jacobian of a substep, along the path without noise.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+        With an integrator.
+    theta : ndarray (m, n_theta)
+    steps : ndarray (m, J)
+    inputs : ndarray (m, rows, n_inputs)
+    t0 : ndarray (m,)
+        Inputs of the likelihood, at m points. The path starts from the initial mean.
+
+    Returns
+    -------
+    ndarray (m, K, n)
+        At K states of the path; NaN where the Jacobian is not finite.
+    """
+    assert system.integrator is not None
+    single = system.with_integrator(system.integrator.substep())
+    length, substeps = single.dt, round(system.dt / single.dt)
+    start, advance, jacobian = _compile_path(single)
+    if inputs.shape[1] == 0:  # a system without inputs
+        inputs = np.zeros((len(theta), 1, system.n_inputs))
+    x = start(theta)
+    eigenvalues = []
+    n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
+    with np.errstate(all="ignore"):
+        for k in range(n_steps + 1):
+            now = theta, x, inputs[:, min(k // substeps, inputs.shape[1] - 1)], t0 + k * length
+            if k % STEPS_PER_JACOBIAN == 0 or k == n_steps:
+                eigenvalues.append(_eigenvalues(jacobian(*now)))
+            x = advance(*now)
+    return np.stack(eigenvalues, axis=1)
+
+
+def _eigenvalues(jacobians: Array) -> NDArray[np.complex128]:
+    found = np.full(jacobians.shape[:2], np.nan, dtype=complex)
+    finite = np.isfinite(jacobians).all(axis=(1, 2))
+    found[finite] = np.linalg.eigvals(jacobians[finite])
+    return found
+
+
+def _compile_path(system: StateSpaceModel) -> list[Callable]:
+    """Initial mean, next state and Jacobian of the step, each for many points at once."""
+    symbols = symbols_of(system)
+    theta, now = symbols["theta"], [symbols[name] for name in ("theta", "x", "u", "t")]
+    values = dict(zip(("theta", "x", "u", "t"), now, strict=True))
+    advanced = call(system.equations.transition, system, values)
+    start = call(system.equations.initial_mean, system, {"theta": theta})
+    graphs = [([theta], start), (now, advanced), (now, jacobian_of(advanced, values["x"]))]
+    compiled = []
+    for arguments, output in graphs:
+        batches = [pt.tensor(shape=(None, *a.type.shape), dtype="float64") for a in arguments]
+        vectorised = vectorize_graph(output, dict(zip(arguments, batches, strict=True)))
+        # A constant output, such as an initial mean given as numbers, has no batch axis yet.
+        if vectorised.type.ndim == output.type.ndim:
+            vectorised = vectorised + pt.zeros((batches[0].shape[0],) + (1,) * output.type.ndim)
+        # Called a few thousand times: machine code would take longer to compile than it saves.
+        compiled.append(
+            pytensor.function(batches, vectorised, mode="FAST_COMPILE", on_unused_input="ignore")
+        )
+    return compiled
 
 
 def _deterministic_filter(
-    system: StateSpaceModel, refined: StateSpaceModel, own: Filter
+    system: StateSpaceModel, refined: StateSpaceModel, filter_of_variable: Filter
 ) -> Filter | None:
-    """A filter that gives a number for both systems, whatever the seed."""
-    for filter in (EKF(), own):
+    """A deterministic filter that can treat both systems."""
+    candidates: tuple[Any, ...] = (EKF(), filter_of_variable)
+    for filter in candidates:
         try:
             filter.check(compile_system(system))
             filter.check(compile_system(refined))

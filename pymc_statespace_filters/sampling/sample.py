@@ -14,7 +14,8 @@ from pymc_statespace_filters.sampling.checkpoint.checkpoint import subfolder
 from pymc_statespace_filters.sampling.run.driver import How, sample_models
 from pymc_statespace_filters.sampling.run.model_task import Asked
 from pymc_statespace_filters.sampling.run.warm_start import with_head_start
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings, is_count
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.system.checks import is_integer
 
 
 @overload
@@ -248,7 +249,7 @@ def _asked(
 ) -> Asked:
     """Check what is asked for, apart from the model."""
     for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
-        if not is_count(value) or value < least:
+        if not is_integer(value) or value < least:
             raise ModelError(f"{name}={value!r}: expected an integer, at least {least}")
     if draws + tune * keeps_warmup == 0:
         raise ModelError(
@@ -275,7 +276,7 @@ def _entropy(random_seed: object) -> list[int]:
         return np.random.SeedSequence().generate_state(4).tolist()
     if isinstance(random_seed, np.random.Generator):
         return random_seed.integers(2**32, size=4).tolist()
-    if not is_count(random_seed) or random_seed < 0:
+    if not is_integer(random_seed) or random_seed < 0:
         raise ModelError(
             f"random_seed={random_seed!r}: expected None, a non-negative integer or a Generator"
         )

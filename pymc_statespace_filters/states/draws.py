@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
-from pymc_statespace_filters.system.record import is_whole
+from pymc_statespace_filters.system.checks import is_integer
 
 SAMPLE_DIMS = ("chain", "draw")
 
@@ -76,7 +76,7 @@ def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
         raise ModelError("the posterior of idata has no draws")
     stats = _of_the_same_draws(stats, posterior)
     if n_draws is not None:
-        if not is_whole(n_draws) or not 1 <= n_draws <= n_chains * length:
+        if not is_integer(n_draws) or not 1 <= n_draws <= n_chains * length:
             raise ModelError(
                 f"n_draws must be an integer from 1 to {n_chains * length}, the draws that there "
                 f"are, or None for all of them; got {n_draws!r}"

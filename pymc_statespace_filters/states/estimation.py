@@ -11,7 +11,8 @@ from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, 
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.groups import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
-from pymc_statespace_filters.system.record import check_at, check_random_seed, rows_at
+from pymc_statespace_filters.system.checks import check_random_seed
+from pymc_statespace_filters.system.record import check_at, rows_at
 
 
 def filtered_states(

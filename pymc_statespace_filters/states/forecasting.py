@@ -15,10 +15,9 @@ from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import draws_of
 from pymc_statespace_filters.states.groups import state_dims, with_group
 from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.system.checks import check_random_seed, is_integer
 from pymc_statespace_filters.system.record import (
     check_inputs,
-    check_random_seed,
-    is_whole,
     n_input_rows,
     steps_of,
 )
@@ -138,7 +137,7 @@ def _future(
     if sum(given is not None for given in (n_steps, steps, times)) != 1:
         raise ModelError("give exactly one of n_steps, steps and times")
     if n_steps is not None:
-        if not is_whole(n_steps) or n_steps < 1:
+        if not is_integer(n_steps) or n_steps < 1:
             raise ModelError(f"n_steps must be an integer of at least 1, got {n_steps!r}")
         return np.arange(last + 1, last + 1 + n_steps)
     future = steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)

@@ -1,4 +1,4 @@
-"""Reading what a user wrote: the arguments of a function, and the symbols that it returns."""
+"""Functions that a user wrote: their signatures, and checks of the symbols that they return."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +12,7 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import shortened
 
 RESERVED = {
     "x": "the state",
@@ -24,7 +25,7 @@ RESERVED = {
 
 @dataclass(frozen=True)
 class Equation:
-    """A function of the user and what its signature asks for."""
+    """A user's function: its reserved arguments (``symbols``), parameters and defaults."""
 
     role: str
     function: Callable
@@ -33,7 +34,7 @@ class Equation:
     defaults: tuple[tuple[str, Any], ...]
 
     def __call__(self, values: Mapping[str, Variable]) -> Any:
-        """Call the function with the symbols and parameters that it asks for, by name."""
+        """Call the function with the symbols and parameters that are its arguments, by name."""
         arguments = {name: values[name] for name in (*self.symbols, *self.parameters)}
         try:
             return self.function(**arguments)
@@ -43,12 +44,21 @@ class Equation:
             raise ModelError(
                 f"{self.role} could not be traced with symbolic arguments "
                 f"({', '.join(arguments)}): {type(error).__name__}: {error}. Write it with "
-                f"pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or `if`."
+                f"pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or if"
             ) from error
 
 
 def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
-    """Check a user's function; ``symbols`` are the reserved names that it may ask for."""
+    """Read the signature of a user's function.
+
+    Parameters
+    ----------
+    role : str
+        The function's name in messages.
+    function : callable
+    symbols : sequence of str
+        The reserved names that it may have as arguments; other arguments are parameters.
+    """
     if not callable(function):
         raise ModelError(f"{role} must be a function, got {function!r}")
     found: list[str] = []
@@ -56,19 +66,22 @@ def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
     defaults: list[tuple[str, Any]] = []
     for name, argument in _signature(role, function).items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
-            raise ModelError(f"{role}: argument {argument} is not a plain named argument")
+            raise ModelError(f"{role} must have named arguments only, got {argument}")
         if name in symbols:
             found.append(name)
         elif name in RESERVED:
             raise ModelError(
-                f"{role}: the argument name {name!r} is reserved for {RESERVED[name]}, which "
-                f"{role} does not have (it may ask for: {', '.join(symbols) or 'parameters only'})"
+                f"{role}: the argument name {name!r} is reserved for {RESERVED[name]}; besides "
+                f"parameters, {role} may have {', '.join(symbols) or 'no arguments'}"
             )
         else:
             parameters.append(name)
         if argument.default is not argument.empty:
             if name in symbols:
-                raise ModelError(f"{role}: the reserved argument {name!r} takes no default")
+                raise ModelError(
+                    f"{role}: the reserved argument {name!r} must have no default, got "
+                    f"{argument.default!r}"
+                )
             defaults.append((name, _default(role, name, argument.default)))
     return Equation(role, function, tuple(found), tuple(parameters), tuple(defaults))
 
@@ -78,8 +91,7 @@ def _signature(role: str, function: Callable) -> Mapping[str, inspect.Parameter]
         return inspect.signature(function).parameters
     except (TypeError, ValueError):  # built-in functions may have none
         raise ModelError(
-            f"{role}: {function!r} does not tell the names of its arguments; wrap it in a "
-            f"function of your own"
+            f"{role} must have a readable signature, got {function!r}; wrap it in a Python function"
         ) from None
 
 
@@ -105,25 +117,25 @@ def as_symbol(role: str, value: Any) -> TensorVariable:
         if not parts:
             return pt.as_tensor(np.zeros(0))
         if len({part.type.ndim for part in parts}) > 1:
-            raise ModelError(f"{role} returns a list whose entries differ in shape")
+            raise ModelError(f"{role} must return entries of one shape, got several")
         return pt.stack(parts) if all(p.type.ndim for p in parts) else _vector_of(parts)
     if isinstance(value, Variable):
         symbol = value if isinstance(value, TensorVariable) else pt.as_tensor(value)
         if symbol.type.dtype.startswith("complex"):
-            raise ModelError(f"{role} returns complex numbers; states and observations are real")
+            raise ModelError(f"{role} must return real numbers, got {symbol.type.dtype}")
         return symbol if symbol.type.dtype == "float64" else pt.cast(symbol, "float64")
     if value is None:
-        raise ModelError(f"{role} returns None; return one expression per component")
+        raise ModelError(f"{role} must return one expression per component, got None")
     if isinstance(value, np.ndarray) and value.dtype == object:
         raise ModelError(
-            f"{role} returns a numpy array of symbols, {_short(value)}: numpy does not see into "
-            f"symbols. Return a list, and use pytensor.tensor (pt.roll, pt.stack, @) for arrays"
+            f"{role} must return a list or a symbol, got a numpy array of symbols: "
+            f"{shortened(value)}. Use pytensor.tensor (pt.roll, pt.stack, @) instead of numpy"
         )
     try:
         # A 64-bit array: PyTensor would store a bare 0.5 in single precision.
         return pt.as_tensor(np.asarray(value, dtype="float64"))
     except (TypeError, ValueError):
-        raise ModelError(f"{role} returns {value!r}, which is neither symbol nor number") from None
+        raise ModelError(f"{role} must return symbols or numbers, got {value!r}") from None
 
 
 def _vector_of(parts: Sequence[TensorVariable]) -> TensorVariable:
@@ -131,7 +143,7 @@ def _vector_of(parts: Sequence[TensorVariable]) -> TensorVariable:
 
 
 def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariable:
-    """One expression per component; ``length`` None takes what comes."""
+    """What a function returned as a vector, of the given length unless it is None."""
     symbol = as_symbol(role, value)
     if symbol.type.ndim != 1:
         raise ModelError(
@@ -144,7 +156,7 @@ def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariabl
 def as_matrix(
     role: str, value: Any, rows: int | None = None, columns: int | None = None
 ) -> TensorVariable:
-    """A matrix, of the given numbers of rows and columns where they are given."""
+    """What a function returned as a matrix, of the given numbers of rows and columns."""
     symbol = as_symbol(role, value)
     if symbol.type.ndim != 2:
         raise ModelError(
@@ -158,7 +170,7 @@ def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]
     shape = _static_shape(symbol)
     if None in shape:
         if None in expected:
-            raise ModelError(f"{role}: the shape of what it returns is not known before it runs")
+            raise ModelError(f"{role} must return arrays of static shape, got shape {shape}")
         return pt.specify_shape(symbol, tuple(expected))
     wanted = tuple(s if e is None else e for e, s in zip(expected, shape, strict=True))
     if shape != wanted:
@@ -167,21 +179,13 @@ def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]
 
 
 def _static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
-    """The shape as far as it is known; some operations (pt.roll) only compute it."""
+    """The static shape, which some operations (pt.roll) do not infer by themselves."""
     if None not in symbol.type.shape:
         return symbol.type.shape
     lengths = constant_fold(
         [symbol.shape[i] for i in range(symbol.type.ndim)], raise_not_constant=False
     )
     return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
-
-
-def positive(name: str, value: Any) -> float:
-    """A positive number, such as a length of time."""
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not np.isfinite(value) or value <= 0:
-        raise ModelError(f"{name} must be a positive number, got {value!r}")
-    return float(value)
 
 
 def constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
@@ -202,17 +206,12 @@ def constant_covariance(role: str, value: Any, size: int | None, *, definite: bo
     smallest = np.linalg.eigvalsh(matrix).min(initial=np.inf)
     if smallest < -1e-10 * scale:
         raise ModelError(
-            f"{role} must not be negative: it has the eigenvalue {smallest:.6g} "
-            f"(it is a covariance, not a standard deviation: {matrix.tolist()})"
+            f"{role} must be a covariance (not a standard deviation) without negative eigenvalues, "
+            f"got {matrix.tolist()} with the eigenvalue {smallest:.6g}"
         )
     if definite and smallest <= 0:
         raise ModelError(
-            f"{role} must be positive definite, its smallest eigenvalue is {smallest:.6g}: "
-            f"every observed component needs noise of its own ({matrix.tolist()})"
+            f"{role} must be positive definite (every observable needs noise), got "
+            f"{matrix.tolist()} with the smallest eigenvalue {smallest:.6g}"
         )
     return matrix
-
-
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else text[:77] + "..."

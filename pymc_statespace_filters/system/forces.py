@@ -1,7 +1,7 @@
 """Restoring forces of worn and ageing structures (thesis, Section 5.3.1).
 
-The three forces are sums of one shape, the ramp ``max(z, 0)``. With `width` its kink becomes a
-polynomial bend, and every force that is built of ramps is smooth in the displacement.
+Freeplay and hysteresis are sums of ramps ``max(z, 0)``. With `width` the kink of a ramp becomes a
+polynomial bend, which makes these forces smooth in the displacement.
 """
 
 from typing import Any
@@ -73,10 +73,10 @@ def freeplay(
     delta_f : tensor_like
         Half the gap, not negative.
     width : float, optional
-        Length over which each of the two kinks is bent, centred on the kink. Farther than
-        ``width / 2`` from a kink the force is unchanged; nowhere is it off by more than
-        ``3 / 32 * k_f * width``. It has two continuous derivatives, so that a likelihood which
-        uses its Jacobian is differentiable. None keeps the kinks.
+        Length over which each of the two kinks is smoothed, centred on the kink. Farther than
+        ``width / 2`` from a kink the force is exact; the error is at most
+        ``3 / 32 * k_f * width``. The smoothed force has two continuous derivatives, so a
+        likelihood that uses its Jacobian is differentiable. None keeps the kinks.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def freeplay(
     >>> psf.freeplay([-0.5, 0.1, 0.5], k_f=2.0, delta_f=0.2).eval()
     array([-0.6, 0. , 0.6])
     """
-    z, width = _real(z), _checked(width)
+    z, width = _real(z), _check_width(width)
     return k_f * (_ramp(z - delta_f, width) - _ramp(-z - delta_f, width))
 
 
@@ -111,7 +111,7 @@ def hysteresis(
     *,
     width: float | None = None,
 ) -> TensorVariable:
-    r"""Force that takes one branch on the way up and another on the way down.
+    r"""Force of a hysteretic spring: one branch for rising, another for falling displacement.
 
     With :math:`f_0 = k_h (2 a_h + \delta_h) / 2` the rising branch, :math:`v \ge 0`, is
 
@@ -123,8 +123,8 @@ def hysteresis(
 
     and the falling branch, :math:`v < 0`, is its mirror image, :math:`-f_h(-z)`. Beyond
     :math:`|z| = a_h + \delta_h` both are the line :math:`k_h (z - \delta_h / 2)` for positive and
-    :math:`k_h (z + \delta_h / 2)` for negative `z`. A full cycle takes the energy
-    :math:`2 f_0 \delta_h` out of the motion.
+    :math:`k_h (z + \delta_h / 2)` for negative `z`. A full cycle dissipates the energy
+    :math:`2 f_0 \delta_h`.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def hysteresis(
     k_h : tensor_like
         Stiffness outside the plateaus.
     a_h, delta_h : tensor_like
-        Where a plateau begins and how long it is, neither of them negative.
+        Start and length of a plateau, not negative.
     width : float, optional
-        Length over which each kink in `z` is bent, as in :func:`freeplay`; the force is off by at
-        most ``3 / 32 * k_h * width``. The jump between the branches at ``v = 0``, of height up to
-        ``k_h * delta_h``, stays: no distance says how fast a velocity should be blended. The
-        derivative with respect to `v` is therefore zero wherever it exists. None keeps the kinks.
+        Length over which each kink in `z` is smoothed, as in :func:`freeplay`; the error is at most
+        ``3 / 32 * k_h * width``. The jump between the branches at ``v = 0``, of height up to
+        ``k_h * delta_h``, is not smoothed, because `width` is a displacement and not a velocity.
+        The derivative by `v` is therefore zero wherever it exists. None keeps the kinks.
 
     Returns
     -------
@@ -152,11 +152,11 @@ def hysteresis(
 
     Notes
     -----
-    The rule has no memory: the branch follows from the sign of the velocity alone. Between the
-    plateaus, ``abs(z) < a_h``, it is a spring with dry friction of strength ``k_h * delta_h / 2``,
-    which holds the mass in place if the other forces are weaker than that. For a force that keeps
-    its branch when the motion turns inside the loop, give as `v` what :func:`hysteresis_branch`
-    returns: only the sign counts.
+    The force has no memory: the branch depends on the sign of the velocity alone. Between the
+    plateaus, ``abs(z) < a_h``, the force is that of a spring with dry friction of strength
+    ``k_h * delta_h / 2``, which holds the mass in place if the other forces are weaker. For a force
+    that keeps its branch when the motion turns inside the loop, pass the branch from
+    :func:`hysteresis_branch` as `v`: only the sign counts.
 
     *Differences from the source.* "Positive deflection" is read as positive velocity: with the sign
     of the displacement there would be no loop. A velocity of exactly zero is on the rising branch.
@@ -171,7 +171,7 @@ def hysteresis(
     >>> psf.hysteresis(0.0, [1.0, -1.0], k_h=1.0, a_h=0.5, delta_h=1.5).eval()
     array([ 0.75, -0.75])
     """
-    z, v, width = _real(z), _real(v), _checked(width)
+    z, v, width = _real(z), _real(v), _check_width(width)
     f_0 = k_h * (2 * a_h + delta_h) / 2
 
     def rising(z: TensorVariable) -> TensorVariable:
@@ -183,7 +183,7 @@ def hysteresis(
 def hysteresis_branch(
     z: Tensorlike, branch: Tensorlike, a_h: Coefficient, delta_h: Coefficient
 ) -> TensorVariable:
-    r"""Branch of a hysteresis that remembers: it is left at the ends of the loop alone.
+    r"""Branch of a hysteresis with memory, which changes only at the ends of the loop.
 
     .. math::
 
@@ -191,29 +191,29 @@ def hysteresis_branch(
                             +1 & z \le -(a_h + \delta_h) \\
                             b & \text{between} \end{cases}
 
-    Beyond the ends both branches are one line, so the force, ``hysteresis(z, b, ...)``, is
-    continuous: a motion that turns inside the loop goes back the way it came, and has no friction.
+    Beyond the ends both branches are the same line, so the force ``hysteresis(z, b, ...)`` is
+    continuous. A motion that turns inside the loop returns along its branch, without friction.
 
     Parameters
     ----------
     z : tensor_like
         Displacement.
     branch : tensor_like
-        The branch until now: 1 is the one of the way up, -1 that of the way down.
+        The current branch: 1 is the rising one, -1 the falling one.
     a_h, delta_h : tensor_like
-        Where a plateau begins and how long it is, as in :func:`hysteresis`.
+        Start and length of a plateau, as in :func:`hysteresis`.
 
     Returns
     -------
     TensorVariable
-        The branch from here on, of the broadcast shape of the arguments.
+        The new branch, of the broadcast shape of the arguments.
 
     Notes
     -----
-    In a `StateSpaceModel` the branch is a state of its own, named in ``carried``: no Kalman update
-    may move it. `EKF` and `GridFilter` refuse such a system.
+    In a `StateSpaceModel` the branch is a separate state, named in ``carried`` because no Kalman
+    update may change it. `EKF` and `GridFilter` refuse such a system.
 
-    *Difference from the source.* Thesis, Eqs. 5.22 and 5.23 do not say when a branch is left.
+    *Difference from the source.* Thesis, Eqs. 5.22 and 5.23 do not say when the branch changes.
 
     Examples
     --------
@@ -235,11 +235,11 @@ def _ramp(z: TensorVariable, width: float | None) -> TensorVariable:
 
 
 def _real(value: Tensorlike) -> TensorVariable:
-    """Make a symbolic value of PyTensor's floating type: small integers overflow in a power."""
+    """Cast to PyTensor's float type, because powers of small integer types overflow."""
     return pt.cast(pt.as_tensor_variable(value), config.floatX)
 
 
-def _checked(width: Any) -> float | None:
+def _check_width(width: Any) -> float | None:
     if width is None or (isinstance(width, int | float) and 0 < width < np.inf):
         return width
-    raise ModelError(f"width must be a positive, finite number or None; got {width!r}")
+    raise ModelError(f"width must be a positive, finite number or None, got {width!r}")

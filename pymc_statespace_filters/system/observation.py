@@ -1,4 +1,4 @@
-"""How a state is seen: a function with noise, PyMC distributions, or a log-density."""
+"""The observation of a state: a function with noise, PyMC distributions, or a log-density."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ Values = Mapping[str, TensorVariable]
 
 
 @dataclass(frozen=True)
-class Observation:
-    """The traced observation: symbols for its noise and its datum, and graphs of them."""
+class TracedObservation:
+    """A traced observation: symbols of its noise and of an observation, and expressions of them."""
 
     noise: TensorVariable
     datum: TensorVariable
@@ -41,11 +41,11 @@ class Observation:
 
     @property
     def gaussian(self) -> bool:
-        """Whether Kalman updates have a meaning: an observation function with Gaussian noise."""
+        """Whether the density is that of a function with Gaussian noise, as Kalman updates need."""
         return self.logp is None
 
     def freeze_draw(self, symbols: Sequence[Variable]) -> FrozenFunctionGraph | None:
-        """The simulation of a datum, with its random generators as further inputs."""
+        """The graph that simulates an observation, with its random generators as more inputs."""
         if self.draw is None:
             return None
         generators = [
@@ -61,22 +61,26 @@ def read_observation(
     observation_noise: Any,
     observation_dist: Callable | None,
     observation_logp: Callable | None,
-) -> "_GaussianObservation | _DensityObservation":
-    """Check which of the three forms was given; exactly one density must result."""
+) -> "GaussianObservation | DensityObservation":
+    """Read the observation in one of its three forms; each gives exactly one density."""
     if observation_dist is not None and (observation is not None or observation_logp is not None):
         raise ModelError(
-            "observation_dist replaces observation and observation_logp; give it alone"
+            "observation_dist must be given without observation and observation_logp, got both"
         )
     if observation_dist is None and observation_logp is None:
         if observation is None:
-            raise ModelError("give observation, observation_dist or observation_logp")
+            raise ModelError("give one of observation, observation_dist and observation_logp")
         if observation_noise is None:
-            raise ModelError("observation needs observation_noise, the covariance of its noise")
-        return _GaussianObservation(observation, observation_noise)
-    return _DensityObservation(observation, observation_noise, observation_dist, observation_logp)
+            raise ModelError(
+                "observation_noise must be the covariance of the observation, got None"
+            )
+        return GaussianObservation(observation, observation_noise)
+    return DensityObservation(observation, observation_noise, observation_dist, observation_logp)
 
 
-class _GaussianObservation:
+class GaussianObservation:
+    """An observation function with Gaussian noise, additive or inside the function."""
+
     def __init__(self, observation: Callable, covariance: Any) -> None:
         self.observation = read_equation("observation", observation, "xeut")
         self.covariance = (
@@ -87,10 +91,12 @@ class _GaussianObservation:
 
     @property
     def equations(self) -> tuple[Equation, ...]:
+        """The function, and the covariance if it is one."""
         functions = (self.observation, self.covariance)
         return tuple(f for f in functions if isinstance(f, Equation))
 
-    def trace(self, values: Values, n_observables: int | None) -> Observation:
+    def trace(self, values: Values, n_observables: int | None) -> TracedObservation:
+        """Call the functions with symbols."""
         additive = "e" not in self.observation.symbols
         p = r = None
         if additive:
@@ -105,9 +111,9 @@ class _GaussianObservation:
             seen = as_vector("observation", self.observation(with_noise), n_observables)
             p = seen.type.shape[0]
         if p == 0:
-            raise ModelError("observation returns nothing: at least one observable is needed")
+            raise ModelError("observation must return at least one expression, got none")
         datum = pt.tensor("d", shape=(p,), dtype="float64")
-        return Observation(noise, datum, seen, cov, additive=additive)
+        return TracedObservation(noise, datum, seen, cov, additive=additive)
 
     def _trace_covariance(
         self, values: Values, size: int | None, *, definite: bool
@@ -118,8 +124,8 @@ class _GaussianObservation:
         return pt.as_tensor(constant_covariance(role, self.covariance, size, definite=definite))
 
 
-class _DensityObservation:
-    """Distributions, or a log-density with (for simulation only) an observation function."""
+class DensityObservation:
+    """Distributions, or a log-density with an observation function used in simulations only."""
 
     def __init__(
         self,
@@ -130,26 +136,31 @@ class _DensityObservation:
     ) -> None:
         if observation is None and observation_noise is not None:
             raise ModelError(
-                "observation_noise has no observation to belong to: a density brings its own noise"
+                "observation_noise must be None without an observation function, got "
+                f"{observation_noise!r}"
             )
         if observation is not None and observation_noise is None:
-            raise ModelError("observation needs observation_noise, the covariance of its noise")
+            raise ModelError(
+                "observation_noise must be the covariance of the observation, got None"
+            )
         self.simulated = (
-            None if observation is None else _GaussianObservation(observation, observation_noise)
+            None if observation is None else GaussianObservation(observation, observation_noise)
         )
         self.dist = None if dist is None else read_equation("observation_dist", dist, "xut")
         self.logp = None
         if logp is not None:
             self.logp = read_equation("observation_logp", logp, ("d", *"xut"))
             if "d" not in self.logp.symbols:
-                raise ModelError("observation_logp must ask for d, the observation")
+                raise ModelError("observation_logp must have the argument d, the observation")
 
     @property
     def equations(self) -> tuple[Equation, ...]:
-        own = tuple(f for f in (self.dist, self.logp) if f is not None)
-        return own if self.simulated is None else own + self.simulated.equations
+        """The density, then what only a simulation uses."""
+        density = tuple(f for f in (self.dist, self.logp) if f is not None)
+        return density if self.simulated is None else density + self.simulated.equations
 
-    def trace(self, values: Values, n_observables: int | None) -> Observation:
+    def trace(self, values: Values, n_observables: int | None) -> TracedObservation:
+        """Call the functions with symbols."""
         if self.dist is not None:
             return _trace_distributions(self.dist, values, n_observables)
         assert self.logp is not None
@@ -165,22 +176,24 @@ class _DensityObservation:
             raise ModelError(
                 f"observation_logp must return one number, got {logp.type.ndim} dimensions"
             )
-        return Observation(
+        return TracedObservation(
             noise, datum, seen and seen.observation, seen and seen.covariance, logp=logp
         )
 
 
-def _trace_distributions(dist: Equation, values: Values, n_observables: int | None) -> Observation:
+def _trace_distributions(
+    dist: Equation, values: Values, n_observables: int | None
+) -> TracedObservation:
     returned = dist(values)
     variables = list(returned) if isinstance(returned, list | tuple) else [returned]
     if n_observables is not None and len(variables) != n_observables:
         raise ModelError(
-            f"observation_dist returns {len(variables)} distributions "
-            f"for {n_observables} observables"
+            f"observation_dist must return {n_observables} distributions, one per observable, got "
+            f"{len(variables)}"
         )
     datum = pt.tensor("d", shape=(len(variables),), dtype="float64")
     terms = [_log_density(variable, datum[i]) for i, variable in enumerate(variables)]
-    return Observation(
+    return TracedObservation(
         noise=pt.tensor("e", shape=(0,), dtype="float64"),
         datum=datum,
         # A partly missing row counts as missing.
@@ -196,12 +209,15 @@ def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
             f"([pm.Poisson.dist(mu=...)]), got {variable!r}"
         )
     if variable.owner is None:
-        raise ModelError(f"observation_dist returns {variable}, which is not a distribution")
+        raise ModelError(f"observation_dist must return distributions, got {variable}")
     try:
         if "int" in variable.type.dtype:
-            # A count that is not whole has no probability.
+            # A value that is not an integer has probability zero.
             whole = pm.logp(variable, pt.cast(pt.round(value), variable.type.dtype))
             return pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
         return pm.logp(variable, value)
     except NotImplementedError as error:
-        raise ModelError(f"observation_dist: {variable} has no log-density: {error}") from error
+        raise ModelError(
+            f"observation_dist must return distributions with a log-density, got {variable}: "
+            f"{error}"
+        ) from error

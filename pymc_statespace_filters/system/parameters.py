@@ -1,32 +1,26 @@
-"""The flat parameter vector of a system, from numbers by name."""
+"""The flat parameter vector of a system, from values by name: numbers or symbols."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 def check_names(system: StateSpaceModel, params: Mapping[str, Any]) -> None:
-    """Raise if ``params`` holds a name that the system does not have."""
+    """Raise unless ``params`` is a mapping from names of the system's parameters."""
     if not isinstance(params, Mapping):
         raise ModelError(f"params must be a mapping from names to values, got {params!r}")
     unknown = [name for name in params if name not in system.parameters]
     if unknown:
         raise ModelError(
-            f"params names unknown parameters {unknown}; parameters are {list(system.parameters)}"
+            f"params must name parameters of the system, {list(system.parameters)}, got {unknown}"
         )
-
-
-def missing_parameters(system: StateSpaceModel, found: Mapping[str, Any]) -> ModelError:
-    """The error that lists which parameters have no value."""
-    missing = [name for name in system.parameters if name not in found]
-    return ModelError(
-        f"no value for the parameters {missing}: the system needs {list(system.parameters)}, "
-        f"found {sorted(found)}"
-    )
 
 
 def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.ndarray:
@@ -34,10 +28,10 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     check_names(system, params)
     values = dict(system.defaults) | dict(params)
     if any(name not in values for name in system.parameters):
-        raise missing_parameters(system, values)
+        raise _missing_parameters(system, values)
     parts, batches = [], []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        part = parameter_numbers(name, values[name])
+        part = _numbers(name, values[name])
         core = part.ndim - len(shape)
         if core < 0 or part.shape[core:] != shape:
             raise ModelError(
@@ -49,14 +43,47 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
         batch = np.broadcast_shapes(*batches)
     except ValueError:
         shapes = dict(zip(system.parameters, batches, strict=True))
-        raise ModelError(f"parameter arrays do not broadcast together: {shapes}") from None
+        raise ModelError(f"params must be arrays that broadcast together, got {shapes}") from None
     if not parts:
         return np.zeros((0,))
     return np.concatenate([np.broadcast_to(p, (*batch, p.shape[-1])) for p in parts], axis=-1)
 
 
-def parameter_numbers(name: str, value: Any) -> np.ndarray:
-    """A parameter's value as an array; never NaN."""
+def symbolic_parameters(system: StateSpaceModel, values: Mapping[str, Any]) -> TensorVariable:
+    """Parameter values, numbers or symbols, as a symbolic vector (k,)."""
+    if any(name not in values for name in system.parameters):
+        raise _missing_parameters(system, values)
+    parts = [
+        _symbol(name, values[name], shape).ravel()
+        for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
+    ]
+    theta = pt.concatenate(parts) if parts else pt.as_tensor(np.zeros(0))
+    return pt.specify_shape(theta, (system.n_theta,))
+
+
+def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
+    symbol: Any = value if isinstance(value, Variable) else pt.as_tensor(_numbers(name, value))
+    has_shape = symbol.type.ndim == len(shape) and all(
+        s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
+    )
+    if not has_shape:
+        raise ModelError(
+            f"parameter {name!r} must have shape {shape}, got {symbol.type.shape}"
+            f"{'' if shape else ' (declare shapes={...} in the system for an array)'}"
+        )
+    return pt.cast(symbol, "float64")
+
+
+def _missing_parameters(system: StateSpaceModel, found: Mapping[str, Any]) -> ModelError:
+    """The error that lists the parameters without a value."""
+    missing = [name for name in system.parameters if name not in found]
+    return ModelError(
+        f"params must give every parameter without a default, {list(system.parameters)}, got no "
+        f"value for the parameters {missing}, only for {sorted(found)}"
+    )
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
     try:
         array = np.asarray(value, dtype="float64")
     except (TypeError, ValueError):

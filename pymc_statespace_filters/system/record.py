@@ -1,12 +1,17 @@
-"""The record that a system is compared with: observation steps, data, inputs; checked once."""
+"""The record that a system is compared with: observation steps, data, inputs and t0.
 
-from numbers import Integral
+`checked_record` takes numbers, `symbolic_record` takes numbers or symbols.
+"""
+
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytensor.tensor as pt
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.equations import positive
+from pymc_statespace_filters.system.checks import check_finite, check_positive, shortened
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Times must lie on the grid of steps to this fraction of a step.
@@ -16,7 +21,7 @@ ROWS_AT = ("observations", "steps")
 
 
 class CheckedRecord(NamedTuple):
-    """A record as machine code reads it: steps (J,), data (J, p), inputs (rows, n), t0 ()."""
+    """A record of numbers: steps (J,), data (J, p), inputs (rows, n_inputs) and t0 ()."""
 
     steps: np.ndarray
     observed: np.ndarray
@@ -27,15 +32,76 @@ class CheckedRecord(NamedTuple):
 def checked_record(
     system: StateSpaceModel, observed: Any, *, steps: Any, times: Any, inputs: Any, t0: Any
 ) -> CheckedRecord:
-    """The record that a user gives for a system, every part of it checked."""
-    t0 = check_t0(t0)
+    """Check every part of a record of numbers."""
+    t0 = check_finite("t0", t0)
     at = steps_of(steps, times, system.dt, t0)
     data = check_observed(observed, system, at.size)
     return CheckedRecord(at, data, check_inputs(inputs, system, at), np.asarray(t0))
 
 
+class SymbolicRecord(NamedTuple):
+    """A record of numbers or symbols, with the current numbers of its steps."""
+
+    steps: Any
+    current_steps: np.ndarray
+    observed: Any
+    inputs: Any
+    t0: float
+
+
+def symbolic_record(
+    system: StateSpaceModel, observed: Any, *, steps: Any, times: Any, inputs: Any, t0: Any
+) -> SymbolicRecord:
+    """Check every part of a record as far as it is known: numbers and the values of shared data."""
+    t0 = check_finite("t0", t0)
+    if isinstance(times, Variable):
+        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+    is_symbolic = isinstance(steps, Variable)
+    current = steps_of(steps.eval() if is_symbolic else steps, times, system.dt, t0)
+    return SymbolicRecord(
+        steps if is_symbolic else current,
+        current,
+        None if observed is None else _symbolic_observed(observed, system, current),
+        _symbolic_inputs(inputs, system, current),
+        t0,
+    )
+
+
+def _symbolic_observed(observed: Any, system: StateSpaceModel, steps: np.ndarray) -> Variable:
+    if not isinstance(observed, Variable):
+        # A symbol, because PyMC would mask and impute the NaN of an array.
+        return pt.as_tensor(check_observed(observed, system, steps.size))
+    if observed.type.ndim != 2:
+        raise ModelError(
+            f"observed must have 2 dimensions (observations, observables) if it is symbolic, "
+            f"got {observed.type.ndim}"
+        )
+    if isinstance(observed, SharedVariable):
+        check_observed(observed.get_value(), system, steps.size)
+    return observed
+
+
+def _symbolic_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
+    if not isinstance(inputs, Variable):
+        return check_inputs(inputs, system, steps)
+    if isinstance(inputs, SharedVariable):
+        check_inputs(inputs.get_value(), system, steps)
+    if inputs.type.ndim == 1 and system.n_inputs == 1:
+        inputs = inputs[:, None]
+    if not system.n_inputs or inputs.type.ndim != 2:
+        raise _inputs_of_other_shape(system, inputs.type)
+    return inputs
+
+
+def _inputs_of_other_shape(system: StateSpaceModel, found: Any) -> ModelError:
+    return ModelError(
+        f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
+        f"{list(system.inputs)}, got {found}"
+    )
+
+
 def check_system(system: Any) -> None:
-    """Raise unless this is a system."""
+    """Raise unless ``system`` is a `StateSpaceModel`."""
     if not isinstance(system, StateSpaceModel):
         raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
 
@@ -44,19 +110,19 @@ def check_steps(steps: Any) -> np.ndarray:
     """Integer steps, not negative, strictly increasing."""
     array = np.asarray(steps)
     if array.size == 0:
-        raise ModelError("steps is empty: a record has at least one observation")
+        raise ModelError(f"steps must hold at least one step, got {shortened(steps)}")
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise ModelError(
-            f"steps must be a vector of integers (step numbers; real timestamps are `times`), "
-            f"got {_short(steps)}"
+            f"steps must be a vector of integers (give real timestamps as times), got "
+            f" {shortened(steps)}"
         )
     if array[0] < 0:
         raise ModelError(f"steps must not be negative, got {array[0]}")
     if (np.diff(array.astype("int64")) <= 0).any():
         at = int(np.argmax(np.diff(array.astype("int64")) <= 0))
         raise ModelError(
-            f"steps must increase strictly, but steps[{at}] = {array[at]} "
-            f"is followed by {array[at + 1]}"
+            f"steps must increase strictly, got steps[{at}] = {array[at]} "
+            f"followed by {array[at + 1]}"
         )
     return array.astype("int64")
 
@@ -99,7 +165,7 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     Raises
     ------
     ModelError
-        If two timestamps fall on one step, or one before ``t0``.
+        If two timestamps fall on one step, or one lies before ``t0``.
 
     Examples
     --------
@@ -109,28 +175,29 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     """
     if np.asarray(times).dtype.kind in "mM":
         raise ModelError(
-            "times must be numbers in the units of dt (seconds from a start), not dates"
+            f"times must be numbers in the unit of dt (seconds from a start), got dates: "
+            f"{shortened(times)}"
         )
     array = _floats("times", times, 1)
-    dt, t0 = positive("dt", dt), check_t0(t0)
+    dt, t0 = check_positive("dt", dt), check_finite("t0", t0)
     steps = np.round((array - t0) / dt)
     if (clashes := np.flatnonzero(np.diff(steps) == 0)).size:
         first, second = array[clashes[0]], array[clashes[0] + 1]
         raise ModelError(
-            f"times {first:g} and {second:g} fall on one step of dt = {dt:g}: take a smaller dt, "
-            "or one value for both"
+            f"times must fall on different steps of dt = {dt:g}, got {first:g} and {second:g}: "
+            "take a smaller dt, or merge the two observations"
         )
     return check_steps(steps.astype("int64"))
 
 
 def check_at(at: Any) -> None:
-    """Raise unless this names the steps at which states are wanted."""
+    """Raise unless ``at`` is one of `ROWS_AT`."""
     if at not in list(ROWS_AT):
         raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
 
 
 def rows_at(at: str, steps: np.ndarray) -> np.ndarray:
-    """The steps at which states are wanted: those observed, or all from 0 to the last of them."""
+    """The requested steps: the observed ones, or all from 0 to the last observed one."""
     return steps if at == "observations" else np.arange(steps[-1] + 1)
 
 
@@ -148,7 +215,10 @@ def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) 
 
 
 def n_input_rows(system: StateSpaceModel, steps: np.ndarray) -> int:
-    """How many rows of inputs a record needs: one per step, one more if it is observed too."""
+    """Number of rows of inputs that a record needs.
+
+    One per step, and one more if the observation has the argument u.
+    """
     return int(steps[-1]) + int(system.observation_uses_inputs) if steps.size else 0
 
 
@@ -157,63 +227,38 @@ def check_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.
     if inputs is None:
         if system.n_inputs:
             raise ModelError(
-                f"the system has the inputs {list(system.inputs)}; give inputs=, one row per step"
+                f"inputs must have a row per step and a column for each of {list(system.inputs)}, "
+                f"got None"
             )
         return np.zeros((0, 0))
     if not system.n_inputs:
         raise ModelError(
-            "inputs are given, but the system names none (StateSpaceModel(inputs=[...]))"
+            f"inputs must be None for a system without inputs, got {shortened(inputs)}; name them "
+            f"in the system (StateSpaceModel(inputs=[...]))"
         )
     array = _floats("inputs", inputs, None)
     if array.ndim == 1 and system.n_inputs == 1:
         array = array[:, None]
     if array.ndim != 2 or array.shape[1] != system.n_inputs:
-        raise ModelError(
-            f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
-            f"{list(system.inputs)}, got {np.shape(inputs)}"
-        )
+        raise _inputs_of_other_shape(system, np.shape(inputs))
     needed = n_input_rows(system, steps)
     if array.shape[0] < needed:
+        last_row = ", and the observation uses u" if system.observation_uses_inputs else ""
         raise ModelError(
-            f"inputs has {array.shape[0]} rows, but the last observation is at step {steps[-1]} "
-            f"and needs {needed} (row k holds during step k"
-            f"{', and the observation asks for u' if system.observation_uses_inputs else ''})"
+            f"inputs must have at least {needed} rows, because the last observation is at step "
+            f"{steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
         )
     return array
 
 
 def check_seed(name: str, seed: Any) -> np.ndarray:
-    """Integers within 64 bits."""
+    """Return seeds as an array of 64-bit integers."""
     array = np.asarray(seed)
     if array.dtype.kind not in "iu":
-        raise ModelError(f"{name} must be an integer, got {_short(seed)}")
+        raise ModelError(f"{name} must be an integer, got {shortened(seed)}")
     if (array > np.iinfo("int64").max).any():
-        raise ModelError(f"{name} must be below 2**63, got {_short(seed)}")
+        raise ModelError(f"{name} must be below 2**63, got {shortened(seed)}")
     return array.astype("int64")
-
-
-def check_random_seed(random_seed: Any) -> np.random.Generator:
-    """The generator of a seed that a user gave."""
-    try:
-        return np.random.default_rng(random_seed)
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"random_seed must be None, an integer that is not negative or a "
-            f"numpy.random.Generator, got {random_seed!r}"
-        ) from None
-
-
-def is_whole(value: Any) -> bool:
-    """Whether a value is an integer, Python's or NumPy's."""
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def check_t0(t0: Any) -> float:
-    """A finite time of step 0."""
-    number = isinstance(t0, int | float | np.number) and not isinstance(t0, bool)
-    if not number or not np.isfinite(t0):
-        raise ModelError(f"t0 must be a finite number, got {t0!r}")
-    return float(t0)
 
 
 def _floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -> np.ndarray:
@@ -222,7 +267,7 @@ def _floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -
     try:
         array = np.array(value, dtype="float64")
     except (TypeError, ValueError):
-        raise ModelError(f"{name} must be numbers, got {_short(value)}") from None
+        raise ModelError(f"{name} must be numbers, got {shortened(value)}") from None
     if ndim is not None and array.ndim != ndim:
         raise ModelError(f"{name} must have {ndim} dimension(s), got shape {array.shape}")
     bad = np.isinf(array) if missing else ~np.isfinite(array)
@@ -230,10 +275,5 @@ def _floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -
         at = tuple(int(i) for i in np.argwhere(bad)[0])
         allowed = "numbers, or NaN where missing" if missing else "finite numbers"
         place = f"{name}[{', '.join(map(str, at))}]" if at else name
-        raise ModelError(f"{name} must hold {allowed}, but {place} is {array[at]}")
+        raise ModelError(f"{name} must hold {allowed}, got {place} = {array[at]}")
     return array
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

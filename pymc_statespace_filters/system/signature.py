@@ -1,13 +1,37 @@
-"""Names: of parameters, with their defaults and shapes, and of states, observables and inputs."""
+"""Names of a system: parameters with defaults and shapes, states, observables and inputs."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import is_integer
 from pymc_statespace_filters.system.equations import Equation
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Parameters in order of appearance, defaults of some, shapes of all, and input names."""
+
+    parameters: tuple[str, ...]
+    defaults: tuple[tuple[str, Any], ...]
+    shapes: tuple[tuple[int, ...], ...]
+    inputs: tuple[str, ...]
+
+
+def read_signature(
+    equations: Sequence[Equation],
+    shapes: Mapping[str, Sequence[int]] | None,
+    inputs: Sequence[str] | None,
+) -> Signature:
+    """The signature of a system with these functions."""
+    names, defaults = parameter_names(equations)
+    declared = shapes_of(names, shapes)
+    check_defaults(defaults, names, declared)
+    return Signature(names, defaults, declared, checked_names("inputs", inputs, None))
 
 
 def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
@@ -19,7 +43,7 @@ def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tup
         for name, value in equation.defaults:
             if defaults.setdefault(name, value) != value:
                 raise ModelError(
-                    f"parameter {name!r} has two defaults, {defaults[name]} and {value}"
+                    f"parameter {name!r} must have one default, got {defaults[name]} and {value}"
                 )
     return tuple(names), tuple(defaults.items())
 
@@ -27,42 +51,41 @@ def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tup
 def shapes_of(
     names: tuple[str, ...], shapes: Mapping[str, Sequence[int]] | None
 ) -> tuple[tuple[int, ...], ...]:
-    """The declared shape of every parameter; scalars if nothing is declared."""
+    """The declared shape of every parameter; a parameter is a scalar unless declared."""
     declared = dict(shapes or {})
     unknown = sorted(set(declared) - set(names))
     if unknown:
-        raise ModelError(f"shapes names unknown parameters {unknown}; parameters are {list(names)}")
+        raise ModelError(f"shapes must name parameters, {list(names)}, got {unknown}")
     for name, shape in declared.items():
-        whole = isinstance(shape, Sequence) and all(isinstance(s, int) and s > 0 for s in shape)
-        if not whole:
+        if not isinstance(shape, Sequence) or not all(is_integer(s) and s > 0 for s in shape):
             raise ModelError(
                 f"shapes[{name!r}] must be a tuple of positive integers, got {shape!r}"
             )
-    return tuple(tuple(declared.get(name, ())) for name in names)
+    return tuple(tuple(map(int, declared.get(name, ()))) for name in names)
 
 
 def check_defaults(
     defaults: Sequence[tuple[str, Any]], names: Sequence[str], shapes: Sequence[tuple[int, ...]]
 ) -> None:
-    """Raise if a default has another shape than the parameter is declared with."""
+    """Raise unless every default has the declared shape of its parameter."""
     shape_of = dict(zip(names, shapes, strict=True))
     for name, value in defaults:
         if np.shape(value) != shape_of[name]:
             raise ModelError(
-                f"the default of {name!r} has shape {np.shape(value)}, but the parameter has "
-                f"shape {shape_of[name]}; declare it with shapes={{{name!r}: {np.shape(value)}}}"
+                f"the default of {name!r} must have the parameter's shape {shape_of[name]}, got "
+                f"shape {np.shape(value)}; declare it with shapes={{{name!r}: {np.shape(value)}}}"
             )
 
 
 def size_of(shape: tuple[int, ...]) -> int:
-    """How many numbers a parameter of this shape has."""
+    """Number of elements of a parameter of this shape."""
     return int(np.prod(shape, dtype=int))
 
 
 def parameter_symbols(
     theta: TensorVariable, names: Sequence[str], shapes: Sequence[tuple[int, ...]]
 ) -> dict[str, TensorVariable]:
-    """The parameters by name, cut out of the flat vector."""
+    """The parameters by name, as slices of the flat vector."""
     symbols, start = {}, 0
     for name, shape in zip(names, shapes, strict=True):
         stop = start + size_of(shape)
@@ -74,13 +97,13 @@ def parameter_symbols(
 def checked_names(
     role: str, names: Sequence[str] | None, default: list[str] | None
 ) -> tuple[str, ...]:
-    """Names that differ, as many as the default has; the default if none are given."""
+    """Distinct names, as many as there are in the default; the default if none are given."""
     if names is None:
         return tuple(default or ())
     if isinstance(names, str) or not all(isinstance(n, str) for n in names):
         raise ModelError(f"{role} must be a list of names, got {names!r}")
     if len(set(names)) != len(names):
-        raise ModelError(f"{role} must differ from each other, got {list(names)}")
+        raise ModelError(f"{role} must be distinct names, got {list(names)}")
     if default is not None and len(names) != len(default):
         raise ModelError(f"{role} must name {len(default)} components, got {list(names)}")
     return tuple(names)
@@ -91,5 +114,5 @@ def carried_names(carried: Sequence[str], states: tuple[str, ...]) -> tuple[str,
     names = checked_names("carried", carried, None)
     unknown = [name for name in names if name not in states]
     if unknown:
-        raise ModelError(f"carried names unknown states {unknown}; states are {list(states)}")
+        raise ModelError(f"carried must name states, {list(states)}, got {unknown}")
     return names

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
 
@@ -56,7 +56,7 @@ NEEDS_LONG_DOUBLE = pytest.mark.skipif(
 
 def elementwise(name):
     """The function in a loop that is compiled as generated loops are."""
-    function = FOR_MEMBERS[name]
+    function = VECTOR_NAMESPACE[name]
     options = {"fastmath": FAST_MATH, "error_model": "numpy"}
 
     @njit(**options)

@@ -215,7 +215,7 @@ def test_arviz_takes_it_and_it_can_be_stored(tmp_path):
             {"function": {"a": line, "b": lambda p: line(p).drop_vars("x")}},
             "different coordinates along 'x'",
         ),
-        ({"n_draws": 0}, "n_draws must be an integer >= 1, got 0"),
+        ({"n_draws": 0}, "n_draws must be an integer of at least 1, got 0"),
     ],
 )
 def test_what_is_refused(change, message):

@@ -172,7 +172,7 @@ def test_a_pickled_system_has_forgotten_its_integrator():
 
 
 class TestRules:
-    """Which draws are guilty, with losses and multipliers that are given instead of computed."""
+    """Which draws are guilty, with losses and stability that are given instead of computed."""
 
     def doubts(self, monkeypatch, *, lost, overshoots, size=1):
         with pm.Model() as model:
@@ -183,8 +183,8 @@ class TestRules:
         monkeypatch.setattr(discretisation, "densities_by_steps", lambda model: densities)
         monkeypatch.setattr(
             discretisation,
-            "step_multipliers",
-            lambda model: lambda x: np.where(overshoots(x[:, 0]), -0.5, 0.5),
+            "step_stability",
+            lambda model: lambda x: ~overshoots(x[:, 0]),
         )
         return doubts(model, near(-1.0, 1.0))
 

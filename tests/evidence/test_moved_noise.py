@@ -4,7 +4,7 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.pymc_model.inspection import smooth_filters
+from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters
 
 STEPS = np.arange(1, 31)
 LINEAR = psf.StateSpaceModel(

@@ -93,7 +93,9 @@ def test_missing_variables_are_named(idata, model):
 
 def test_wrong_shape(idata, model):
     idata["posterior"] = idata["posterior"].to_dataset().isel(w_dim_0=slice(2))
-    with pytest.raises(DataMismatchError, match=r"'w' has shape \(3,\) in the model and \(2,\)"):
+    with pytest.raises(
+        DataMismatchError, match=r"'w' in idata must have the model's shape \(3,\), got \(2,\)"
+    ):
         unconstrained_draws(idata, model)
 
 
@@ -101,7 +103,7 @@ def test_draws_outside_the_support(idata, model):
     dataset = idata["posterior"].to_dataset()
     dataset["upper"] = -dataset["upper"]
     idata["posterior"] = dataset
-    with pytest.raises(DataMismatchError, match="60 of 60 draws lie on or outside"):
+    with pytest.raises(DataMismatchError, match="got 60 of 60 draws outside"):
         unconstrained_draws(idata, model)
 
 

@@ -9,7 +9,8 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import CallbackLogLikelihood, PythonCallback
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.inspection import health_outputs, with_likelihood_callback
+from pymc_statespace_filters.pymc_model.graph_rewrites import with_likelihood_callback
+from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from tests.pymc_model.test_inspection import ENSEMBLE, FEW, filters_in, twins, two_systems
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
 

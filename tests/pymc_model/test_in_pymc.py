@@ -75,7 +75,7 @@ def test_a_copy_has_a_seed_of_its_own_and_a_frozen_model_none():
     model = pair_model(PF)
     noise_seeds(model.copy())["d"].set_value(np.array(99))
     assert model["d_seed"].get_value() == 3
-    with pytest.raises(ModelError, match="noise seed of 'd' has been frozen"):
+    with pytest.raises(ModelError, match="noise seed of 'd' must be shared data"):
         noise_seeds(freeze_dims_and_data(model))
 
 

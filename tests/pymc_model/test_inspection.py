@@ -9,12 +9,12 @@ from pytensor.graph.traversal import ancestors
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.pymc_model.graph_rewrites import with_filter
 from pymc_statespace_filters.pymc_model.inspection import (
     health_outputs,
     noise_seeds,
     noisy_filters,
     resized,
-    with_filter,
 )
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
@@ -99,7 +99,7 @@ def test_one_of_two_alike_but_for_the_seed():
 
 def test_variables_alike_in_all_are_exchanged_together_or_not_at_all():
     model = twins(EKF, EKF, seeds=(0, 0))
-    with pytest.raises(ModelError, match="one, two cannot be told apart"):
+    with pytest.raises(ModelError, match="must be the same for one, two"):
         with_filter([model.logp()], model, {"two": FEW})
     graphs = with_filter([model.logp()], model, {"one": FEW, "two": FEW})
     assert set(filters_in(graphs)) == {repr(FEW)}
@@ -115,9 +115,9 @@ def test_health_is_that_of_the_filter_in_place():
 
 def test_what_cannot_be_exchanged_is_named():
     model = two_systems(FEW, ENSEMBLE)
-    with pytest.raises(ModelError, match=r"'a' is not a StateSpace variable: expected \['pair'"):
+    with pytest.raises(ModelError, match=r"StateSpace variables, \['pair'"):
         with_filter([model.logp()], model, {"a": EKF})
-    with pytest.raises(ModelError, match="hold no likelihood of pair"):
+    with pytest.raises(ModelError, match="contain the likelihood of pair"):
         with_filter([model.logp(vars=[model["forced"]])], model, {"pair": EKF})
     with pytest.raises(ModelError, match="filter must be a filter"):
         with_filter([model.logp()], model, {"pair": "EKF"})

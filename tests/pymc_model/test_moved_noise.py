@@ -13,11 +13,8 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import StoredNoise
-from pymc_statespace_filters.pymc_model.inspection import (
-    autoregressive_noise,
-    health_outputs,
-    noise_seeds,
-)
+from pymc_statespace_filters.pymc_model.graph_rewrites import autoregressive_noise
+from pymc_statespace_filters.pymc_model.inspection import health_outputs, noise_seeds
 
 STEPS = np.array([1, 3, 4])
 OBSERVED = np.array([0.3, np.nan, -0.2])

@@ -245,7 +245,7 @@ def test_models_that_cannot_be_sampled():
 
 def test_frozen_models(noisy):
     freeze = pm.model.transform.optimization.freeze_dims_and_data
-    with pytest.raises(ModelError, match=r"seed of 'd0' has been frozen"):
+    with pytest.raises(ModelError, match=r"seed of 'd0' must be shared data"):
         sample_dram(freeze(noisy))
     exact = state_space_model(psf.EKF())
     assert_identical(sample_dram(freeze(exact)), sample_dram(exact))

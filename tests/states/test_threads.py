@@ -58,7 +58,7 @@ def test_results_of_several_shapes_and_types():
         outer = np.outer(a, [10, 20, 30]).ravel()
         np.testing.assert_array_equal(row, [*(a[::-1] * k), *outer, k])
     counts = []
-    calls.watch = counts.append
+    calls.on_progress = counts.append
     calls(*columns)
     assert sum(counts) == 3
     # Strided columns, of another type.

@@ -183,7 +183,7 @@ def test_plain_numbers_are_computed_in_double_precision():
 
 @pytest.mark.parametrize("width", [0, -0.1, np.inf, np.nan, "wide"])
 def test_a_width_that_is_no_length_is_refused(width):
-    with pytest.raises(ModelError, match="width must be a positive, finite number or None; got"):
+    with pytest.raises(ModelError, match="width must be a positive, finite number or None, got"):
         freeplay(0.1, 1.0, 0.2, width=width)
     with pytest.raises(ModelError, match="width"):
         hysteresis(0.1, 1.0, 1.0, 0.2, 0.3, width=width)

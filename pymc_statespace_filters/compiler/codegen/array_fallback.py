@@ -1,4 +1,4 @@
-"""Functions on arrays, for graphs that are too large or hold an operation without a scalar form."""
+"""Functions on arrays, for graphs that are too large or have an operation without scalar form."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -18,11 +18,11 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
     function_of,
 )
-from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_ONE
+from pymc_statespace_filters.compiler.codegen.source import SCALAR_NAMESPACE
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.errors import LoweringError
 
-# How the code reads a whole input.
+# The code that reads a whole input.
 _WHOLE = {
     "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "d": "d", "x": "X[:, member].copy()",
     "z": "Z[:{n}, member].copy()", "s": "s", "s_bar": "s_bar", "c_bar": "c_bar",
@@ -32,7 +32,7 @@ _WHOLE = {
 
 
 def array_vector_function(name: str, function: VectorFunction) -> CompiledFunction:
-    """A vector function that hands arrays on; NaN where the array code raises."""
+    """A vector function that passes arrays; NaN where the array code raises."""
     graph = function.graph
     used = _used(graph.inputs, graph.outputs)
     compiled = array_code(list(used.values()), graph.outputs)
@@ -40,7 +40,7 @@ def array_vector_function(name: str, function: VectorFunction) -> CompiledFuncti
         f"out[{i}].item()" if scalar else f"out[{i}].copy()"
         for i, scalar in enumerate(function.scalar)
     ]
-    nothing = [
+    failed = [
         "nan" if scalar else f"np.full({output.type.shape[0]}, nan)"
         for scalar, output in zip(function.scalar, graph.outputs, strict=True)
     ]
@@ -49,7 +49,7 @@ def array_vector_function(name: str, function: VectorFunction) -> CompiledFuncti
         f"    out = array_code({_whole(used)})",
         f"    return {', '.join(results)}",
         "except Exception:",  # a singular matrix, say
-        f"    return {', '.join(nothing)}",
+        f"    return {', '.join(failed)}",
     ]
     return _build(name, function.arguments, body, array_code=compiled)
 
@@ -90,7 +90,7 @@ def array_member_function(name: str, arguments: str, graph: Graph, target: str) 
 def _build(
     name: str, arguments: str, body: list[str], **parts: CompiledFunction
 ) -> CompiledFunction:
-    namespace = FOR_ONE | {part: compiled.function for part, compiled in parts.items()}
+    namespace = SCALAR_NAMESPACE | {part: compiled.function for part, compiled in parts.items()}
     function, source = function_of(name, arguments, body, namespace)
     return CompiledFunction(function, key_of(source, *(part.key for part in parts.values())))
 
@@ -109,7 +109,7 @@ def _used(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[s
 def _frontier(
     inputs: list[Variable], members: list[Variable], outputs: Sequence[Variable]
 ) -> list[Variable]:
-    """Variables that no member enters and that something a member enters reads."""
+    """Variables independent of the members that something dependent on them reads."""
     dependent, frontier = set(members), []
     nodes = io_toposort(inputs, outputs)
     for node in nodes:
@@ -125,11 +125,11 @@ def _frontier(
 
 
 def array_code(inputs: list, outputs: Sequence[Variable]) -> CompiledFunction:
-    """A graph as PyTensor itself compiles it: arrays in, a tuple of arrays out."""
-    # PyMC's checks of parameters become minus infinity: nothing may raise inside a filter.
+    """A graph compiled by PyTensor itself: arrays in, a tuple of arrays out."""
+    # Failed parameter checks of PyMC become minus infinity, because a filter must not raise.
     mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
     with warnings.catch_warnings():
-        # Python code called back from machine code: slow, not cacheable, and it holds the lock.
+        # Object mode calls Python from machine code: slow, not cacheable, and it needs the GIL.
         warnings.filterwarnings("error", "Numba will use object mode", UserWarning)
         try:
             function = pytensor.function(
@@ -140,8 +140,7 @@ def array_code(inputs: list, outputs: Sequence[Variable]) -> CompiledFunction:
             code, key = numba_funcify_and_cache_key(graph)
         except (NotImplementedError, UserWarning) as error:
             raise LoweringError(
-                f"A function of the system holds an operation without a compiled form ({error}) "
-                f"Write the function without it, in terms of pytensor.tensor operations that "
-                f"numba supports."
+                f"functions of the system must consist of pytensor.tensor operations that numba "
+                f"supports, got one that it does not: {error}"
             ) from error
     return CompiledFunction(code, None if key is None else digest(str(key)))

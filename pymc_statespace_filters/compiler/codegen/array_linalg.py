@@ -1,8 +1,8 @@
-"""Linear algebra of array code as plain loops, in place of calls of BLAS and LAPACK.
+"""Linear algebra of array code as plain loops, in place of calls to BLAS and LAPACK.
 
-A call of BLAS from numba takes seconds to compile, again for every combination of memory layouts;
-that was nine tenths of the time before the first number of a system with 40 states. For matrices
-of that size the loops are about as fast.
+A call to BLAS from numba takes seconds to compile, once for every combination of memory layouts.
+For a system with 40 states that was nine tenths of the compilation time. For matrices of that size
+the loops are about as fast.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
-"""Scalar expressions: interned, simplified as they are built, and nothing else.
+"""Scalar expressions, interned and simplified as they are built.
 
 An expression is a PyTensor scalar operation applied to expressions and Python constants. Equal
-expressions are one object, constants are folded, and products with zero vanish: Jacobians and
-identity matrices are mostly zeros and ones, and what they would cost is removed here.
+expressions are one object, constants are folded, and products with zero vanish. This removes most
+of the cost of Jacobians and identity matrices, which are mostly zeros and ones.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def _is(value: Value, number: float) -> bool:
 
 
 class Arena:
-    """Builds expressions; every expression of one lowered function comes from one arena."""
+    """Builds and interns the expressions of one lowered function."""
 
     def __init__(self) -> None:
         self._interned: dict[tuple, Expression] = {}
@@ -83,7 +83,7 @@ class Arena:
         simplified, kind = rule(op, *args) if rule else None, _result_kind(op, args)
         if simplified is None:
             return self._intern(op, args, kind)
-        # What a neutral element left may be a truth value where a number is meant.
+        # Dropping a neutral element may leave a boolean where a number is expected.
         same = kind_of(simplified) == kind
         return simplified if same else self.apply(_CASTS[kind], simplified)
 
@@ -97,7 +97,7 @@ class Arena:
     def _reduced(self, op: ps.ScalarOp, args: tuple) -> Value:
         return reduce(lambda a, b: self.apply(op, a, b), args)
 
-    # Rules: return None for "keep as it is".
+    # Rules return None to keep the operation as it is.
 
     def _add(self, op: ps.ScalarOp, *args: Value) -> Value | None:
         if _all_boolean(args):
@@ -146,7 +146,7 @@ class Arena:
         return a.args[0] if isinstance(a, Expression) and isinstance(a.op, ps.Neg) else None
 
     def _pow(self, op: ps.ScalarOp, base: Value, exponent: Value) -> Value | None:
-        """Small whole powers become products: they vectorise, libm's ``pow`` does not."""
+        """Small integer powers become products, which vectorise; libm's ``pow`` does not."""
         if isinstance(exponent, Expression):
             return None
         if exponent == 0:
@@ -156,13 +156,13 @@ class Arena:
         if exponent != int(exponent) or abs(exponent) > 16:
             return None
         if exponent < 0:
-            return self.apply(ps.true_div, 1.0, self._whole_power(base, -int(exponent)))
-        return self._whole_power(base, int(exponent))
+            return self.apply(ps.true_div, 1.0, self._integer_power(base, -int(exponent)))
+        return self._integer_power(base, int(exponent))
 
-    def _whole_power(self, base: Value, exponent: int) -> Value:
+    def _integer_power(self, base: Value, exponent: int) -> Value:
         if exponent == 1:
             return base
-        half = self._whole_power(base, exponent // 2)
+        half = self._integer_power(base, exponent // 2)
         square = self.apply(ps.mul, half, half)
         return self.apply(ps.mul, square, base) if exponent % 2 else square
 
@@ -176,7 +176,7 @@ class Arena:
 
 
 def _all_boolean(args: tuple) -> bool:
-    """PyTensor's sums and products of truth values are truth values, like numpy's."""
+    """Whether all are boolean: their sums and products are then boolean too, as in NumPy."""
     return all(kind_of(a) == BOOLEAN for a in args)
 
 

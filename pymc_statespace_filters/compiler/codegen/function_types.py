@@ -1,4 +1,4 @@
-"""Compiled functions: what they are made of, and how they are compiled."""
+"""Types of compiled functions and of the graphs they come from; compilation of their source."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
 
-# Inputs of which every member of an ensemble has its own.
+# Inputs that differ between the members of an ensemble.
 MEMBER_INPUTS = frozenset({"x", "z"})
 
 
@@ -34,7 +34,7 @@ class Graph:
 
 @dataclass(frozen=True)
 class VectorFunction:
-    """What a vector function is made of; ``scalar[i]`` tells that output i is one number."""
+    """The graph and arguments of a vector function; ``scalar[i]`` if output i is one number."""
 
     arguments: str
     graph: Graph
@@ -44,7 +44,7 @@ class VectorFunction:
 def function_of(
     name: str, arguments: str, body: Sequence[str], namespace: Mapping[str, Any]
 ) -> tuple[Any, str]:
-    """Compile a function from the lines of its body, which may name what is in ``namespace``."""
+    """Compile a function from the lines of its body, which use the names in ``namespace``."""
     source = f"def {name}({arguments}):\n" + "".join(f"    {line}\n" for line in body)
     names = dict(namespace)
     exec(compile(source, f"<{name} of a state-space system>", "exec"), names)
@@ -52,5 +52,5 @@ def function_of(
 
 
 def jit(function: Any) -> Any:
-    """Compile as all code of this room is compiled."""
+    """Compile with the flags of all generated code."""
     return numba.njit(function, nogil=True, error_model="numpy", fastmath=FAST_MATH)

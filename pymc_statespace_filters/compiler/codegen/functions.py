@@ -27,22 +27,21 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     function_of,
 )
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
-from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
-from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.errors import LoweringError
 
-# Up to here the arrays' code takes as long to make and is up to eighty times slower: rings of 8
-# states with a gradient and of 16 without, dense systems of 10. Beyond, nobody would wait for it.
+# Up to this size array code takes as long to compile and is up to eighty times slower: rings of 8
+# states with a gradient and of 16 without, dense systems of 10. Beyond, compilation is too slow.
 MAX_EXPRESSIONS = 6000
 MAX_OUTPUT_ELEMENTS = 200
 
-# LLVM makes no vector code of a loop before which more than 128 pairs of rows would have to be
-# found apart; 8 rows that are written and as many that are only read make 92.
+# LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
+# 8 rows that are written and as many that are only read need 92.
 MAX_ROWS_COMPARED = 8
 BLOCK = 64
 
-# How generated code reads element i of an input; members are columns.
+# The code that reads element i of an input; members are columns.
 _ELEMENT = {
     "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]", "x": "X[{i}, member]",
     "z": "Z[{i}, member]", "s": "s[{i}]", "s_bar": "s_bar[{i}]", "c_bar": "c_bar[{i}]",
@@ -79,7 +78,7 @@ def _element_code(graph: Graph) -> dict[str, str]:
 
 
 def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, CompiledFunction]:
-    """Functions that hand vectors to each other: all of them in scalars, or all on arrays.
+    """Functions that pass vectors to each other: all written out in scalars, or all on arrays.
 
     In scalars a vector is a tuple of numbers, otherwise an array; both are read by index.
     """
@@ -110,7 +109,7 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
         (values,) = unrolled(graph)
     except NotUnrollableError:
         return array_member_function(name, arguments, graph, target)
-    writer = Writer(_element_code(graph), FOR_MEMBERS)
+    writer = Writer(_element_code(graph), VECTOR_NAMESPACE)
     members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
     dependent = depends_on(values, members)
     shared = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
@@ -123,25 +122,25 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
 
 
 def _loop(inside: list[str], results: list[str], target: str) -> list[str]:
-    """Lines that run ``inside`` for every member and keep its results."""
+    """Lines that run ``inside`` for every member and store its results."""
     stores = [f"{target.format(i=i)} = {result}" for i, result in enumerate(results)]
     head = f"for member in range({target.partition('[')[0]}.shape[-1]):"
     return [head, *_indented([*inside, *stores])]
 
 
 def _staged_loop(inside: list[str], results: list[str], target: str) -> list[str]:
-    """The same by blocks of members, whose results are kept aside and copied.
+    """The same loop over blocks of members, whose results are buffered and then copied.
 
-    What is written is then apart from all that is read, which LLVM need not find out row by row.
+    The buffer does not overlap any row that is read, so LLVM needs no check for each pair of rows.
     """
     whole = target.partition("[")[0]
-    stores = [f"aside[{i}, j] = {result}" for i, result in enumerate(results)]
-    # An unsigned index is never counted from the end, and so leaves the loop vector code.
+    stores = [f"buffer[{i}, j] = {result}" for i, result in enumerate(results)]
+    # A signed index might be negative and count from the end, which would prevent vectorisation.
     compute = ["member = np.uint64(first + j)", *inside, *stores]
     copy = [
         f"for i in range({len(results)}):",
         "    for j in range(size):",
-        f"        {whole}[i, np.uint64(first + j)] = aside[i, j]",
+        f"        {whole}[i, np.uint64(first + j)] = buffer[i, j]",
     ]
     block = [
         f"size = min({BLOCK}, {whole}.shape[-1] - first)",
@@ -150,7 +149,7 @@ def _staged_loop(inside: list[str], results: list[str], target: str) -> list[str
         *copy,
     ]
     return [
-        f"aside = np.empty(({len(results)}, {BLOCK}))",
+        f"buffer = np.empty(({len(results)}, {BLOCK}))",
         f"for first in range(0, {whole}.shape[-1], {BLOCK}):",
         *_indented(block),
     ]
@@ -161,7 +160,7 @@ def _indented(lines: Sequence[str]) -> list[str]:
 
 
 def sorted_by_number(values: Iterable[Value]) -> list[Value]:
-    """Expressions in the order of their making, so that the source is canonical."""
+    """Expressions in order of creation, so that the source is canonical."""
     return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
 
 
@@ -170,9 +169,9 @@ def _tuple(names: Sequence[str]) -> str:
 
 
 def build(name: str, arguments: str, body: list[str], writer: Writer) -> CompiledFunction:
-    """Compile a body that a writer wrote."""
+    """Compile a function body from a writer."""
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
-    function, source = function_of(name, arguments, body, {**writer.vocabulary, **others})
+    function, source = function_of(name, arguments, body, {**writer.namespace, **others})
     return CompiledFunction(
         function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values()))
     )
@@ -184,6 +183,6 @@ def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:
         return numba_funcify(op, node=node)
     except NotImplementedError as error:
         raise LoweringError(
-            f"The operation {op} has no compiled form. Write the function without it, "
-            f"in terms of pytensor.tensor operations that numba supports."
+            f"functions of the system must consist of pytensor.tensor operations that numba "
+            f"supports, got {op}"
         ) from error

@@ -1,8 +1,8 @@
 """Unroll a PyTensor graph of small arrays into scalar expressions.
 
-Every variable of the graph becomes a numpy object array whose elements are expressions or Python
-constants. Operations that only move elements (indexing, joining, reshaping) are run by numpy on
-those arrays; elementwise operations, sums and small linear algebra are written out.
+Every variable of the graph becomes a NumPy object array of expressions and Python constants. NumPy
+runs the operations that only move elements (indexing, joining, reshaping) on those arrays;
+elementwise operations, sums and small linear algebra are written out.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -60,7 +60,7 @@ def unroll(
 def _value(known: dict[Variable, np.ndarray], variable: Variable) -> np.ndarray:
     if variable not in known:
         if not isinstance(variable, Constant):
-            raise NotUnrollableError(f"the value {variable} comes from outside the function")
+            raise NotUnrollableError(f"an input that is not an argument, {variable}")
         known[variable] = _objects(variable.data)
     return known[variable]
 
@@ -105,7 +105,7 @@ def _perform(node, arguments: list) -> list:
 
 
 def _move(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """Run an operation that only moves the elements of its first input; the others are numbers."""
+    """Run an operation that only moves elements of its first input; the others are numbers."""
     numbers = [_numbers(i, a) for i, a in zip(node.inputs[1:], arguments[1:], strict=True)]
     return _perform(node, [arguments[0], *numbers])
 
@@ -142,7 +142,7 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     (array,) = arguments
     axes = tuple(range(array.ndim)) if node.op.axis is None else tuple(node.op.axis)
     kept = [axis for axis in range(array.ndim) if axis not in axes]
-    # A sum of truth values counts them.
+    # A sum of booleans is a count.
     counts = node.inputs[0].type.dtype == "bool" and node.outputs[0].type.dtype != "bool"
     cast = ps.Cast(ps.get_scalar_type(node.outputs[0].type.dtype))
     rows = np.transpose(array, (*kept, *axes)).reshape(*(array.shape[a] for a in kept), -1)
@@ -167,7 +167,7 @@ def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
 
 
 def _cholesky(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """Row by row; a negative pivot gives NaN through its square root, as LAPACK's wrapper does."""
+    """Row by row; a negative pivot gives NaN through its square root, like LAPACK's wrapper."""
     (a,) = arguments
     n = a.shape[0]
     chol = np.full((n, n), 0.0, dtype=object)

@@ -1,9 +1,10 @@
-"""Vector functions for several parameter points side by side, as vector code.
+"""Vector functions for several parameter points at once, as SIMD code.
 
-A point is a lane. All numbers of all lanes are in one flat array ``W`` of rows of `LANES`: the
-parameters, the vector ``s``, a last number, and what depends on parameters alone, which is computed
-once. The rows' distances are constants of the source, so that LLVM knows them apart; the number of
-lanes is not, because a short loop of known length is unrolled before it can become vector code.
+Each point occupies a lane. All numbers of all lanes are in one flat array ``W`` of rows of `LANES`:
+the parameters, the vector ``s``, a last number, and what depends on parameters alone, which is
+computed once. Row offsets are constants of the source, so LLVM knows that rows do not overlap. The
+number of lanes is a variable, because LLVM would unroll a short loop of known length instead of
+vectorising it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,12 +14,11 @@ from typing import Any
 from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, VectorFunction
 from pymc_statespace_filters.compiler.codegen.functions import build, sorted_by_number, unrolled
-from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
-from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_MEMBERS
+from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 
 LANES = 16  # at most
-LANES_AT_ONCE = 8  # their number is a multiple of this
+LANES_AT_ONCE = 8  # the number of lanes is a multiple of this
 
 _SHARED = {"u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]"}
 _ARGUMENTS = "W, n_lanes, inputs, k, t, d"
@@ -26,10 +26,10 @@ _ARGUMENTS = "W, n_lanes, inputs, k, t, d"
 
 @dataclass(frozen=True)
 class Lanes:
-    """Compiled functions ``name(W, n_lanes, inputs, k, t, d)``, and what ``W`` holds.
+    """Compiled functions ``name(W, n_lanes, inputs, k, t, d)``, and the layout of ``W``.
 
-    Rows ``i`` are theta, rows ``n_theta + i`` the vector ``s``, the row ``last`` what a function
-    returns beside ``s``. ``prepare`` are functions to be called once theta is in its rows.
+    Rows ``i`` hold theta, rows ``n_theta + i`` the vector ``s``, the row ``last`` the result beside
+    ``s``. The functions in ``prepare`` must be called after theta is written to its rows.
     """
 
     functions: Mapping[str, Any]
@@ -40,7 +40,7 @@ class Lanes:
 
 
 def lane_functions(functions: Mapping[str, VectorFunction], size: int) -> Lanes:
-    """The functions for lanes; raises NotUnrollableError where there is no scalar form."""
+    """Compile functions for lanes; raises NotUnrollableError where there is no scalar form."""
     n_theta = next(iter(functions.values())).graph.inputs["theta"].type.shape[0]
     last = n_theta + size
     n_rows = last + 1
@@ -82,7 +82,7 @@ def _named(code: Mapping[str, str], *inputs: str) -> frozenset[str]:
 
 
 def _constants(values: Sequence[Value], code: Mapping[str, str]) -> list[Value]:
-    """What depends on theta alone and is used by something that does not, or is a result."""
+    """Expressions of theta alone that are results, or are used by others."""
     varying = depends_on(values, _named(code, "s", "u", "t", "d"))
     of_theta = depends_on(values, _named(code, "theta")) - varying
     used = [*values, *(a for e in varying for a in e.args)]
@@ -98,7 +98,7 @@ def _function(
     targets: Sequence[str],
 ) -> CompiledFunction:
     """Write ``values`` to ``targets`` in every lane; what lanes share is computed before."""
-    writer = Writer(code, FOR_MEMBERS, known)
+    writer = Writer(code, VECTOR_NAMESPACE, known)
     of_lane = depends_on(values, _named(code, "theta", "s"))
     used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
     before = writer.statements(

@@ -1,12 +1,15 @@
-"""Scalar expressions as Python source that numba compiles.
+"""Scalar expressions as Python source that numba compiles, and the functions that it may call.
 
-The source text is canonical: equal expressions give equal text, in every process. It is therefore
-also the identity of a lowered function, and part of the key under which machine code is cached.
+The source text is canonical: equal expressions give equal text, in every process. The text
+therefore identifies a lowered function, and is part of the key under which its machine code is
+cached.
 """
 
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pytensor.scalar as ps
 from pytensor.scalar.math import Log1mexp, Sigmoid, Softplus
 
@@ -19,8 +22,38 @@ from pymc_statespace_filters.compiler.codegen.expressions import (
     is_constant,
     kind_of,
 )
-from pymc_statespace_filters.compiler.codegen.vocabulary import FOR_ONE
+from pymc_statespace_filters.compiler.numerics import (
+    exponential,
+    hyperbolic,
+    intrinsics,
+    trigonometric,
+)
 
+_NUMPY = (
+    "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sqrt", "sin", "cos", "tan", "arcsin",
+    "arccos", "arctan", "arctan2", "sinh", "cosh", "tanh", "floor", "ceil", "trunc", "rint",
+)  # fmt: skip
+
+# For single numbers, where the tables of the system's library are faster.
+SCALAR_NAMESPACE = {
+    "np": np, "inf": np.inf, "nan": np.nan, "power": operator.pow,
+    "floor_divide": operator.floordiv, "modulo": operator.mod,
+    **{name: getattr(np, name) for name in _NUMPY},
+}  # fmt: skip
+
+_VECTORIZABLE = (
+    exponential.exp, exponential.exp2, exponential.expm1, exponential.log, exponential.log2,
+    exponential.log10, exponential.log1p, exponential.power, hyperbolic.sinh,
+    hyperbolic.cosh, hyperbolic.tanh, trigonometric.sin, trigonometric.cos, trigonometric.tan,
+    trigonometric.arctan, trigonometric.arctan2, trigonometric.floor_divide, trigonometric.modulo,
+)  # fmt: skip
+
+# For loops over members, which LLVM vectorises only if they call no function of the library.
+VECTOR_NAMESPACE = (
+    SCALAR_NAMESPACE
+    | {"sqrt": intrinsics.sqrt}
+    | {function.py_func.__name__: function for function in _VECTORIZABLE}
+)
 _INFIX: dict[type, str] = {
     ps.Add: "+", ps.Sub: "-", ps.Mul: "*", ps.TrueDiv: "/", ps.LT: "<", ps.GT: ">", ps.LE: "<=",
     ps.GE: ">=", ps.EQ: "==", ps.NEQ: "!=", ps.IntDiv: "//", ps.Mod: "%",
@@ -54,23 +87,23 @@ _TEMPLATES: dict[type, str] = {
 class Writer:
     """Writes the statements that compute some expressions, each at most once.
 
-    The names of functions have the meaning that the ``vocabulary`` gives them; what is ``known``
-    was computed before and is read by the code given.
+    ``namespace`` holds the functions that the source may call by name; ``known`` holds the code of
+    expressions that were computed before.
     """
 
     def __init__(
         self,
         input_code: dict[str, str],
-        vocabulary: Mapping[str, Any] = FOR_ONE,
+        namespace: Mapping[str, Any] = SCALAR_NAMESPACE,
         known: Mapping[Value, str] | None = None,
     ) -> None:
-        self.vocabulary = vocabulary
+        self.namespace = namespace
         self._input_code = input_code
         self._names: dict[Value, str] = dict(known or {})
         self.fallbacks: dict[str, tuple[ps.ScalarOp, int]] = {}
 
     def statements(self, values: Iterable[Value]) -> list[str]:
-        """Statements for everything that ``values`` need and that is not written yet."""
+        """Statements for everything that ``values`` depend on and that is not written yet."""
         lines: list[str] = []
         for expression in _in_order(values, self._names):
             name = f"v{len(self._names)}"
@@ -79,7 +112,7 @@ class Writer:
         return lines
 
     def name(self, value: Value) -> str:
-        """How a written expression, or a constant, is named in the source."""
+        """The name in the source of a written expression, or the literal of a constant."""
         return self._names[value] if isinstance(value, Expression) else _literal(value)
 
     def as_float(self, value: Value) -> str:
@@ -120,7 +153,7 @@ class Writer:
 
 
 def _in_order(values: Iterable[Value], written: Mapping[Value, str]) -> list[Expression]:
-    """Expressions that ``values`` need, arguments first; no recursion, graphs may be deep."""
+    """Expressions that ``values`` depend on, arguments first; not recursive, for deep graphs."""
     order: list[Expression] = []
     seen = set(written)
     for root in values:

@@ -1,1 +1,1 @@
-"""Machine code with a name or an address, called from other machine code."""
+"""Machine code with a symbol or an address, called from other machine code."""

@@ -1,21 +1,21 @@
-"""Under which key compiled code is kept on disk, and the flags that all of it is compiled with."""
+"""Keys of compiled code on disk, and the fast-math flags of generated code."""
 
 import hashlib
 from functools import cache
 from pathlib import Path
 
-# NaN and infinity keep their meaning: failures are found by them. With reassociation allowed beside
-# "nsz", x - x becomes 0 for every x, and numba's isfinite, which is made of it, is always true.
+# No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it
+# folds x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.
 FAST_MATH = {"contract", "nsz", "arcp"}
 
 
 def digest(*parts: str) -> str:
-    """The key of compiled code that is made of ``parts`` by the code of this package."""
+    """The key of compiled code, from ``parts`` that identify it and the sources of this package."""
     return hashlib.sha256("\0".join((_source_digest(), *parts)).encode()).hexdigest()
 
 
 def key_of(what: str, *keys: str | None) -> str | None:
-    """The key of code made of ``what`` and compiled parts; None if a part cannot be cached."""
+    """The key of code that calls compiled parts; None if a part cannot be cached."""
     known = [key for key in keys if key is not None]
     return digest(what, *known) if len(known) == len(keys) else None
 
@@ -26,10 +26,10 @@ def _source_digest() -> str:
 
 
 def digest_of_sources(package: Path) -> str:
-    """The digest of all sources that machine code can be made by, in nested folders too.
+    """The digest of all sources that generate machine code, nested folders included.
 
-    Machine code on disk must not outlive the code that it was made by. A file's place counts, for
-    machine code is loaded by way of the module that it was made in.
+    A change of any of them invalidates the machine code on disk. A file's path counts too, because
+    machine code is loaded through the module that it was compiled in.
     """
     files = [*package.glob("*.py")]
     for folder in ("system", "compiler", "filters", "ops"):

@@ -1,11 +1,11 @@
-"""Machine code with a name: compiled once, kept on disk, and called through a symbol or an address.
+"""Entry points: machine code compiled once, cached on disk, called by symbol or address.
 
-A function that another compiled function calls in the ordinary way is copied into its caller and
-optimised again there, at every level of callers: a filter would be compiled anew for each model and
-for each number of members. An entry is not: its callers hold its name, which is the same in every
-process. So a filter is compiled once per installation, and a model once for all filters.
+Numba copies an ordinary callee into its caller and optimises it again there, at every level of
+callers, so a filter would be compiled again for each model and each number of members. The callers
+of an entry point refer to its symbol only, which is the same in every process. A filter is
+therefore compiled once per installation, and a model once for all filters.
 
-Arguments of an entry are numbers and addresses of contiguous float64 or int64 data.
+Arguments of an entry point are numbers and addresses of contiguous float64 or int64 data.
 """
 
 from collections import namedtuple
@@ -35,35 +35,34 @@ I64_PTR = types.CPointer(types.int64)
 
 
 class _CacheByKey(FunctionCache):
-    """A cache in PyTensor's folder that asks for the key alone.
+    """A cache in PyTensor's folder that compares the key alone.
 
-    Numba would also compare what the function closes over, and compiled functions are never the
-    same in two processes.
+    Numba would also compare the closure, and compiled functions in it differ in every process.
     """
 
     def _index_key(self, signature, codegen):
         return signature, codegen.magic_tuple(), CACHED_SRC_FUNCTIONS[self._py_func]
 
 
-# Machine code lives as long as its Python object.
+# Keeps the Python objects, and with them their machine code, alive.
 _compiled: dict[str, Any] = {}
 
 
 def cached_on_disk(function: Any, key: str) -> Any:
-    """Keep a compiled function on PyTensor's disk cache, under a key that identifies its code."""
+    """Cache a jitted function in PyTensor's folder, under a key that identifies its code."""
     if config.numba__cache:
         function._cache = _cache(function.py_func, key)
     return with_internal_linkage(function)
 
 
 def _cache(function: Callable, key: str) -> _CacheByKey:
-    # What is kept is loaded by way of its module, which may be another one tomorrow.
+    # The module is part of the key: cached code is loaded through it, and it may be moved.
     CACHED_SRC_FUNCTIONS[function] = digest(key, function.__module__)
     return _CacheByKey(function)
 
 
 class EntryPoint:
-    """A function that is compiled when `compile` is first called, and called by its ``symbol``.
+    """A function that `compile` compiles on its first call, and that is called by its ``symbol``.
 
     Parameters
     ----------
@@ -73,7 +72,7 @@ class EntryPoint:
         The parameters of the function, by name and in order. ``F64_PTR`` and ``I64_PTR`` are
         addresses, of which ``numba.carray`` makes arrays.
     name : str
-        Part of the symbol, for the reader of a profile.
+        Part of the symbol, readable in a profile.
     key : str or None
         Identifies the code, see `digest`; None if it cannot be cached on disk.
     needs : sequence of EntryPoint
@@ -106,7 +105,7 @@ class EntryPoint:
         self.symbol = f"psf_{name}_{key or uuid4().hex}"
 
     def compile(self) -> None:
-        """Make the symbol known to this process, from disk if any process compiled it before."""
+        """Define the symbol in this process; load it from disk if it was compiled before."""
         if self.symbol in _compiled:
             return
         for needed in self._needs:
@@ -127,7 +126,7 @@ class EntryPoint:
 
     @property
     def address(self) -> int:
-        """Where the compiled code lies."""
+        """Address of the compiled code."""
         return _compiled[self.symbol].address
 
     @property
@@ -145,7 +144,7 @@ def arguments_class(name: str, arguments: Mapping[str, Any], module: str) -> Any
 
 @intrinsic(prefer_literal=True)
 def address_of(typing_context, symbol):
-    """Address of the entry with this symbol, a literal string; 0 for the empty string."""
+    """Address of the entry point with this symbol, a literal string; 0 for the empty string."""
 
     def generate(context, builder, signature, values):
         integer = context.get_value_type(types.intp)
@@ -160,9 +159,9 @@ def address_of(typing_context, symbol):
 
 @intrinsic
 def call_address(typing_context, address, arguments):
-    """Call the entry at an address with a tuple of numbers, addresses, and arrays.
+    """Call the entry point at an address with a tuple of numbers, addresses and arrays.
 
-    Of an array the entry gets the address; unlike one whose address was taken, it lives until then.
+    An array is passed by address and stays alive until the call.
     """
 
     def generate(context, builder, signature, values):

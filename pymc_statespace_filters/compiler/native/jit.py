@@ -1,8 +1,8 @@
-"""How every njit function of the filters is compiled.
+"""The numba flags of all handwritten compiled functions.
 
-Division by zero gives inf or nan as in NumPy, the interpreter lock is released, and multiplications
-may be fused with additions. No flag that lets the compiler assume finite numbers: the guards
-against NaN and infinity would be compiled away.
+Division by zero gives inf or nan as in NumPy, the GIL is released, and multiplications may be fused
+with additions. No flag lets the compiler assume finite numbers, because it would remove the checks
+for NaN and infinity.
 """
 
 from numba import njit
@@ -16,22 +16,22 @@ njit_internal = njit(
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
 )
-"""For a function that only compiled functions call: what Python would need is not compiled."""
+"""For a function that only compiled functions call: compiled without the wrappers for Python."""
 
 inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
-"""For a function with one caller, or a few instructions inside a loop that must become vector code.
+"""For a function with one caller, or of a few instructions inside a loop that must vectorise.
 
-It becomes part of its caller before anything is compiled. Compilation optimises a function again at
-every level that it is called from, so this also halves the time a new model waits.
+Numba inlines it before compilation. LLVM would otherwise optimise it again at every level of
+callers, so this also halves the compilation time of a new model.
 """
 
 njit_reassoc = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
-"""For sums over members, which may be added up in another order and so become vector code."""
+"""For sums over members, which may be reordered in order to vectorise."""
 
 njit_strict = njit(error_model="numpy", nogil=True, inline="always")
-"""Pasted too, and computed to the letter: for sums that must not depend on what is around them."""
+"""Inlined, without fused operations: for sums whose bits must not depend on the calling code."""
 
 
 @njit_contract
 def keep_alive(array):
-    """Be the last reader of an array whose address was handed on; else it was freed before."""
+    """Do nothing; called after the last use of an array's address, to keep the array until then."""

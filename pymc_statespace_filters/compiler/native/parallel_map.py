@@ -1,4 +1,4 @@
-"""One compiled function at many rows of arguments: a loop of machine code, in threads."""
+"""A compiled function applied to many rows of arguments, in threads of machine code."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
@@ -15,14 +15,14 @@ from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunc
 from pymc_statespace_filters.parallel.cpu_affinity import available_cores
 
 _REFRESH_SECONDS = 0.1
-# What the main thread and a calling one tell each other.
+# Control block of each thread: rows done, written by the thread; stop, written by the main thread.
 _N_DONE, _STOP = 0, 1
 
 
-def _call_rows(call, argument, rows, results, told):
-    """Call with every row of words (m, size), until told to stop; False if one call raised."""
+def _call_rows(call, argument, rows, results, control):
+    """Call with every row of words (m, size), until stopped; False if a call raised."""
     for i in range(len(rows)):
-        if told[_STOP]:
+        if control[_STOP]:
             return True
         for j in range(argument.size):
             argument[j] = rows[i, j]
@@ -30,7 +30,7 @@ def _call_rows(call, argument, rows, results, told):
             return False
         for j in range(results.shape[1]):
             results[i, j] = call.out[1 + j]
-        told[_N_DONE] = i + 1
+        control[_N_DONE] = i + 1
     return True
 
 
@@ -41,14 +41,16 @@ _call_rows = cached_on_disk(
 
 
 class ParallelMap:
-    """A compiled PyTensor function at many points; neither order nor number of threads matters.
+    """A compiled PyTensor function applied to many points.
+
+    Results depend neither on the order of the points nor on the number of threads.
 
     Parameters
     ----------
     function : pytensor.compile.executor.Function
-        Of float64 and int64 arguments, with numbers as results.
+        With float64 and int64 arguments, and numbers or arrays as results.
     varying : sequence of ndarray
-        An example of each of its first arguments, those that differ from row to row.
+        An example of each of its first arguments, which differ from row to row.
     constant : sequence of ndarray
         The other arguments.
 
@@ -56,8 +58,8 @@ class ParallelMap:
     ----------
     shapes : list of tuple of int
         Shapes of the results.
-    watch : callable
-        Told, in the main thread, how many rows were done since it was last told.
+    on_progress : callable
+        Called in the main thread with the number of rows done since its last call.
     """
 
     def __init__(
@@ -67,10 +69,10 @@ class ParallelMap:
         self._constant = [np.array(value, order="C") for value in constant]
         self._native = NativeFunction(function, [*self._examples, *self._constant])
         self.shapes = self._native.shapes
-        self.watch: Callable[[int], None] = lambda count: None
+        self.on_progress: Callable[[int], None] = lambda count: None
 
     def __call__(self, *columns: np.ndarray) -> NDArray[np.float64]:
-        """Results of every row, (m, size), one after the other; NaN for rows not reached.
+        """Results of every row, flattened and joined, (m, size); NaN for rows not reached.
 
         ``columns`` are the varying arguments, each with a first dimension of length m.
         """
@@ -78,21 +80,21 @@ class ParallelMap:
         results = np.full((len(rows), self._native.size), np.nan)
         n_threads = min(available_cores(), max(1, len(rows)))
         ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
-        told = np.zeros((n_threads, 2), dtype=np.int64)
+        control = np.zeros((n_threads, 2), dtype=np.int64)
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
         with ThreadPoolExecutor(n_threads) as pool:
             futures = [
-                pool.submit(self._call_part, rows[part], results[part], told[i])
+                pool.submit(self._call_part, rows[part], results[part], control[i])
                 for i, part in enumerate(parts)
             ]
             try:
-                self._wait(futures, told)
+                self._wait(futures, control)
             finally:
-                told[:, _STOP] = True
+                control[:, _STOP] = True
         return results
 
     def _words(self, columns: Sequence[np.ndarray]) -> NDArray[np.int64]:
-        """The arguments of each row as words of eight bytes, whatever their type."""
+        """The arguments of each row, of either type, as words of eight bytes."""
         parts = [
             np.ascontiguousarray(column, example.dtype)
             .reshape(len(column), example.size)
@@ -102,16 +104,16 @@ class ParallelMap:
         return np.ascontiguousarray(np.concatenate(parts, axis=1))
 
     def _call_part(
-        self, rows: NDArray[np.int64], results: NDArray[np.float64], told: NDArray[np.int64]
+        self, rows: NDArray[np.int64], results: NDArray[np.float64], control: NDArray[np.int64]
     ) -> None:
-        argument, arguments = self._laid_out()
+        argument, arguments = self._allocate_arguments()
         call, kept_alive = self._native.bind(arguments)
-        if not _call_rows(call, argument, rows, results, told):
-            self._native(*arguments)  # raises what the machine code met
+        if not _call_rows(call, argument, rows, results, control):
+            self._native(*arguments)  # raises the exception of the machine code
         del kept_alive
 
-    def _laid_out(self) -> tuple[NDArray[np.int64], list[np.ndarray]]:
-        """A vector of words, and all arguments, of which the varying ones are views of it."""
+    def _allocate_arguments(self) -> tuple[NDArray[np.int64], list[np.ndarray]]:
+        """A vector of words, and all arguments; the varying ones are views of the vector."""
         argument = np.concatenate([np.ravel(value).view(np.int64) for value in self._examples])
         arguments, start = [], 0
         for value in self._examples:
@@ -120,12 +122,12 @@ class ParallelMap:
             start += value.size
         return argument, [*arguments, *self._constant]
 
-    def _wait(self, futures: Sequence[Future], told: NDArray[np.int64]) -> None:
-        n_told, pending = 0, set(futures)
+    def _wait(self, futures: Sequence[Future], control: NDArray[np.int64]) -> None:
+        n_reported, pending = 0, set(futures)
         while pending:
             done, pending = wait(pending, _REFRESH_SECONDS, return_when=FIRST_EXCEPTION)
             for future in done:
                 future.result()
-            n_done = int(told[:, _N_DONE].sum())
-            self.watch(n_done - n_told)
-            n_told = n_done
+            n_done = int(control[:, _N_DONE].sum())
+            self.on_progress(n_done - n_reported)
+            n_reported = n_done

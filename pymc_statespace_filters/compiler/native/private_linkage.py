@@ -1,10 +1,10 @@
-"""Machine code that is the same to the bit in the process that compiles it and in all others.
+"""Internal linkage for helper functions, so that all processes run the same machine code.
 
-Numba leaves functions that were not pasted into their caller under their names, as weak symbols:
-the first definition that a process has loaded serves all its callers. In the process that compiled
-it that is one that was optimised on its own; where the code comes from disk it is one that was
-optimised again beside its caller, or that of another library. Both are right, but sums and products
-that may be rearranged differ in their last digits. A closed library keeps its functions to itself.
+Numba emits functions that were not inlined as weak symbols, and the first definition that a process
+loads serves all callers. In the process that compiled it, that definition was optimised on its own;
+in a process that loads it from disk, it was optimised again beside its caller, or belongs to
+another library. Both are correct, but sums and products that may be reordered differ in their last
+digits. With internal linkage every library calls its own copies.
 """
 
 from typing import Any
@@ -15,22 +15,22 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 
 
-class _ClosedLibrary(JITCodeLibrary):
-    """A library whose functions, but for those that were compiled for it, are its own."""
+class _InternalLinkageLibrary(JITCodeLibrary):
+    """A code library in which helper functions have internal linkage."""
 
     def _optimize_final_module(self) -> None:
-        own = uuid4().hex
+        suffix = uuid4().hex
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage == Linkage.linkonce_odr:
                 function.linkage = Linkage.internal
-                # LLVM's loader would give even these to other libraries that ask for the name,
-                # and who calls them is no matter of theirs: arguments may have been left out.
-                function.name = f"{function.name}.{own}"
+                # LLVM's loader resolves even internal functions by name for other libraries, whose
+                # calls may not match: LLVM may have removed arguments of an internal function.
+                function.name = f"{function.name}.{suffix}"
         super()._optimize_final_module()
 
 
 class InternalLinkageCompiler(Compiler):
-    """Numba's compiler, for functions that machine code calls by address."""
+    """Numba's compiler, for functions that machine code calls by address or symbol."""
 
     def __init__(
         self,
@@ -44,11 +44,13 @@ class InternalLinkageCompiler(Compiler):
     ):
         super().__init__(typingctx, targetctx, library, args, return_type, flags, locals)
         if library is None:
-            self.state.library = _ClosedLibrary(self.state.targetctx.codegen(), "closed")
+            self.state.library = _InternalLinkageLibrary(
+                self.state.targetctx.codegen(), "internal_linkage"
+            )
             self.state.library.enable_object_caching()
 
 
 def with_internal_linkage(function: Any) -> Any:
-    """Have a jitted function compiled into a closed library, if it is not compiled yet."""
+    """Give the helper functions of a jitted function internal linkage; call before it compiles."""
     function._compiler.pipeline_class = InternalLinkageCompiler
     return function

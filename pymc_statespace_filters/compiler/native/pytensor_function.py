@@ -1,9 +1,9 @@
-"""A compiled PyTensor function as something that machine code can call, without Python.
+"""Compiled PyTensor functions that machine code can call without Python.
 
-PyTensor's function is machine code already, with arrays as arguments and results. A call of it is
-described by a table of addresses: an adapter makes arrays of them, calls the function by its own
-address, and writes all results one after the other into a vector of float64. Adapters depend on the
-types alone, so that a second function of the same types compiles nothing.
+A PyTensor function is machine code already, with arrays as arguments and results. A table of
+addresses describes a call: an adapter makes arrays of them, calls the function by its address, and
+writes all results one after the other into a float64 vector. Adapters depend on the types alone, so
+a second function of the same types needs no compilation.
 """
 
 import ctypes
@@ -32,7 +32,7 @@ _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 
 
 class Call(NamedTuple):
-    """What machine code needs for a call; each thread has its own.
+    """Arguments and results of a call from machine code; each thread needs its own.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Call(NamedTuple):
         Addresses of the adapter, of the function and of its inputs; the inputs' shapes; and the
         length of ``out``.
     out : ndarray, shape (1 + n,)
-        0, or 1 if the function raised; then the results, one after the other.
+        First 0, or 1 if the function raised; then the results, one after the other.
     """
 
     table: np.ndarray
@@ -49,7 +49,7 @@ class Call(NamedTuple):
 
 @njit(error_model="numpy", nogil=True, inline="always")
 def make_call(call):
-    """Make the call, and tell whether it succeeded."""
+    """Make the call; returns whether it succeeded."""
     call_address(call.table[0], (call.table, call.out))
     return call.out[0] == 0.0
 
@@ -57,13 +57,13 @@ def make_call(call):
 class NativeFunction:
     """A compiled PyTensor function whose inputs and outputs are arrays of numbers.
 
-    In PyTensor's modes without numba, machine code calls back into Python instead.
+    In PyTensor's modes without numba, machine code calls Python instead.
 
     Parameters
     ----------
     function : pytensor.compile.executor.Function
     example : sequence of ndarray
-        Inputs for a first call, from which types and shapes are learnt.
+        Inputs of a first call, which determines types and shapes.
 
     Attributes
     ----------
@@ -73,25 +73,25 @@ class NativeFunction:
     Raises
     ------
     Exception
-        What the function raises at the example.
+        Any exception that the function raises at the example.
     """
 
     def __init__(self, function: Any, example: Sequence[np.ndarray]):
         self._function = function
-        self._one_at_a_time = Lock()  # PyTensor's functions have one storage for all threads
+        self._one_at_a_time = Lock()  # PyTensor functions have one storage for all threads
         shared = [cell.storage[0] for cell in function.input_storage[len(example) :]]
         self._is_native = hasattr(function.vm, "jit_fn") and all(
             isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
         )
         if self._is_native:
             with_internal_linkage(function.vm.jit_fn)
-        # The values of now, in the one layout that adapters know.
+        # Current values of shared variables, in the memory layout of the adapters.
         self._data = [_contiguous(value) for value in shared] if self._is_native else []
         self.shapes = [np.shape(result) for result in self(*example)]
 
     @property
     def size(self) -> int:
-        """How many numbers the results have in all."""
+        """Total number of elements of the results."""
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
@@ -102,13 +102,13 @@ class NativeFunction:
             return self._function(*inputs)
 
     def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
-        """Make a call that reads these contiguous arrays each time.
+        """Prepare a call that reads these contiguous arrays.
 
         Returns
         -------
         Call
         object
-            Keep it as long as the call.
+            Owns the memory of the call; keep it as long as the call.
         """
         out = np.zeros(1 + self.size)
         if not self._is_native:
@@ -118,7 +118,7 @@ class NativeFunction:
         arrays = [*inputs, *self._data]
         kinds = types.Tuple([typeof(array) for array in arrays])
         overloads = self._function.vm.jit_fn.overloads
-        # PyTensor's functions take a tuple if they are kept on disk, else single arguments.
+        # PyTensor functions take a tuple if they are cached on disk, else separate arguments.
         signature = (kinds,) if (kinds,) in overloads else kinds.types
         compiled = overloads[signature]
         addresses = [
@@ -132,7 +132,7 @@ class NativeFunction:
     def _callback(self, inputs: Sequence[np.ndarray], out: np.ndarray) -> Any:
         def evaluate(table: int, results: int) -> None:
             out[0] = 1.0
-            # An exception cannot pass through machine code; whoever finds the 1 calls again.
+            # An exception cannot pass through machine code; the caller sees the 1 and calls again.
             with suppress(Exception):
                 values = self(*inputs)
                 out[1:] = np.concatenate([np.ravel(value) for value in values])
@@ -147,7 +147,7 @@ def _contiguous(value: np.ndarray) -> np.ndarray:
 
 @cache
 def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTuple) -> int:
-    """Compile, for these types, what turns a table of addresses into a call; give its address."""
+    """Compile the adapter of these types, from a table of addresses to a call; its address."""
     namespace: dict[str, Any] = {"__name__": __name__, "carray": carray, "pointer": _pointer}
     namespace["invoke"] = _invoker(signature, results)
     arrays, n_table = "", _N_ADDRESSES + len(arguments)
@@ -189,7 +189,7 @@ def _pointer(typing_context, address):
 
 
 def _forget_error(context: Any, builder: Any) -> None:
-    """Clear the interpreter's error: an operation in Python may have set it, and we go on."""
+    """Clear Python's error indicator, which a failed operation in Python has set."""
     python = context.get_python_api(builder)
     lock = python.gil_ensure()
     python.err_clear()
@@ -197,7 +197,7 @@ def _forget_error(context: Any, builder: Any) -> None:
 
 
 def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
-    """Call the numba function at an address: whether it raised, and its results."""
+    """An intrinsic that calls the numba function at an address: (raised, results)."""
 
     @intrinsic
     def invoke(typing_context, address, arguments):
@@ -208,7 +208,7 @@ def _invoker(signature: tuple, results: types.BaseTuple) -> Any:
             convention = context.call_conv
             kind = convention.get_function_type(results, signature)
             function = builder.inttoptr(values[0], kind.as_pointer())
-            # Results of a function that raised are null arrays, which may be released.
+            # After an exception the results are null arrays, which are safe to release.
             status, returned = convention.call_function(
                 builder, function, results, signature, given
             )

@@ -1,5 +1,7 @@
 """Whether a posterior reaches the stability limit of the integrator.
 
+An integrator says itself whether its steps are stable (`Integrator.is_stable_at`).
+
 An Euler-Maruyama step multiplies a small deviation by 1 + a h, where the equation multiplies it by
 exp(a h). Where -2 < a h < -1 the step overshoots: the path oscillates from step to step as no path
 of the equation does, and it grows without bound from there on. This leaves two marks on a posterior
@@ -25,7 +27,7 @@ from scipy.stats import rankdata
 
 from pymc_statespace_filters.evidence.posterior import RowFunction
 from pymc_statespace_filters.evidence.posterior.observed_data import scalar_count
-from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_multipliers
+from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_stability
 
 N_DRAWS = 100
 MIN_DRAWS = 2  # one may be chance
@@ -42,18 +44,18 @@ Array = NDArray[np.float64]
 def doubts_of_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
     """Say if draws (chain, draw, k) owe their likelihood to overshooting, or end at its limit.
 
-    Nothing is said of models without Euler-Maruyama steps, or with a system that no deterministic
-    filter can treat.
+    Nothing is said of models without an integrator, or with a system that no deterministic filter
+    can treat.
     """
-    multipliers = step_multipliers(model)
-    if multipliers is None:
+    is_stable = step_stability(model)
+    if is_stable is None:
         return
     flat = draws.reshape(-1, draws.shape[-1])
     chosen = np.linspace(0, len(flat) - 1, min(N_DRAWS, len(flat))).astype(int)
     x = flat[chosen]
     beyond = flat.mean(axis=0) + BEYOND * (x - flat.mean(axis=0))
     # This takes a moment, the rest must compile two filters: most models need not go on.
-    overshoots = multipliers(np.concatenate([x, beyond])) < 0
+    overshoots = ~is_stable(np.concatenate([x, beyond]))
     if overshoots.sum() < MIN_DRAWS or (densities := densities_by_steps(model)) is None:
         return
     coarse, fine = (RowFunction(model, density).evaluate for density in densities)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import check_count
 
 N_NORMALS = 50_000
 SAMPLE_DIMS = ("chain", "draw")
@@ -93,8 +94,7 @@ def average_models(
     array([-4. , -0.9,  0. ,  0.9,  4. ])
     """
     names = _names(idatas)
-    if not (isinstance(n_draws, int | np.integer) and n_draws >= 1):
-        raise ModelError(f"n_draws must be an integer >= 1, got {n_draws!r}")
+    check_count("n_draws", n_draws, 1)
     rng = np.random.default_rng(random_seed)
     prob = _probabilities(weights, names, rng)
     arrays = _arrays(idatas, function)

@@ -51,6 +51,7 @@ from pymc_statespace_filters.evidence.estimators.single_block import (
 )
 from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE
 from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.system.checks import check_count
 
 MIN_PROPOSALS = 100
 MOST_PROPOSALS = 20_000
@@ -84,12 +85,8 @@ class ChibJeliazkov:
     def __post_init__(self) -> None:
         for name, least in (("n_proposals", MIN_PROPOSALS), ("n_blocks", 1)):
             given = getattr(self, name)
-            if given is not None and not (
-                isinstance(given, int | np.integer)
-                and not isinstance(given, bool)
-                and given >= least
-            ):
-                raise ModelError(f"{name} must be an integer of at least {least}, got {given!r}")
+            if given is not None:
+                check_count(name, given, least)
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """The largest number with one block, where fewer may do; about the number with several."""

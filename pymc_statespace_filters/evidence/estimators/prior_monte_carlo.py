@@ -25,6 +25,7 @@ from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE, log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.system.checks import check_count
 
 MIN_DRAWS = 100
 
@@ -48,9 +49,7 @@ class PriorMonteCarlo:
     n_draws: int = 10_000
 
     def __post_init__(self) -> None:
-        given = self.n_draws
-        if not (isinstance(given, int | np.integer) and given >= MIN_DRAWS):
-            raise ModelError(f"n_draws must be an integer of at least {MIN_DRAWS}, got {given!r}")
+        check_count("n_draws", self.n_draws, MIN_DRAWS)
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """One for each draw of the prior."""

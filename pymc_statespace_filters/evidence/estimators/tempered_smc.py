@@ -47,6 +47,7 @@ from pymc_statespace_filters.evidence.estimators.smc_moves import (
     resampled,
 )
 from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.system.checks import check_count, is_integer
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
 SHARE = (
@@ -94,12 +95,9 @@ class TemperedSMC:
     n_runs: int = 16
 
     def __post_init__(self) -> None:
-        particles, runs = self.n_particles, self.n_runs
-        if not (isinstance(particles, int | np.integer) and particles >= MIN_PARTICLES):
-            raise ModelError(
-                f"n_particles must be an integer of at least {MIN_PARTICLES}, got {particles!r}"
-            )
-        if not (isinstance(runs, int | np.integer) and runs >= MIN_RUNS and runs % 2 == 0):
+        runs = self.n_runs
+        check_count("n_particles", self.n_particles, MIN_PARTICLES)
+        if not (is_integer(runs) and runs >= MIN_RUNS and runs % 2 == 0):
             raise ModelError(f"n_runs must be an even integer of at least {MIN_RUNS}, got {runs!r}")
 
     def n_evaluations(self, posterior: Posterior) -> int:

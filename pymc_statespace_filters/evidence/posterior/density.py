@@ -16,7 +16,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.inspection import noise_seeds, smooth_filters, with_filter
+from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters, with_filter
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 
 Array = NDArray[np.float64]
 
@@ -53,13 +54,13 @@ class RowFunction:
         self._calls = ParallelMap(function, [point, *self.model_seeds])
 
     @property
-    def watch(self) -> Callable[[int], None]:
+    def on_progress(self) -> Callable[[int], None]:
         """Told, in the main thread, how many points were evaluated since it was last told."""
-        return self._calls.watch
+        return self._calls.on_progress
 
-    @watch.setter
-    def watch(self, watch: Callable[[int], None]) -> None:
-        self._calls.watch = watch
+    @on_progress.setter
+    def on_progress(self, on_progress: Callable[[int], None]) -> None:
+        self._calls.on_progress = on_progress
 
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
         """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.

@@ -1,31 +1,16 @@
-"""Fingerprints: whether a model, and its data, are those that a run was begun with.
+"""Fingerprints: whether a model, and its data, are those that a run was started with.
 
-A model is what its graphs compute. Each variable of a graph has a digest, of the operation that
-makes it and of the digests of what it is made from, down to constants and to inputs by name. So two
-builds of a model agree, in one process or in two, whatever the addresses and the order of sets.
+A model is identified by what its graphs compute, see `system.graph_digest`. Two builds of a model
+agree, in one process or in two.
 """
 
-import enum
-import hashlib
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from functools import singledispatch
-from types import FunctionType
-from typing import Any
-
-import numpy as np
 import pymc as pm
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant, Variable
-from pytensor.graph.fg import FrozenFunctionGraph, FunctionGraph
-from pytensor.graph.op import Op
-from pytensor.graph.traversal import graph_inputs, io_toposort
-from pytensor.graph.type import Type
+from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.random.type import RandomType
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.graph_digest import described, digest, graph_digest
 
 
 def model_fingerprint(model: pm.Model) -> str:
@@ -42,7 +27,7 @@ def model_fingerprint(model: pm.Model) -> str:
         versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
         deterministic, name, dimension, coordinate and initial value, with the equations of a
         `StateSpace` and with the settings of its filter. Of observed values and other data it holds
-        type and name: see `data_fingerprint`. The Python code inside an operation of the user's own
+        type and name: see `values_fingerprint`. The Python code inside an operation of a user
         is not seen, only what the operation is made of.
 
     Raises
@@ -51,7 +36,7 @@ def model_fingerprint(model: pm.Model) -> str:
         If an operation is made of something that looks different in every process, such as a Python
         function without a name; the message names both.
     """
-    known = {value: _digest("value of", rv.name) for rv, value in _roots(model).items()}
+    known = {value: digest("value of", rv.name) for rv, value in _roots(model).items()}
     names = {
         "free": [(rv.name, model.rvs_to_values[rv].name) for rv in model.free_RVs],
         "observed": [rv.name for rv in model.observed_RVs],
@@ -61,11 +46,11 @@ def model_fingerprint(model: pm.Model) -> str:
         "coords": dict(model.coords),
         "starts": {rv.name: value for rv, value in model.rvs_to_initial_values.items()},
     }
-    described = [_described(f"the model's {what}", value) for what, value in names.items()]
-    return _digest(*described, _graph_digest(_outputs(model), known))
+    texts = [described(f"the model's {what}", value) for what, value in names.items()]
+    return digest(*texts, graph_digest(_outputs(model), known))
 
 
-def data_fingerprint(model: pm.Model) -> str:
+def values_fingerprint(model: pm.Model) -> str:
     """Hash all numbers that a model was given as data.
 
     Parameters
@@ -92,7 +77,7 @@ def data_fingerprint(model: pm.Model) -> str:
         # What draws outside the model, as a posterior predictive does, is seeded anew each time.
         if not isinstance(v.type, RandomType)
     ]
-    return _digest(_described("the model's data", [constants, shared]))
+    return digest(described("the model's data", [constants, shared]))
 
 
 def _roots(model: pm.Model) -> dict[Variable, Variable]:
@@ -107,169 +92,3 @@ def _roots(model: pm.Model) -> dict[Variable, Variable]:
 
 def _outputs(model: pm.Model) -> list[Variable]:
     return [model.logp(), *model.unobserved_value_vars]
-
-
-def _graph_digest(outputs: Sequence[Variable], known: Mapping[Variable, str]) -> str:
-    """A digest of what the outputs compute; inputs that are not known go by order, name and type.
-
-    Equal parts of a graph have equal digests, whether they are one node or several.
-    """
-    digests = dict(known)
-    n_unknown = 0
-
-    def look_up(variable: Variable) -> str:
-        nonlocal n_unknown
-        if variable not in digests:
-            if isinstance(variable, Constant):
-                root = variable.data
-            else:
-                root = (n_unknown, variable.name)
-                n_unknown += 1
-            digests[variable] = _digest(_described(variable, [variable.type, root]))
-        return digests[variable]
-
-    for node in io_toposort(list(known), list(outputs)):
-        arguments = [look_up(variable) for variable in node.inputs]
-        operation = describe(node.op)
-        for i, output in enumerate(node.outputs):
-            digests[output] = _digest(operation, describe(output.type), i, *arguments)
-    return _digest(*map(look_up, outputs))
-
-
-def _digest(*parts: str | int) -> str:
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-class _UnstableError(Exception):
-    """Something has no text that is the same in every process."""
-
-
-def _described(what: object, value: Any) -> str:
-    """Describe a value; where that is impossible, say what the value is of."""
-    try:
-        return describe(value)
-    except _UnstableError as error:
-        raise ModelError(
-            f"{what} holds {error}, which cannot be recognised in another process: a run of this "
-            f"model could not be taken up from a checkpoint"
-        ) from None
-
-
-@singledispatch
-def describe(value: Any) -> str:
-    """A text that is equal for equal values, in every process."""
-    if is_dataclass(value):
-        return _of(value, {field.name: getattr(value, field.name) for field in fields(value)})
-    text = repr(value)
-    if text.startswith("<") or " at 0x" in text:
-        raise _UnstableError(text)
-    return f"{_name(type(value))}:{text}"
-
-
-def _name(value: type | FunctionType) -> str:
-    return f"{value.__module__}.{value.__qualname__}"
-
-
-def _of(value: object, parts: Mapping[str, Any]) -> str:
-    return f"{_name(type(value))}{describe(dict(parts))}"
-
-
-@describe.register(bool | int | float | complex | str | bytes | None)
-def _(value: Any) -> str:
-    return repr(value)
-
-
-@describe.register(np.ndarray | np.generic)
-def _(value: Any) -> str:
-    array = np.asarray(value)
-    if array.dtype.hasobject:
-        return f"{array.shape}{describe(array.ravel().tolist())}"
-    content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
-    return f"{array.dtype}{array.shape}{hashlib.sha256(content).hexdigest()}"
-
-
-@describe.register(tuple | list)
-def _(value: Any) -> str:
-    return f"{_name(type(value))}({', '.join(map(describe, value))})"
-
-
-@describe.register(slice)
-def _(value: slice) -> str:
-    return f"slice{describe((value.start, value.stop, value.step))}"
-
-
-@describe.register(set | frozenset)
-def _(value: Any) -> str:
-    return f"set({', '.join(sorted(map(describe, value)))})"
-
-
-@describe.register
-def _(value: Mapping) -> str:
-    items = sorted((describe(key), describe(item)) for key, item in value.items())
-    return f"{{{', '.join(f'{key}: {item}' for key, item in items)}}}"
-
-
-@describe.register
-def _(value: enum.Enum) -> str:
-    return f"{_name(type(value))}.{value.name}"
-
-
-@describe.register
-def _(value: type) -> str:
-    return _name(value)
-
-
-@describe.register
-def _(value: FunctionType) -> str:
-    found: Any = sys.modules.get(value.__module__)
-    for part in value.__qualname__.split("."):
-        found = getattr(found, part, None)
-    if found is not value:
-        raise _UnstableError(f"the function {value!r}")
-    return _name(value)
-
-
-@describe.register
-def _(value: StateSpaceModel) -> str:
-    return _of(value, {name: getattr(value, name) for name in StateSpaceModel.__annotations__})
-
-
-@describe.register
-def _(value: Variable) -> str:
-    return _graph_digest([value], {})
-
-
-@describe.register(FunctionGraph | FrozenFunctionGraph)
-def _(value: Any) -> str:
-    inputs = {v: _digest("input", i, describe(v.type)) for i, v in enumerate(value.inputs)}
-    return _graph_digest(value.outputs, inputs)
-
-
-@describe.register
-def _(value: Type) -> str:
-    names = getattr(value, "__props__", vars(value))
-    return _of(value, {name: getattr(value, name) for name in names})
-
-
-@describe.register
-def _(value: Op) -> str:
-    kind = _name(type(value))
-    parts = [
-        f"{name}={_described(f'{name!r} of the operation {kind}', setting)}"
-        for name, setting in _settings(value).items()
-    ]
-    return f"{kind}({', '.join(parts)})"
-
-
-# What loops and optimisers are made of beside the graph that they run.
-_AROUND_A_GRAPH = ("info", "truncate_gradient", "method", "optimizer_kwargs", "bound_kwargs")
-
-
-def _settings(op: Op) -> dict[str, Any]:
-    """What an operation is made of: its properties, else all its attributes; and its graph."""
-    names = getattr(op, "__props__", _AROUND_A_GRAPH if hasattr(op, "fgraph") else vars(op))
-    settings = {name: getattr(op, name) for name in names if hasattr(op, name)}
-    settings.pop("output_types_preference", None)  # a function; the types themselves are described
-    if hasattr(op, "fgraph"):
-        settings["fgraph"] = op.fgraph
-    return settings

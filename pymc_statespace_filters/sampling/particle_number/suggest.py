@@ -10,12 +10,8 @@ from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.pymc_model.inspection import (
-    noise_seeds,
-    noisy_filters,
-    resized,
-    with_filter,
-)
+from pymc_statespace_filters.pymc_model.graph_rewrites import with_filter
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds, noisy_filters, resized
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     TARGET,
@@ -30,6 +26,7 @@ from pymc_statespace_filters.sampling.particle_number.search import Row, choose,
 from pymc_statespace_filters.sampling.target.log_density import BoundDensity, LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import HeldVariables, continuous_value_vars
+from pymc_statespace_filters.system.checks import check_random_seed
 
 # Evaluations at a point: a first look, the centre, and each point of the tail.
 _GLANCE, _CENTRE, _TAIL = 25, 100, 30
@@ -150,7 +147,7 @@ def suggest_particles(
     True
     """
     low, high = _checked_target(target)
-    bench = _Bench(model, var_name, _generator(random_seed))
+    bench = _Bench(model, var_name, check_random_seed(random_seed))
     centre, tail = bench.points()
 
     def measure(n_particles: int) -> Row:
@@ -284,13 +281,3 @@ def _checked_target(target: Any) -> tuple[float, float]:
     if not 0.0 < low < high < np.inf:
         raise ModelError(f"target={target!r}: expected two positive numbers, the smaller first")
     return low, high
-
-
-def _generator(random_seed: Any) -> np.random.Generator:
-    try:
-        return np.random.default_rng(random_seed)
-    except (TypeError, ValueError):
-        raise ModelError(
-            "random_seed must be None, an integer that is not negative or a "
-            f"numpy.random.Generator, got {random_seed!r}"
-        ) from None

@@ -16,7 +16,7 @@ from pymc_statespace_filters.sampling.checkpoint.checkpoint import join_checkpoi
 from pymc_statespace_filters.sampling.run.model_task import Asked, ModelRun
 from pymc_statespace_filters.sampling.run.scheduler import run_chains
 from pymc_statespace_filters.sampling.target.leader_follower import follow, leading
-from pymc_statespace_filters.sampling.target.settings import is_count
+from pymc_statespace_filters.system.checks import is_integer
 
 _GATHERS = ("root", "all")
 _SEED_CURE = (
@@ -125,9 +125,9 @@ def _prepare(runs: Sequence[ModelRun]) -> None:
 def _check(how: How) -> None:
     if how.gather not in _GATHERS:
         raise ModelError(f"gather={how.gather!r}: expected one of {_GATHERS}")
-    if how.cores is not None and (not is_count(how.cores) or how.cores < 1):
+    if how.cores is not None and (not is_integer(how.cores) or how.cores < 1):
         raise ModelError(f"cores={how.cores!r}: expected an integer, at least 1, or None")
-    if not is_count(how.ranks_per_chain) or how.ranks_per_chain < 1:
+    if not is_integer(how.ranks_per_chain) or how.ranks_per_chain < 1:
         raise ModelError(
             f"ranks_per_chain={how.ranks_per_chain!r}: expected an integer, at least 1"
         )

@@ -28,7 +28,8 @@ from pymc_statespace_filters.parallel.signals import (
     interrupts_left_to_another_rank,
     noticed_interrupts,
 )
-from pymc_statespace_filters.pymc_model.inspection import PythonCallback, noisy_filters
+from pymc_statespace_filters.pymc_model.graph_rewrites import PythonCallback
+from pymc_statespace_filters.pymc_model.inspection import noisy_filters
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 
 # What the leader sends: what is to be evaluated, that it is, that all is over.

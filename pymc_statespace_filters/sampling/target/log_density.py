@@ -21,13 +21,15 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.pymc_model.inspection import (
+from pymc_statespace_filters.pymc_model.graph_rewrites import (
     autoregressive_noise,
+    with_filter,
+    with_likelihood_callback,
+)
+from pymc_statespace_filters.pymc_model.inspection import (
     health_outputs,
     log_density_terms,
     state_space_names,
-    with_filter,
-    with_likelihood_callback,
 )
 from pymc_statespace_filters.sampling.kernel.state import RAISED, Density, Evaluation
 from pymc_statespace_filters.sampling.kernel.transition import evaluate

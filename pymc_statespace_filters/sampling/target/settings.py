@@ -4,12 +4,13 @@ import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self, TypeGuard
+from typing import Any, Self
 
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.inspection import is_filter
+from pymc_statespace_filters.system.checks import is_integer
 
 ADAPTATIONS = ("chain", "continuous")
 
@@ -77,7 +78,7 @@ class DRAMSettings:
                 f"adaptation={self.adaptation!r}: expected one of "
                 f"{', '.join(map(repr, ADAPTATIONS))}"
             )
-        if not is_count(self.adapt_every) or self.adapt_every < 4:
+        if not is_integer(self.adapt_every) or self.adapt_every < 4:
             raise ModelError(f"adapt_every={self.adapt_every!r}: expected an integer, at least 4")
         if not isinstance(self.refresh_noise, bool | np.bool_):
             raise ModelError(f"refresh_noise={self.refresh_noise!r}: expected True or False")
@@ -154,11 +155,11 @@ def stage_pair(stages: object) -> tuple[int, int]:
     ModelError
         If it is neither, or a number is below 1.
     """
-    pair = (stages, stages) if is_count(stages) else stages
+    pair = (stages, stages) if is_integer(stages) else stages
     if (
         not isinstance(pair, tuple | list)
         or len(pair) != 2
-        or not all(is_count(k) and k >= 1 for k in pair)
+        or not all(is_integer(k) and k >= 1 for k in pair)
     ):
         raise ModelError(
             f"stages={stages!r}: expected an integer, at least 1, or a pair of them "
@@ -169,11 +170,6 @@ def stage_pair(stages: object) -> tuple[int, int]:
 
 def _is_symmetric(cov: np.ndarray) -> bool:
     return np.allclose(cov, cov.T, rtol=1e-8, atol=1e-12 * np.abs(cov).max(initial=0.0))
-
-
-def is_count(value: object) -> TypeGuard[int]:
-    """Whether a value is an integer, and not True or False."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def _is_real(value: object) -> bool:

@@ -1,0 +1,213 @@
+"""Rewrites of a model's graphs that exchange its likelihoods: callbacks, moved noise, filters.
+
+Every function takes graphs and returns new ones; the model itself is not changed.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pymc as pm
+import pytensor.tensor as pt
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.replace import clone_replace
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
+from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.ops.distributed import (
+    CallbackLogLikelihood,
+    CallbackLogLikelihoodOfNoise,
+    PythonCallback,
+)
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.pymc_model.inspection import (
+    likelihood_nodes,
+    noisy_filters,
+    state_space_nodes,
+)
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+__all__ = [
+    "AutoregressiveNoise",
+    "CallbackLikelihoods",
+    "PythonCallback",
+    "autoregressive_noise",
+    "smooth_filters",
+    "with_filter",
+    "with_likelihood_callback",
+]
+
+
+class CallbackLikelihoods(NamedTuple):
+    """The symbols of `with_likelihood_callback`.
+
+    Attributes
+    ----------
+    kinds : tuple of (StateSpaceModel, filter)
+        The likelihoods that the callback evaluates; it is called with an index into them.
+    address : TensorVariable
+        Input: the address of the callback; at 0 the filters evaluate.
+    normals : dict of TensorVariable to TensorVariable
+        Inputs, each with the expression of its values, which depends only on the seed and on the
+        steps of the record. With an empty vector the filter draws from its seed.
+    """
+
+    kinds: tuple[tuple[StateSpaceModel, Filter], ...]
+    address: TensorVariable
+    normals: dict[TensorVariable, TensorVariable]
+
+
+def with_likelihood_callback(
+    graphs: Sequence[Variable], held: Mapping[str, SharedVariable]
+) -> tuple[list[Variable], CallbackLikelihoods]:
+    """Graphs whose noisy likelihoods a `PythonCallback` can evaluate, with the same values.
+
+    Likelihoods whose seed is in ``held`` read stored normals, made once from that seed.
+    """
+    address = pt.lscalar("callback")
+    replaced: dict[Variable, Variable] = {}
+    normals: dict[TensorVariable, TensorVariable] = {}
+    names = {seed: name for name, seed in held.items()}
+    noisy_nodes = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
+    for number, node in enumerate(noisy_nodes):
+        system, filter = node.op.system, node.op.filter
+        steps, seed = node.inputs[1], node.inputs[-1]
+        if seed in names and isinstance(filter, EnsembleFilter):
+            stored = pt.dvector(f"{names[seed]}_normals")
+            normals[stored] = StoredNoise(system, filter)(steps, seed)
+            op: LogLikelihood = CallbackLogLikelihoodOfNoise(system, filter)
+            outputs = op(*node.inputs, stored, number, address)
+        else:
+            outputs = CallbackLogLikelihood(system, filter)(*node.inputs, number, address)
+        replaced |= dict(zip(node.outputs, outputs, strict=True))
+    kinds = tuple((node.op.system, node.op.filter) for node in noisy_nodes)
+    return clone_replace(list(graphs), replaced), CallbackLikelihoods(kinds, address, normals)
+
+
+class AutoregressiveNoise(NamedTuple):
+    """The symbols of `autoregressive_noise`; one entry per noisy variable.
+
+    Attributes
+    ----------
+    correlation : TensorVariable
+        Input, from 0 to 1: the correlation of the moved normals with the current ones.
+    normals : tuple of TensorVariable
+        Inputs: the current normals, finite, ``sizes`` of them.
+    moved : tuple of TensorVariable
+        The moved normals, which are stored if the move is accepted.
+    sizes : tuple of TensorVariable
+        Number of normals, a function of the steps of the record alone.
+    """
+
+    correlation: TensorVariable
+    normals: tuple[TensorVariable, ...]
+    moved: tuple[TensorVariable, ...]
+    sizes: tuple[TensorVariable, ...]
+
+
+def autoregressive_noise(
+    graphs: Sequence[Variable], seeds: Mapping[str, SharedVariable]
+) -> tuple[list[Variable], AutoregressiveNoise]:
+    """Graphs whose noise is an autoregressive move of given normals, not a fresh draw.
+
+    Normals u become rho u + sqrt(1 - rho^2) v, where v are drawn from the seed; the result is
+    standard normal again (Deligiannidis, Doucet and Pitt 2018). Filters are replaced by their
+    smooth versions, whose estimate moves little if the normals do. With rho = 0 the estimate is
+    that of the seed.
+
+    Raises
+    ------
+    ModelError
+        If a filter has no smooth version for its system.
+    """
+    correlation = pt.dscalar("correlation")
+    innovation = pt.sqrt(1.0 - correlation**2)
+    replaced: dict[Variable, Variable] = {}
+    noises: list[tuple[TensorVariable, TensorVariable, TensorVariable]] = []
+    names = {seed: name for name, seed in seeds.items()}
+    for node in likelihood_nodes(graphs):
+        if node.inputs[-1] in names:
+            *arguments, seed = node.inputs
+            system, noisy, steps = node.op.system, node.op.filter, arguments[1]
+            if not isinstance(noisy, EnsembleFilter):
+                raise ModelError(
+                    f"correlation needs a filter whose normals can be stored, such as "
+                    f"psf.BootstrapPF(100), got {noisy!r}"
+                )
+            compiled = compile_system(system)
+            filter = noisy.smooth(compiled)
+            filter.check(compiled)
+            normals = pt.dvector(f"{names[seed]}_normals")
+            fresh = StoredNoise(system, filter)(steps, seed)
+            moved = correlation * normals + innovation * fresh
+            # The sum of one element, or of none: the last step of an empty record is 0.
+            size = filter.n_normals(compiled, pt.sum(steps[-1:]), steps.shape[0])
+            outputs = LogLikelihoodOfNoise(system, filter)(*arguments, moved)
+            replaced |= dict(zip(node.outputs, outputs, strict=True))
+            noises.append((normals, moved, size))
+    columns = zip(*noises, strict=True) if noises else ((), (), ())
+    return clone_replace(list(graphs), replaced), AutoregressiveNoise(correlation, *columns)
+
+
+def with_filter(
+    graphs: Sequence[Variable], model: pm.Model, filters: Mapping[str, Filter]
+) -> list[Variable]:
+    """Graphs of a model's log-density in which some variables have another filter.
+
+    ``filters`` maps names of variables to their new filters. Data, parameters and seed stay the
+    same: a deterministic filter ignores the seed, and a noisy filter that replaces a deterministic
+    one uses that variable's constant seed.
+
+    Raises
+    ------
+    ModelError
+        If a name is not that of a StateSpace variable, its likelihood is not in the graphs, or the
+        filter cannot treat its system.
+    """
+    variables = state_space_nodes(model)
+    for name, filter in filters.items():
+        if name not in variables:
+            raise ModelError(
+                f"filters must name StateSpace variables, {list(variables)}, got {name!r}"
+            )
+        check_system_and_filter(variables[name].op.system, filter)
+    replaced: dict[Variable, Variable] = {}
+    found: set[str] = set()
+    for node in likelihood_nodes(graphs):
+        names = [name for name in variables if _is_likelihood_of(node, model, variables[name])]
+        found.update(names)
+        new = {filters.get(name, node.op.filter) for name in names}
+        if len(new) > 1:
+            raise ModelError(
+                f"filters must be the same for {', '.join(names)}: their likelihoods are equal"
+            )
+        if names:
+            outputs = LogLikelihood(node.op.system, new.pop())(*node.inputs)
+            replaced |= dict(zip(node.outputs, outputs, strict=True))
+    if missing := [name for name in filters if name not in found]:
+        raise ModelError(f"the graphs must contain the likelihood of {', '.join(missing)}")
+    return clone_replace(list(graphs), replaced)
+
+
+def _is_likelihood_of(node: Any, model: pm.Model, variable: Any) -> bool:
+    """Whether a likelihood node has the system, filter, steps, data and seed of a variable."""
+    expected = (variable.inputs[3], model.rvs_to_values[variable.outputs[1]], variable.inputs[-1])
+    found = (node.inputs[1], node.inputs[2], node.inputs[-1])
+    same_op = (node.op.system, node.op.filter) == (variable.op.system, variable.op.filter)
+    return same_op and all(map(_is_same, found, expected))
+
+
+def _is_same(a: Variable, b: Variable) -> bool:
+    """Whether two inputs are the same variable or equal constants, which PyMC merges."""
+    return a is b or (isinstance(a, Constant) and isinstance(b, Constant) and a.equals(b))
+
+
+def smooth_filters(model: pm.Model) -> dict[str, Filter]:
+    """The filters that `autoregressive_noise` uses, by the names of the noisy variables."""
+    nodes = state_space_nodes(model)
+    ops = {name: nodes[name].op for name in noisy_filters(model)}
+    return {name: op.filter.smooth(compile_system(op.system)) for name, op in ops.items()}

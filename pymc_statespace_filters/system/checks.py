@@ -1,0 +1,57 @@
+"""Checks of single numbers that users give: integers, positive numbers, seeds."""
+
+from numbers import Integral, Real
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from pymc_statespace_filters.errors import ModelError
+
+
+def is_integer(value: Any) -> TypeGuard[int]:
+    """Whether a value is an integer, Python's or NumPy's, and not a truth value."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a finite real number, Python's or NumPy's, and not a truth value."""
+    is_real = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    return is_real and bool(np.isfinite(value))
+
+
+def check_count(name: str, value: Any, least: int) -> int:
+    """Return ``value`` as an int of at least ``least``."""
+    if not is_integer(value) or value < least:
+        raise ModelError(f"{name} must be an integer of at least {least}, got {value!r}")
+    return int(value)
+
+
+def check_positive(name: str, value: Any) -> float:
+    """Return ``value`` as a positive float, such as a length of time."""
+    if not is_finite(value) or value <= 0:
+        raise ModelError(f"{name} must be a positive number, got {value!r}")
+    return float(value)
+
+
+def check_finite(name: str, value: Any) -> float:
+    """Return ``value`` as a finite float."""
+    if not is_finite(value):
+        raise ModelError(f"{name} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def check_random_seed(random_seed: Any) -> np.random.Generator:
+    """The random generator of a seed; a generator is returned as it is."""
+    try:
+        return np.random.default_rng(random_seed)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"random_seed must be None, an integer that is not negative or a "
+            f"numpy.random.Generator, got {random_seed!r}"
+        ) from None
+
+
+def shortened(value: Any) -> str:
+    """The text of a value on one line, at most 80 characters of it."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else text[:77] + "..."

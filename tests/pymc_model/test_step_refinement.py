@@ -1,0 +1,138 @@
+"""Eigenvalues of the step's Jacobian along a system's path, against what they are by hand."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.step_refinement import (
+    densities_by_steps,
+    path_eigenvalues,
+    step_stability,
+)
+
+OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
+
+
+def euler(drift, n=1, substeps=1, mean=1.0, **kwargs):
+    return psf.StateSpaceModel(
+        transition=psf.EulerMaruyama(drift, 0.3 * np.eye(n), dt=0.1, substeps=substeps),
+        initial_mean=[mean] * n,
+        initial_cov=np.eye(n),
+        **OBSERVED,
+        **kwargs,
+    )
+
+
+def multiplier(system, theta, n_steps=100, inputs=None, t0=0.0):
+    """Smallest real part of an eigenvalue, which decides on Euler-Maruyama steps."""
+    return eigenvalues(system, theta, n_steps, inputs, t0).real.min(axis=(1, 2))
+
+
+def eigenvalues(system, theta, n_steps=100, inputs=None, t0=0.0):
+    m = len(theta)
+    inputs = np.zeros((0, system.n_inputs)) if inputs is None else inputs
+    return path_eigenvalues(
+        system,
+        np.asarray(theta),
+        np.tile(np.arange(n_steps + 1), (m, 1)),
+        np.tile(inputs, (m, 1, 1)),
+        np.full(m, t0),
+    )
+
+
+@pytest.mark.parametrize("substeps", [1, 2, 5])
+def test_a_linear_state(substeps):
+    """Of one substep: that of two is positive again where each overshoots."""
+    a = np.array([[-1.0], [-9.0], [-15.0], [2.0]])
+    found = multiplier(euler(lambda x, a: [a * x[0]], substeps=substeps), a, n_steps=10)
+    np.testing.assert_allclose(found, 1 + a[:, 0] * 0.1 / substeps, rtol=1e-12)
+
+
+def test_the_path_finds_the_well():
+    """From 0.5 it falls into the well at 1, where the slope is -2 alpha."""
+    found = multiplier(euler(lambda x, a: [a * (x[0] - x[0] ** 3)], mean=0.5), [[3.0], [6.0]])
+    np.testing.assert_allclose(found, [1 - 0.6, 1 - 1.2], atol=1e-4)
+
+
+def test_a_path_that_diverges_is_not_stable():
+    system = euler(lambda x, a: [a * x[0] ** 3], mean=5.0)
+    found = eigenvalues(system, [[-1.0], [-0.01]])
+    assert np.isnan(found[0]).any()
+    assert np.isfinite(found[1]).all()
+    assert list(system.integrator.is_stable_at(found).all(axis=1)) == [False, True]
+
+
+def test_an_oscillator_does_not_overshoot():
+    """Complex multipliers 1 - c h / 2 +- i w h: it is their real part that counts."""
+    found = multiplier(euler(lambda x, c: [x[1], -25 * x[0] - c * x[1]], n=2), [[0.4]])
+    np.testing.assert_allclose(found, 1 - 0.4 * 0.1 / 2, rtol=1e-9)
+
+
+def test_inputs_and_time_move_the_path():
+    """A slope of -(u + t) x at steps of 0.1: the last of u and of t count."""
+    system = euler(lambda x, u, t, b: [-(u[0] + t) * b * x[0]], substeps=2, inputs=["u"])
+    found = multiplier(system, [[1.0]], 10, np.arange(10.0)[:, None], t0=3.0)
+    np.testing.assert_allclose(found, 1 - (9 + 4.0) * 0.05, rtol=1e-9)
+
+
+def test_an_euler_step_is_stable_while_no_eigenvalue_is_negative():
+    step = psf.EulerMaruyama(lambda x, a: [a * x[0]], [[0.3]], dt=0.1)
+    eigenvalues = np.array([[0.5, -0.1], [0.5, 0.0], [0.5, 0.1 + 2j], [0.5, np.nan]])
+    assert list(step.is_stable_at(eigenvalues)) == [False, True, True, False]
+
+
+@pytest.fixture(scope="module")
+def runge_kutta():
+    """The integrator of the guide, which inherits nothing."""
+    page = Path(__file__).parents[2] / "docs/howto/integrator.md"
+    cell = re.search(r"```\{code-cell\} python3\n(.*?)```", page.read_text(), re.DOTALL).group(1)
+    modules = re.findall(r"^(?:from|import) (pymc_statespace_filters[\w.]*)", cell, re.MULTILINE)
+    assert modules == ["pymc_statespace_filters", "pymc_statespace_filters.system"]
+    namespace = {"__name__": "runge_kutta"}
+    exec(cell, namespace)
+    return namespace["RungeKutta4"]
+
+
+def linear_by(integrator):
+    return psf.StateSpaceModel(
+        transition=integrator, initial_mean=[1.0], initial_cov=[[0.5]], **OBSERVED
+    )
+
+
+def test_an_integrator_of_a_user_says_where_it_is_stable(runge_kutta):
+    """The rule multiplies by 1 + z + z^2 / 2 + z^3 / 6 + z^4 / 24, above one for z < -2.785."""
+    system = linear_by(runge_kutta(lambda x, a: [a * x[0]], ((0.3,),), 0.2, substeps=2))
+    z = np.array([-0.1, -1.0, -2.7, -2.9, -4.0])
+    found = eigenvalues(system, z[:, None] / 0.1, n_steps=10)
+    by_hand = 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24
+    np.testing.assert_allclose(found, np.broadcast_to(by_hand[:, None, None], found.shape))
+    stable = system.integrator.is_stable_at(found).all(axis=1)
+    assert list(stable) == [True, True, True, False, False]
+
+
+def test_a_model_with_an_integrator_of_a_user_is_refined(runge_kutta):
+    system = linear_by(runge_kutta(lambda x, a: [a * x[0]], ((0.3,),), 0.1))
+    with pm.Model() as model:
+        a = pm.Normal("a")
+        psf.StateSpace("d", system, psf.EKF(), steps=[10, 20], observed=[0.4, 0.2])
+    assert list(step_stability(model)(np.array([[-1.0], [-29.0]]))) == [True, False]
+    coarse, fine = pytensor.function(
+        [model.rvs_to_values[a]], list(densities_by_steps(model)), mode="FAST_COMPILE"
+    )(-1.0)
+    assert 0 < abs(coarse - fine) < 0.05
+
+
+def test_an_incomplete_integrator_is_refused():
+    class Step:
+        dt, equations = 0.1, ()
+
+        def step(self, values):
+            return values["x"]
+
+    with pytest.raises(psf.ModelError, match="without noise_size, substep, refined, is_stable_at"):
+        linear_by(Step())
