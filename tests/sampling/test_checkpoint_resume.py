@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import warnings
-from contextlib import nullcontext
 
 import numpy as np
 import pymc as pm
@@ -98,16 +97,15 @@ def often(monkeypatch):
     monkeypatch.setattr(chain_run, "CHECKPOINT_SECONDS", 0.0)
 
 
-def test_a_log_torn_anywhere(small, tmp_path, often):
+def test_a_segment_torn_anywhere(small, tmp_path, often):
     expected = sample_dram(small, **SMALL)
     folder = tmp_path / "run"
     assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
-    log = folder / "chain-1.log"
-    whole = log.read_bytes()
-    for size in (0, 5, len(whole) // 3, len(whole) - 1):
-        log.write_bytes(whole[:size])
-        lost = pytest.warns(CheckpointWarning, match="chain-1.log: record")
-        with lost if size else nullcontext():
+    for share in (0.0, 0.3, 1.0):
+        path = sorted(folder.glob("chains.*/chain-1.*.segment"))[int(-share)]
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * (len(content) - 1))])
+        with pytest.warns(CheckpointWarning, match="chain-1.*: record"):
             found = sample_dram(small, checkpoint=folder, **SMALL)
         assert_identical(found, expected)
         # It is mended: not a byte differs in what is stored of the draws.
@@ -136,7 +134,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         patch.setattr(chain_run.ChainRun, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
-    assert (tmp_path / "chain-0.log").stat().st_size > 10_000
+    assert sum(path.stat().st_size for path in tmp_path.glob("chains.*/chain-0.*")) > 10_000
     tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     assert_identical(again, tree)
@@ -147,9 +145,9 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"draws": 701}, r"draws: the checkpoint has 700, asked for 701"),
-        ({"random_seed": 2}, r"random_seed: the checkpoint has \[1\], asked for \[2\]"),
-        ({"random_seed": None}, r"random_seed: the checkpoint has \[1\], asked for null"),
+        ({"draws": 701}, r"draws: the checkpoint has 700, this run has 701"),
+        ({"random_seed": 2}, r"random_seed: the checkpoint has \[1\], this run has \[2\]"),
+        ({"random_seed": None}, r"random_seed: the checkpoint has \[1\], this run has null"),
         ({"stages": 2}, r"stages: "),
         ({"initvals": {"phi": 0.1}}, r"initvals: "),
         ({"proposal_cov": [[0.1]]}, r"proposal_cov: "),

@@ -120,7 +120,7 @@ class ChainRun:
         self._rng = np.random.default_rng(plan.seeds[index])
         self.key = draw_key(self._rng)
         self._block: tuple[int, Random] | None = None
-        self._log = None if checkpoint is None else checkpoint.log(index)
+        self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             draws, state = stored
             self.key = state.pop("key")

@@ -184,9 +184,6 @@ class _Dealer:
         for job, run in self._crew.at_work.items():
             self._show(job, run)
         self._listen()
-        for model in self._models:
-            if model.checkpoint is not None:
-                model.checkpoint.beat()
 
     def _show(self, job: Job, run: ChainRun) -> None:
         if run.done > 0:
