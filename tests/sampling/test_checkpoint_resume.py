@@ -14,7 +14,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
-from pymc_statespace_filters.sampling.run import chain_task as chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from pymc_statespace_filters.sampling.run.thread_pool import Crew
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
@@ -38,16 +38,16 @@ def sample_kind(kind, **changes):
 KILLED = """
 import os, sys, time, warnings
 warnings.simplefilter("ignore")
-from pymc_statespace_filters.sampling import chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from tests.sampling.test_checkpoint_resume import sample_kind
-chain_run.CHECKPOINT_SECONDS = 0.01
-made = chain_run.ChainRun._advance
+chain_task.CHECKPOINT_SECONDS = 0.01
+made = chain_task.ChainRun._advance
 def advance(self):
     if self.done >= int(sys.argv[3]):
         os.write(1, b"there\\n")  # whole, whichever thread says it
         time.sleep(0.001 * (1 + self.done % 7))
     made(self)
-chain_run.ChainRun._advance = advance
+chain_task.ChainRun._advance = advance
 sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
 print("done", flush=True)
 """
@@ -94,7 +94,7 @@ SMALL = {"draws": 700, "tune": 400}
 
 @pytest.fixture
 def often(monkeypatch):
-    monkeypatch.setattr(chain_run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
 
 
 def test_a_segment_torn_anywhere(small, tmp_path, often):
@@ -114,7 +114,7 @@ def test_a_segment_torn_anywhere(small, tmp_path, often):
 
 def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
     first = sample_dram(small, checkpoint=tmp_path, **SMALL)
-    monkeypatch.setattr(chain_run.ChainRun, "_advance", None)
+    monkeypatch.setattr(chain_task.ChainRun, "_advance", None)
     assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
 
 
@@ -123,7 +123,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
     def seed():
         return np.random.default_rng(5) if random_seed else None
 
-    blocks, advance = itertools.count(), chain_run.ChainRun._advance
+    blocks, advance = itertools.count(), chain_task.ChainRun._advance
 
     def die(self):
         if next(blocks) == 5:
@@ -131,7 +131,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(chain_run.ChainRun, "_advance", die)
+        patch.setattr(chain_task.ChainRun, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
     assert sum(path.stat().st_size for path in tmp_path.glob("chains.*/chain-0.*")) > 10_000

@@ -19,7 +19,6 @@ from pymc_statespace_filters.sampling.kernel.state import (
     DONE,
     N_FAILED,
     PAUSE,
-    SCALING,
     STAGE,
     Draws,
     Random,
@@ -176,12 +175,9 @@ class ChainRun:
         """What a progress bar shows of the iterations made so far, one at least."""
         draws, done = self.running.draws, self.done
         begin = self._plan.tune if done > self._plan.tune else 0
-        counts = draws.counts[done - 1]
         return {
             "accept_rate": float(np.mean(draws.counts[begin:done, STAGE] > 0)),
-            "stage": int(counts[STAGE]),
-            "scaling": float(draws.numbers[done - 1, SCALING]),
-            "n_failed": int(counts[N_FAILED]),
+            "n_failed": int(draws.counts[done - 1, N_FAILED]),
         }
 
     def _start(self) -> tuple[int, ...]:
