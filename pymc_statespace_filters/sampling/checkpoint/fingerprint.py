@@ -1,8 +1,9 @@
-"""Fingerprints: whether a model, and its data, are those that a run was begun with.
+"""Fingerprints of a PyMC model and of its data, to tell whether a checkpoint is of the same run.
 
-A model is what its graphs compute. Each variable of a graph has a digest, of the operation that
-makes it and of the digests of what it is made from, down to constants and to inputs by name. So two
-builds of a model agree, in one process or in two, whatever the addresses and the order of sets.
+A model is identified by what its graphs compute. The digest of a variable is that of its operation
+and of the digests of the operation's inputs, down to constants and to inputs by name. So two builds
+of a model have the same fingerprint, in one process or in two: addresses and the order of sets do
+not enter.
 """
 
 import enum
@@ -29,7 +30,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 def model_fingerprint(model: pm.Model) -> str:
-    """Hash everything about a model that its draws depend on, but for the numbers in its data.
+    """Hash everything that the draws of a model depend on, except for the numbers in its data.
 
     Parameters
     ----------
@@ -42,14 +43,14 @@ def model_fingerprint(model: pm.Model) -> str:
         versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
         deterministic, name, dimension, coordinate and initial value, with the equations of a
         `StateSpace` and with the settings of its filter. Of observed values and other data it holds
-        type and name: see `data_fingerprint`. The Python code inside an operation of the user's own
-        is not seen, only what the operation is made of.
+        type and name: see `model_data_fingerprint`. Of an operation of the user's own it holds the
+        properties or attributes, not the Python code.
 
     Raises
     ------
     ModelError
-        If an operation is made of something that looks different in every process, such as a Python
-        function without a name; the message names both.
+        If an operation holds something that has no text which is the same in every process, such
+        as a Python function without a name; the message names both.
     """
     known = {value: _digest("value of", rv.name) for rv, value in _roots(model).items()}
     names = {
@@ -65,8 +66,8 @@ def model_fingerprint(model: pm.Model) -> str:
     return _digest(*described, _graph_digest(_outputs(model), known))
 
 
-def data_fingerprint(model: pm.Model) -> str:
-    """Hash all numbers that a model was given as data.
+def model_data_fingerprint(model: pm.Model) -> str:
+    """Hash all numbers that a model was given as data, with their names.
 
     Parameters
     ----------
@@ -76,9 +77,9 @@ def data_fingerprint(model: pm.Model) -> str:
     -------
     str
         Hexadecimal SHA-256 of the names, types and bytes of observed values, of `pymc.Data`, and
-        of every other shared variable that the model uses, the noise seeds of its likelihoods
-        among them. (The evidence compares models on one record, whatever they call it: its
-        fingerprint of data is another one.)
+        of every other shared variable that the model uses, including the noise seeds of its
+        likelihoods. (The ``data_fingerprint`` of an evidence is another one: that of the observed
+        values alone, which rival models share under any name.)
     """
     constants = {
         f"observed {rv.name}": value.data
@@ -89,14 +90,14 @@ def data_fingerprint(model: pm.Model) -> str:
     shared = [
         (v.name, v.get_value(borrow=True) if isinstance(v, SharedVariable) else v.data)
         for v in dict.fromkeys([*model.data_vars, *used])
-        # What draws outside the model, as a posterior predictive does, is seeded anew each time.
+        # Generators are for draws outside the log-density, as in a posterior predictive.
         if not isinstance(v.type, RandomType)
     ]
     return _digest(_described("the model's data", [constants, shared]))
 
 
 def _roots(model: pm.Model) -> dict[Variable, Variable]:
-    """Values of random variables that its graphs begin from: to be moved, or given as numbers."""
+    """Values of random variables at which the graphs begin: of free ones, and constants."""
     return {
         rv: model.rvs_to_values[rv]
         for rv in model.basic_RVs
@@ -110,7 +111,7 @@ def _outputs(model: pm.Model) -> list[Variable]:
 
 
 def _graph_digest(outputs: Sequence[Variable], known: Mapping[Variable, str]) -> str:
-    """A digest of what the outputs compute; inputs that are not known go by order, name and type.
+    """Digest of what the outputs compute; inputs not in ``known`` enter by order, name and type.
 
     Equal parts of a graph have equal digests, whether they are one node or several.
     """
@@ -141,17 +142,17 @@ def _digest(*parts: str | int) -> str:
 
 
 class _UnstableError(Exception):
-    """Something has no text that is the same in every process."""
+    """A value has no text that is the same in every process."""
 
 
 def _described(what: object, value: Any) -> str:
-    """Describe a value; where that is impossible, say what the value is of."""
+    """Describe a value; where that is impossible, name in the error what the value belongs to."""
     try:
         return describe(value)
     except _UnstableError as error:
         raise ModelError(
             f"{what} holds {error}, which cannot be recognised in another process: a run of this "
-            f"model could not be taken up from a checkpoint"
+            f"model could not be resumed from a checkpoint"
         ) from None
 
 
@@ -261,12 +262,12 @@ def _(value: Op) -> str:
     return f"{kind}({', '.join(parts)})"
 
 
-# What loops and optimisers are made of beside the graph that they run.
+# Attributes of loops and optimisers beside the graph that they run.
 _AROUND_A_GRAPH = ("info", "truncate_gradient", "method", "optimizer_kwargs", "bound_kwargs")
 
 
 def _settings(op: Op) -> dict[str, Any]:
-    """What an operation is made of: its properties, else all its attributes; and its graph."""
+    """The properties of an operation, else all its attributes; and its inner graph."""
     names = getattr(op, "__props__", _AROUND_A_GRAPH if hasattr(op, "fgraph") else vars(op))
     settings = {name: getattr(op, name) for name in names if hasattr(op, name)}
     settings.pop("output_types_preference", None)  # a function; the types themselves are described

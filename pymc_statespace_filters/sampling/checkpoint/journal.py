@@ -8,8 +8,8 @@ damaged file or one of another chain is recognised.
 A record has the draws since the one before, and the whole state of the chain. The last segments are
 merged whenever 16 of them have similar lengths, so a chain of n records has at most some
 16 log_16(n) files, and a draw is written about log_16(n) times. Only the last state is needed: a
-merged segment has no other, and all are merged where old states would fill the disk (a chain that
-carries its noise has a state of megabytes).
+merged segment has no other, and segments are also merged where old states would fill the disk (a
+chain that carries its noise has a state of megabytes).
 """
 
 import json
@@ -17,9 +17,10 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,22 +98,10 @@ class ChainJournal:
             If records were removed.
         """
         self._check()
-        self._segments, parts = [], []
-        listed = self._listed()
-        for i, segment in enumerate(listed):
-            n_records = self._n_records()
-            if segment.first < n_records:  # merged by a process that was killed before the removal
-                segment.path.unlink()
-                continue
-            part = self._load(segment) if segment.first == n_records else None
-            if part is None:
-                self._discard(listed[i:], n_records)
-                break
-            self._segments.append(_Segment(*segment[:3], *map(_n_bytes, part)))
-            parts.append(part)
+        stored = _joined(self._good_parts())
         self._is_read = True
         self._tidy()
-        return _joined(parts) if parts else None
+        return stored if self._segments else None
 
     def append(self, draws: Arrays, state: Arrays) -> None:
         """Write one record; when this returns, it is on the disk.
@@ -140,6 +129,22 @@ class ChainJournal:
 
     def _n_records(self) -> int:
         return self._segments[-1].last + 1 if self._segments else 0
+
+    def _good_parts(self) -> Iterator[StoredChain]:
+        """Load what follows in order from the first record; remove all else."""
+        self._segments = []
+        listed = self._listed()
+        for i, segment in enumerate(listed):
+            n_records = self._n_records()
+            if segment.first < n_records:  # merged by a process that was killed before the removal
+                segment.path.unlink()
+                continue
+            part = self._load(segment) if segment.first == n_records else None
+            if part is None:
+                self._discard(listed[i:], n_records)
+                return
+            self._segments.append(_Segment(*segment[:3], *map(_n_bytes, part)))
+            yield part
 
     def _listed(self) -> list[_Segment]:
         """All segments on disk by their first record, the longest first."""
@@ -183,25 +188,37 @@ class ChainJournal:
         return _Segment(path, first, last, _n_bytes(draws), _n_bytes(state))
 
     def _tidy(self) -> None:
-        """Merge all segments if their old states fill the disk, the last ones if they are many."""
-        in_draws = sum(segment.draw_bytes for segment in self._segments)
-        if sum(s.state_bytes for s in self._segments[:-1]) > _MAX_OLD_STATE_BYTES + in_draws:
-            self._merge(self._segments)
-        while len(tail := self._segments[-_FAN_IN:]) == _FAN_IN:
-            is_even = tail[0].n_records <= tail[-1].n_records * _FAN_IN // 2
-            if not is_even or sum(segment.draw_bytes for segment in tail) > _MAX_MERGED_BYTES:
+        """Merge segments if their old states fill the disk, or if there are many."""
+        tail = self._small_tail()
+        in_draws = sum(segment.draw_bytes for segment in tail)
+        if sum(s.state_bytes for s in tail[:-1]) > _MAX_OLD_STATE_BYTES + in_draws:
+            self._merge(tail)
+        while len(tail := self._small_tail()[-_FAN_IN:]) == _FAN_IN:
+            if tail[0].n_records > tail[-1].n_records * _FAN_IN // 2:
                 break
             self._merge(tail)
 
+    def _small_tail(self) -> list[_Segment]:
+        """As many of the last segments as may be merged."""
+        in_draws = accumulate(segment.draw_bytes for segment in reversed(self._segments))
+        n_small = sum(n_bytes <= _MAX_MERGED_BYTES for n_bytes in in_draws)
+        return self._segments[len(self._segments) - n_small :]
+
     def _merge(self, tail: Sequence[_Segment]) -> None:
         """Write the last segments anew as a single one, with the last state alone."""
-        parts = [part for segment in tail if (part := self._load(segment)) is not None]
-        if len(parts) < len(tail):
-            raise OSError(f"{tail[0].path.parent}: a file was damaged after it had been written")
-        merged = self._write(tail[0].first, tail[-1].last, *_joined(parts))
+        merged = self._write(tail[0].first, tail[-1].last, *_joined(map(self._load_again, tail)))
         self._segments = [*self._segments[: -len(tail)], merged]
         for segment in tail:
             segment.path.unlink()
+
+    def _load_again(self, segment: _Segment) -> StoredChain:
+        part = self._load(segment)
+        if part is None:
+            raise OSError(
+                f"{segment.path} was damaged after it had been written; the same call resumes from "
+                f"the records before it"
+            )
+        return part
 
     def _discard(self, segments: Sequence[_Segment], n_good: int) -> None:
         first = segments[0]
@@ -232,12 +249,15 @@ def sync_folder(path: Path) -> None:
     os.close(folder)
 
 
-def _joined(parts: Sequence[StoredChain]) -> StoredChain:
+def _joined(parts: Iterable[StoredChain]) -> StoredChain:
     """All draws, and the last state."""
-    if len(parts) == 1:
-        return parts[0]
-    draws = {name: np.concatenate([part.draws[name] for part in parts]) for name in parts[0].draws}
-    return StoredChain(draws, parts[-1].state)
+    draws: list[dict[str, np.ndarray]] = []
+    state: dict[str, np.ndarray] = {}
+    for part in parts:
+        draws.append(part.draws)
+        state = part.state
+    names = draws[0] if draws else {}
+    return StoredChain({name: np.concatenate([d[name] for d in draws]) for name in names}, state)
 
 
 def _n_bytes(arrays: Arrays) -> int:
