@@ -28,17 +28,13 @@ def lease_file(folder, pid, host="node7", start=345, name="lease.0"):
     return path
 
 
-def moved_to(host, path):
-    """Change a lease file as if a process of another computer had written it."""
-    path.write_text(re.sub("host=.*", f"host={host}", path.read_text()))
-
-
 @contextmanager
 def lease_of_elsewhere(monkeypatch, folder, host="node7"):
     """A lease that a process of another computer holds, without a heartbeat for a while."""
     with monkeypatch.context() as other:
         other.setattr(lease, "_HEARTBEAT_SECONDS", 19.0)
+        other.setattr(lease, "_process_table", lambda: f"of {host}")
         held = lease.FolderLease(folder)
-    moved_to(host, held.path)
+    held.path.write_text(re.sub("host=.*", f"host={host}", held.path.read_text()))
     yield held
     held.release()

@@ -52,7 +52,7 @@ def write_journal(folder, sizes):
 
 
 def segments_in(folder):
-    return sorted(folder.glob("chain-*.segment"), key=lambda path: path.stat().st_mtime_ns)
+    return sorted(folder.glob("chain-*.segment"))
 
 
 def write(folder, sizes, settings=SETTINGS, chain=0):

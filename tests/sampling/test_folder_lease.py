@@ -4,16 +4,22 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
+from pathlib import Path
 from threading import Barrier, BrokenBarrierError, Thread
 
 import pytest
+from filelock import SoftFileLease
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint import lease
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease, check_held
-from tests.sampling.lease_clock import lease_file, lease_of_elsewhere, moved_to
+from tests.sampling.lease_clock import lease_file, lease_of_elsewhere
+
+with tempfile.TemporaryDirectory() as folder, SoftFileLease(Path(folder, "lease")) as held:
+    HOST = held.owner.hostname
 
 HOLDER = """
 import sys, time
@@ -41,6 +47,7 @@ def test_a_living_process_is_respected_and_a_killed_one_is_not(tmp_path, clock):
         try:
             process.stdout.readline()
             (path,) = tmp_path.iterdir()
+            assert re.search("host=(.*)", path.read_text())[1] == HOST
             clock.at_each_sleep.append(lambda: time.sleep(0.5))  # for heartbeats of the process
             with pytest.raises(ModelError) as caught:
                 FolderLease(tmp_path)
@@ -70,10 +77,7 @@ def test_a_folder_is_held_once_by_a_process(tmp_path, clock):
 
 @pytest.mark.parametrize("pid", [os.getpid(), os.getppid()])
 def test_a_process_that_has_the_number_of_a_dead_one_is_not_it(tmp_path, clock, pid):
-    held = FolderLease(tmp_path)
-    host = re.search("host=(.*)", held.path.read_text())[1]
-    held.release()
-    lease_file(tmp_path, pid, host, start=1)
+    lease_file(tmp_path, pid, HOST, start=1, name=f"lease.{lease._process_table()}-0")
     FolderLease(tmp_path).release()
     assert not names(tmp_path)
     assert clock.now == 20
@@ -96,7 +100,7 @@ def test_a_fork_does_not_release_the_folder_of_its_parent(tmp_path):
 # Owners on another computer, or in another container: only their heartbeats tell that they live.
 
 
-@pytest.mark.parametrize("host", ["node7", "a.b.c", "vm?pidns-f0000001"])
+@pytest.mark.parametrize("host", ["node7", "a.b.c", HOST, f"{HOST}?pidns-f0000001"])
 @pytest.mark.parametrize("number_lives_here", [True, False])
 def test_a_lease_of_elsewhere_that_is_not_touched_expires(tmp_path, clock, host, number_lives_here):
     path = lease_file(tmp_path, os.getpid() if number_lives_here else 2**22 + 1, host)
@@ -192,7 +196,7 @@ def test_of_two_newcomers_the_first_gets_the_folder(tmp_path, monkeypatch):
     step, got, living = Barrier(2), {}, []
 
     def sleep(_):
-        for path in living:
+        for path in list(living):
             with suppress(FileNotFoundError):  # the other one has ended
                 heartbeat(path)
         try:
@@ -210,13 +214,13 @@ def test_of_two_newcomers_the_first_gets_the_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(lease, "sleep", sleep)
     threads = [Thread(target=come, args=[name]) for name in ("first", "second")]
     for name, thread in zip(("first", "second"), threads, strict=True):
+        monkeypatch.setattr(lease, "_process_table", lambda name=name: name)
         thread.start()
         while thread.is_alive() and not step.n_waiting:
             time.sleep(0.001)  # until it has looked at the others
-        for path in tmp_path.iterdir():  # as on two computers
-            if "node" not in path.read_text():
-                moved_to(f"node-{name}", path)
-                living.append(path)
+        for path in tmp_path.glob(f"lease.{name}-*"):
+            path.write_text(re.sub("host=.*", f"host=node-{name}", path.read_text()))
+            living.append(path)
     for thread in threads:
         thread.join(60)
     assert "on node-first" in str(got["second"])

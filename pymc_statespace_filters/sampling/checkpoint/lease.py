@@ -2,10 +2,10 @@
 
 Each job puts a lease file of its own into the folder, and then looks at those of other jobs: of two
 jobs at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
-which names the process and its host, and touches it every few seconds in a thread. The lease of a
-process of this host that has ended is removed at once. Any other is watched, and removed if it is
-not touched for 20 s; only changes count, the clocks of two computers are never compared. A job that
-was suspended for longer finds its file gone and stores nothing more.
+which names the process and its host, and touches it every few seconds in a thread. The lease of an
+ended process of this computer is removed at once. Any other is watched, and removed if it is not
+touched for 20 s; only changes count, the clocks of two computers are never compared. A job that was
+suspended for longer finds its file gone and stores nothing more.
 
 SoftFileLease can also take over one common file. That is not used, because it exchanges two file
 names in one step, which NFS, SMB and most parallel file systems refuse: there the lease of a dead
@@ -14,7 +14,9 @@ job would be held for ever. File names that are never used again need no exchang
 
 import errno
 import os
+import platform
 from contextlib import suppress
+from hashlib import blake2b
 from pathlib import Path
 from time import sleep
 from uuid import uuid4
@@ -54,12 +56,12 @@ class FolderLease:
     """
 
     def __init__(self, folder: Path):
-        self.path = folder / f"{PREFIX}{uuid4().hex}"
+        self.path = folder / f"{PREFIX}{_process_table()}-{uuid4().hex[:16]}"
         self._lease = _lease(self.path)
         self._lease.acquire(blocking=False)
         try:
             others = [path for path in folder.glob(f"{PREFIX}*") if path != self.path]
-            ended = [path for path in others if _has_ended(path, self.path)]
+            ended = [path for path in others if _has_ended(path)]
             expired = _expired([path for path in others if path not in ended])
             for path in ended + expired:
                 try:
@@ -103,18 +105,31 @@ def _lease(path: Path) -> SoftFileLease:
     )
 
 
-def _has_ended(path: Path, own: Path) -> bool:
-    """Whether the owner is a process of this host that has ended; raise if it is this one."""
+def _process_table() -> str:
+    """Identify the table of processes that this one is in: of this computer, and this container.
+
+    Computers and containers may have the same name; the kernel's start and the name space of
+    process numbers tell them apart.
+    """
+    table = platform.node()
+    with suppress(OSError):
+        table += Path("/proc/sys/kernel/random/boot_id").read_text()
+        table += os.readlink("/proc/self/ns/pid")
+    return blake2b(table.encode(), digest_size=8).hexdigest()
+
+
+def _has_ended(path: Path) -> bool:
+    """Whether the owner is a process of this table that has ended; raise if it is this one."""
     if _lease(path).is_lock_held_by_us:
         raise ModelError(f"{path.parent} is in use by this process already: {path}")
+    pid = _lease(path).pid
+    if pid is None or not path.name.startswith(f"{PREFIX}{_process_table()}-"):
+        return False
     if os.name == "nt":  # removing the file will tell
         return True
-    owner, here = _lease(path).owner, _lease(own).owner
-    if owner is None or here is None or owner.hostname != here.hostname:
-        return False
     with suppress(PermissionError):  # a process of another user
         try:
-            os.kill(owner.pid, 0)
+            os.kill(pid, 0)
         except ProcessLookupError:
             return True
     return False
