@@ -1,27 +1,150 @@
-"""A progress bar for work that is done in threads, row by row."""
+"""Progress bars, drawn by PyMC: of sampled chains, and of rows that are evaluated in threads."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
-from typing import Protocol
+from typing import Any, Protocol
 
-from pymc.progress_bar import create_simple_progress
+from pymc.progress_bar import ProgressBarManager, create_simple_progress
+from pymc.progress_bar.rich_progress import RichProgressBackend
+from rich.progress import ProgressColumn, TextColumn
+from rich.table import Column
+from rich.theme import Theme
+
+# Below this share of accepted proposals a bar turns red.
+MIN_ACCEPT_RATE = 0.01
 
 PATIENCE = 2.0  # seconds without a progress bar
 
 
-class _Bar:
+def step_columns(n_chains: int) -> tuple[list[ProgressColumn], dict[str, list]]:
+    """DRAM's column in the bar of ``pm.sample``, and its first values, one per chain.
+
+    With a second one, PyMC would cut the times off in a terminal of 80 columns.
+    """
+    return [_column("accept_rate", "Accept", "0.2f")], {"accept_rate": [0.0] * n_chains}
+
+
+def stat_values(stats: Mapping[str, Any]) -> dict[str, Any]:
+    """What columns show of a draw's statistics, and whether the bar turns red."""
+    return {
+        "accept_rate": stats["accept_rate"],
+        "failed": stats["n_failed"],
+        "failing": stats["accept_rate"] < MIN_ACCEPT_RATE,
+    }
+
+
+def _column(key: str, title: str, form: str) -> ProgressColumn:
+    return TextColumn(f"{{task.fields[{key}]:{form}}}", table_column=Column(title, no_wrap=True))
+
+
+class ChainProgress(ProgressBarManager):
+    """Progress bars of several chains, each advanced by many iterations at once.
+
+    A context manager that leaves the terminal as it was, however the block ends. To be used from
+    one thread.
+
+    Parameters
+    ----------
+    n_chains, draws, tune : int
+    progressbar : bool or str
+        As in ``pm.sample``: True, False, "combined", "split", "combined+stats", "split+stats".
+    theme : rich.theme.Theme or str, optional
+        Colours, or a style sheet for marimo.
+
+    Raises
+    ------
+    ValueError
+        If ``progressbar`` is something else; with the message of ``pm.sample``.
+
+    Examples
+    --------
+    >>> from pymc_statespace_filters.progress import ChainProgress
+    >>> with ChainProgress(n_chains=1, draws=1000, tune=500, progressbar=False) as bars:
+    ...     bars.begin(0)
+    ...     bars.update(0, 1500, {"accept_rate": 0.3, "n_failed": 0})
+    """
+
+    step_name = "Draw"
+
+    def __init__(
+        self,
+        n_chains: int,
+        draws: int,
+        tune: int,
+        progressbar: Any = True,
+        theme: Theme | str | None = None,
+    ):
+        super().__init__(n_chains, progressbar, theme)
+        chains_per_bar = n_chains if self.combined_progress else 1
+        self._total, self._tune = chains_per_bar * (draws + tune), chains_per_bar * tune
+        self._done = [0] * n_chains
+        columns, stats = step_columns(n_chains)
+        columns.append(_column("failed", "Fails", "d"))
+        stats |= {"failed": [0] * n_chains, "draw": [0] * n_chains}
+        stats["marker_pos"] = [self._tune] * n_chains
+        self._backend = self._create_backend(self._total, columns, stats)
+        if isinstance(self._backend, RichProgressBackend):
+            # PyMC gives each column a share of the terminal, and cuts its text to it: let the bar
+            # alone take what the texts leave.
+            for column in self._backend._progress.columns[1:]:
+                column.get_table_column().ratio = None
+
+    def begin(self, chain: int) -> None:
+        """Start the clock of a chain; without this it starts at the first update."""
+        self._advance(chain, 0, {"failing": False})
+
+    def update(self, chain: int, done: int, stats: Mapping[str, Any], seconds: float = 0.0) -> None:
+        """Show how many iterations a chain has made.
+
+        Parameters
+        ----------
+        chain : int
+        done : int
+            Its iterations so far, warm-up included. Nothing is drawn if there are no new ones.
+        stats : mapping of str to number
+            "accept_rate" and "n_failed" of its last draw, as in ``sample_stats``.
+        seconds : float, optional
+            How long the chain has run, once it has ended: PyMC's bar has no speed for what took
+            less than a quarter of a second.
+        """
+        advance = done - self._done[chain]
+        if not self._show_progress or advance <= 0:
+            return
+        self._done[chain] = done
+        count = sum(self._done) if self.combined_progress else done
+        shown = stat_values(stats) | {"draw": count if count <= self._tune else count - self._tune}
+        self._advance(chain, advance, shown)
+        if count == self._total:
+            if seconds > 0.0 and not self.combined_progress:
+                shown |= {"sampling_speed": done / seconds, "speed_unit": "draws/s"}
+            self._advance(chain, 0, shown, is_last=True)
+
+    def _advance(
+        self, chain: int, advance: int, shown: dict[str, Any], is_last: bool = False
+    ) -> None:
+        self._backend.update(
+            task_id=0 if self.combined_progress else chain,
+            advance=advance,
+            failing=shown.pop("failing", False),
+            stats=shown,
+            is_last=is_last,
+            total=self._total,
+        )
+
+
+class _RowProgress:
     """A bar that appears once its task has taken two seconds, and goes with the next task."""
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack
         self._total = self._done = 0
         self._shown: tuple | None = None
-        self.announce("", 0)
+        self.begin("", 0)
 
-    def announce(self, task: str, total: int) -> None:
-        """Name what is evaluated next, and about how many rows that takes."""
-        if self._shown is not None:  # the number was a guess: what is done is done
+    def begin(self, task: str, total: int) -> None:
+        """Name the next task and about how many rows it has."""
+        if self._shown is not None:  # the total was an estimate
             bar, row = self._shown
             bar.advance(row, advance=max(0, self._total - self._done))
         self._stack.close()
@@ -40,20 +163,20 @@ class _Bar:
             bar.advance(row, advance=count)
 
 
-class Watched(Protocol):
-    """Work that calls ``on_progress``, in the main thread, with the number of new rows done."""
+class ReportsRows(Protocol):
+    """Work that calls ``on_progress``, in the main thread, with the number of new rows."""
 
     on_progress: Callable[[int], None]
 
 
 @contextmanager
-def watched(work: Watched, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
-    """Show how many rows were done, and for what.
+def row_progress(work: ReportsRows, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
+    """Show the progress of work that takes long.
 
-    Gives the function that names what comes next and about how many rows that takes.
+    Yields the function that begins a task, with its name and about how many rows it has.
     """
     with ExitStack() as stack:
-        bar = _Bar(stack)
+        bar = _RowProgress(stack)
         if enabled:
             work.on_progress = bar.advance
-        yield bar.announce
+        yield bar.begin

@@ -26,7 +26,7 @@ from pymc_statespace_filters.evidence.posterior.observed_data import (
     observation_count,
 )
 from pymc_statespace_filters.evidence.posterior.support import Support
-from pymc_statespace_filters.progress import watched
+from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
 
 MAXIMUM = "maximum likelihood"
@@ -77,7 +77,7 @@ def evidences_of(
         """The same for an estimator whatever the others are."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
-    with watched(density, enabled=progressbar) as announce:
+    with row_progress(density, enabled=progressbar) as announce:
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood

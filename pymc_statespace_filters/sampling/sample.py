@@ -10,7 +10,7 @@ from pymc.model import Model, modelcontext
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import subfolder
+from pymc_statespace_filters.sampling.checkpoint.checkpoint import folder_name
 from pymc_statespace_filters.sampling.run.driver import How, sample_models
 from pymc_statespace_filters.sampling.run.model_task import Asked
 from pymc_statespace_filters.sampling.run.warm_start import with_head_start
@@ -234,7 +234,7 @@ def run_models(
         draws, tune, chains, random_seed, initvals, not discard_tuned_samples, dram_settings
     )
     how = How(cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather)
-    folders = [] if checkpoint is None else [Path(checkpoint, subfolder(n)) for n in models]
+    folders = [] if checkpoint is None else [Path(checkpoint, folder_name(n)) for n in models]
     return sample_models(models, asked, how, folders)
 
 

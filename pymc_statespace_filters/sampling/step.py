@@ -16,9 +16,9 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.progress import stat_values, step_columns
 from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_key
 from pymc_statespace_filters.sampling.kernel.state import Random, State
-from pymc_statespace_filters.sampling.output import progress
 from pymc_statespace_filters.sampling.output import sample_stats as statistics
 from pymc_statespace_filters.sampling.output.warnings import Record, closing_warning
 from pymc_statespace_filters.sampling.run.chain import RunningChain
@@ -158,8 +158,8 @@ class DRAM(BlockedStep):
     name = "dram"
     default_blocked = True
     _state_class = DRAMState
-    _progressbar_config = staticmethod(progress.columns)
-    _make_progressbar_update_functions = staticmethod(progress.update_functions)
+    _progressbar_config = staticmethod(step_columns)
+    _make_progressbar_update_functions = staticmethod(lambda: (stat_values,))
 
     # Of the chain now running, as in DRAMState.
     _has_started: bool

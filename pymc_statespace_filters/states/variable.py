@@ -14,7 +14,7 @@ from pytensor.graph.traversal import ancestors
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.progress import watched
+from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
@@ -122,8 +122,8 @@ class VariableAtDraws:
         function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
         columns = [np.arange(np.prod(self._draws.shape)), *self._columns, *drawn.values()]
         calls = ParallelMap(function, [column[0] for column in columns], list(constant.values()))
-        with watched(calls, enabled=progressbar) as announce:
-            announce(task, len(columns[0]))
+        with row_progress(calls, enabled=progressbar) as begin:
+            begin(task, len(columns[0]))
             results = calls(*columns)
         ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
         parts = np.split(results, ends, axis=1)

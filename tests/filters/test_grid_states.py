@@ -9,6 +9,7 @@ from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters

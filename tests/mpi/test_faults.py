@@ -95,8 +95,8 @@ def wait_for_a_checkpoint(folder, since):
     """Wait until chains have been stored after a time."""
     begin = time.monotonic()
     while time.monotonic() - begin < 60:
-        logs = [log.stat() for log in folder.glob("run/chain-*.log")]
-        if any(log.st_mtime > since and log.st_size > 10_000 for log in logs):
+        stored = [path.stat() for path in folder.glob("run/chains.*/chain-*.segment")]
+        if any(file.st_mtime > since and file.st_size > 10_000 for file in stored):
             return
         time.sleep(0.05)
     raise AssertionError("nothing was stored")

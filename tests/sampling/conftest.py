@@ -2,14 +2,13 @@
 
 import pytest
 
-from pymc_statespace_filters.sampling.checkpoint import lease as folder_lock
-from tests.sampling.lock_clock import Clock
+from pymc_statespace_filters.sampling.checkpoint import lease
+from tests.sampling.lease_clock import Clock
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Time that passes for locks only when they wait."""
+    """Time that passes only while a lease is watched."""
     clock = Clock()
-    monkeypatch.setattr(folder_lock, "sleep", clock.sleep)
-    monkeypatch.setattr(folder_lock, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(lease, "sleep", clock.sleep)
     return clock

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import warnings
-from contextlib import nullcontext
 
 import numpy as np
 import pymc as pm
@@ -15,7 +14,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
-from pymc_statespace_filters.sampling.run import chain_task as chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from pymc_statespace_filters.sampling.run.thread_pool import Crew
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
@@ -39,16 +38,16 @@ def sample_kind(kind, **changes):
 KILLED = """
 import os, sys, time, warnings
 warnings.simplefilter("ignore")
-from pymc_statespace_filters.sampling import chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from tests.sampling.test_checkpoint_resume import sample_kind
-chain_run.CHECKPOINT_SECONDS = 0.01
-made = chain_run.ChainRun._advance
+chain_task.CHECKPOINT_SECONDS = 0.01
+made = chain_task.ChainRun._advance
 def advance(self):
     if self.done >= int(sys.argv[3]):
         os.write(1, b"there\\n")  # whole, whichever thread says it
         time.sleep(0.001 * (1 + self.done % 7))
     made(self)
-chain_run.ChainRun._advance = advance
+chain_task.ChainRun._advance = advance
 sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
 print("done", flush=True)
 """
@@ -95,19 +94,18 @@ SMALL = {"draws": 700, "tune": 400}
 
 @pytest.fixture
 def often(monkeypatch):
-    monkeypatch.setattr(chain_run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
 
 
-def test_a_log_torn_anywhere(small, tmp_path, often):
+def test_a_segment_torn_anywhere(small, tmp_path, often):
     expected = sample_dram(small, **SMALL)
     folder = tmp_path / "run"
     assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
-    log = folder / "chain-1.log"
-    whole = log.read_bytes()
-    for size in (0, 5, len(whole) // 3, len(whole) - 1):
-        log.write_bytes(whole[:size])
-        lost = pytest.warns(CheckpointWarning, match="chain-1.log: record")
-        with lost if size else nullcontext():
+    for share in (0.0, 0.3, 1.0):
+        path = sorted(folder.glob("chains.*/chain-1.*.segment"))[int(-share)]
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * (len(content) - 1))])
+        with pytest.warns(CheckpointWarning, match="chain-1.*: record"):
             found = sample_dram(small, checkpoint=folder, **SMALL)
         assert_identical(found, expected)
         # It is mended: not a byte differs in what is stored of the draws.
@@ -116,7 +114,7 @@ def test_a_log_torn_anywhere(small, tmp_path, often):
 
 def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
     first = sample_dram(small, checkpoint=tmp_path, **SMALL)
-    monkeypatch.setattr(chain_run.ChainRun, "_advance", None)
+    monkeypatch.setattr(chain_task.ChainRun, "_advance", None)
     assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
 
 
@@ -125,7 +123,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
     def seed():
         return np.random.default_rng(5) if random_seed else None
 
-    blocks, advance = itertools.count(), chain_run.ChainRun._advance
+    blocks, advance = itertools.count(), chain_task.ChainRun._advance
 
     def die(self):
         if next(blocks) == 5:
@@ -133,10 +131,10 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(chain_run.ChainRun, "_advance", die)
+        patch.setattr(chain_task.ChainRun, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
-    assert (tmp_path / "chain-0.log").stat().st_size > 10_000
+    assert sum(path.stat().st_size for path in tmp_path.glob("chains.*/chain-0.*")) > 10_000
     tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
     assert_identical(again, tree)
@@ -147,9 +145,9 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"draws": 701}, r"draws: the checkpoint has 700, asked for 701"),
-        ({"random_seed": 2}, r"random_seed: the checkpoint has \[1\], asked for \[2\]"),
-        ({"random_seed": None}, r"random_seed: the checkpoint has \[1\], asked for null"),
+        ({"draws": 701}, r"draws: the checkpoint has 700, this run has 701"),
+        ({"random_seed": 2}, r"random_seed: the checkpoint has \[1\], this run has \[2\]"),
+        ({"random_seed": None}, r"random_seed: the checkpoint has \[1\], this run has null"),
         ({"stages": 2}, r"stages: "),
         ({"initvals": {"phi": 0.1}}, r"initvals: "),
         ({"proposal_cov": [[0.1]]}, r"proposal_cov: "),

@@ -6,12 +6,14 @@ import sys
 
 import pymc as pm
 import pytest
+from pymc.progress_bar import MCMCProgressBarManager
 from rich.console import Console
 
-from pymc_statespace_filters.sampling.output.progress import watch
+from pymc_statespace_filters.progress import ChainProgress
+from pymc_statespace_filters.sampling.step import DRAM
 
 TUNE, DRAWS = 100, 900
-STATS = {"accept_rate": 0.25, "stage": 2, "scaling": 0.5, "n_failed": 3}
+STATS = {"accept_rate": 0.25, "n_failed": 3}
 FORMS = [True, "combined", "split", "combined+stats", "stats+combined", "split+stats"]
 
 
@@ -20,17 +22,17 @@ def tasks(bars):
     return bars._backend._progress.tasks
 
 
-def quiet(bars):
-    """Draw as in a terminal of 120 columns, but into a string."""
+def quiet(bars, **terminal):
+    """Draw into a string."""
     screen = io.StringIO()
-    console = Console(file=screen, force_terminal=True, width=120)
+    console = Console(file=screen, **terminal)
     bars._backend._progress.live.console = console
     return screen
 
 
 @pytest.mark.parametrize("progressbar", FORMS)
 def test_final_counts_are_reached(progressbar):
-    with watch(2, DRAWS, TUNE, progressbar) as bars:
+    with ChainProgress(2, DRAWS, TUNE, progressbar) as bars:
         for done in (60, 130, 131, 1000):
             for chain in range(2):
                 bars.update(chain, done, STATS)
@@ -44,7 +46,7 @@ def test_final_counts_are_reached(progressbar):
 
 def test_counts_on_the_way():
     """Each chain has its own; draws are counted anew after warm-up; time runs from the start."""
-    with watch(3, DRAWS, TUNE, "split+stats") as bars:
+    with ChainProgress(3, DRAWS, TUNE, "split+stats") as bars:
         bars.begin(0)
         bars.begin(1)
         bars.update(0, 60, STATS)
@@ -55,14 +57,13 @@ def test_counts_on_the_way():
         assert [task.completed for task in (first, second, third)] == [250, 100, 0]
         assert (first.fields["draw"], second.fields["draw"]) == (150, 100)
         assert (first.fields["failing"], second.fields["failing"]) == (False, True)
-        shown = [first.fields[name] for name in ("accept_rate", "stage", "scaling", "failed")]
-        assert shown == [0.25, 2, 0.5, 3]
+        assert (first.fields["accept_rate"], first.fields["failed"]) == (0.25, 3)
         assert (first.started, second.started, third.started) == (True, True, False)
         assert not first.finished
 
 
 def test_combined_counts_are_those_of_all_chains():
-    with watch(2, DRAWS, TUNE, "combined") as bars:
+    with ChainProgress(2, DRAWS, TUNE, "combined") as bars:
         bars.update(0, 150, STATS)
         (task,) = tasks(bars)
         assert (task.completed, task.total, task.fields["draw"]) == (150, 2000, 150)
@@ -72,20 +73,49 @@ def test_combined_counts_are_those_of_all_chains():
         assert not task.finished
 
 
-def test_what_is_drawn(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "140")
-    with watch(2, DRAWS, TUNE) as bars:
+@pytest.mark.parametrize("progressbar", FORMS)
+def test_all_is_legible_in_80_columns(progressbar, monkeypatch):
+    bars = ChainProgress(2, 90_000, 10_000, progressbar)
+    screen = quiet(bars, width=80)
+    with bars:
         for chain in range(2):
-            bars.update(chain, 1000, STATS)
-    drawn = capsys.readouterr().out
-    for title in ("Draw", "Acceptance", "Stage", "Scale", "Failed", "Speed", "Elapsed"):
-        assert title in drawn
-    assert drawn.count("900") == 2
+            bars.begin(chain)
+        for task in tasks(bars):  # for more than an hour
+            task.start_time -= 5000.0
+        bars.update(0, 100_000, STATS, seconds=5000.0)
+        bars.update(1, 99_999, STATS | {"n_failed": 12_345})
+    drawn = screen.getvalue()
+    titles = ["Progress", "Draw", "Speed", "Elapsed", "Remaining"]
+    if progressbar in (True, "combined+stats", "stats+combined", "split+stats"):
+        titles[2:2] = ["Accept", "Fails"]
+        assert "12345" in drawn
+        assert "0.25" in drawn
+    assert drawn.split()[: len(titles)] == titles
+    assert "\u2026" not in drawn
+    assert all(len(line) <= 80 for line in drawn.splitlines())
+    assert drawn.count("1:23:20") == len(tasks(bars))
+    assert "draws/s" in drawn
+
+
+def test_values_are_legible_in_80_columns_in_the_bar_of_pm_sample():
+    with pm.Model():
+        pm.Normal("x")
+        step = DRAM()
+    bars = MCMCProgressBarManager(step, 1, DRAWS, TUNE)
+    screen = quiet(bars, width=80)
+    with bars:
+        for draw in range(TUNE + DRAWS):
+            bars.update(0, False, draw, draw < TUNE, [STATS])
+    drawn = screen.getvalue()
+    assert "Accept" in drawn
+    assert "0.25" in drawn
+    assert drawn.count("0:00:0") == 2
+    assert drawn.splitlines()[-2].count("\u2026") == 0
 
 
 def test_the_speed_of_what_took_no_time():
     """PyMC's bar says 0 draws a second of a chain that ended within a quarter of a second."""
-    with watch(2, DRAWS, TUNE, "split") as bars:
+    with ChainProgress(2, DRAWS, TUNE, "split") as bars:
         bars.update(0, 1000, STATS, seconds=0.05)
         bars.update(1, 1000, STATS)
         assert [task.fields["sampling_speed"] for task in tasks(bars)] == [20_000, 0]
@@ -93,8 +123,8 @@ def test_the_speed_of_what_took_no_time():
 
 @pytest.mark.parametrize("progressbar", FORMS)
 def test_an_interrupt_leaves_the_terminal_clean(progressbar):
-    bars = watch(2, DRAWS, TUNE, progressbar)
-    screen = quiet(bars)
+    bars = ChainProgress(2, DRAWS, TUNE, progressbar)
+    screen = quiet(bars, force_terminal=True, width=120)
     with contextlib.suppress(KeyboardInterrupt), bars:
         bars.update(0, 300, STATS)
         raise KeyboardInterrupt
@@ -109,19 +139,19 @@ def test_nothing_is_drawn_or_imported_without_a_bar(capfd, monkeypatch):
     # What a bar in colours takes, and a look for notebooks.
     monkeypatch.setitem(sys.modules, "matplotlib.colors", None)
     monkeypatch.setitem(sys.modules, "marimo", None)
-    with watch(1, DRAWS, TUNE, False) as bars:
+    with ChainProgress(1, DRAWS, TUNE, False) as bars:
         bars.begin(0)
         bars.update(0, 5, STATS)
         bars.update(0, 1000, STATS)
     assert capfd.readouterr() == ("", "")
     with pytest.raises(ImportError):
-        watch(1, DRAWS, TUNE, True)
+        ChainProgress(1, DRAWS, TUNE, True)
 
 
 @pytest.mark.parametrize("progressbar", ["all", 1])
 def test_anything_else_is_refused_as_by_pm_sample(progressbar):
     with pytest.raises(ValueError, match="Invalid value for `progressbar`") as ours:
-        watch(1, DRAWS, TUNE, progressbar)
+        ChainProgress(1, DRAWS, TUNE, progressbar)
     with pm.Model():
         pm.Normal("x")
         with pytest.raises(ValueError, match="Invalid value for `progressbar`") as theirs:

@@ -14,7 +14,7 @@ from pymc_statespace_filters.system.graph_digest import described, digest, graph
 
 
 def model_fingerprint(model: pm.Model) -> str:
-    """Hash everything about a model that its draws depend on, but for the numbers in its data.
+    """Hash everything that the draws of a model depend on, except for the numbers in its data.
 
     Parameters
     ----------
@@ -27,14 +27,14 @@ def model_fingerprint(model: pm.Model) -> str:
         versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
         deterministic, name, dimension, coordinate and initial value, with the equations of a
         `StateSpace` and with the settings of its filter. Of observed values and other data it holds
-        type and name: see `values_fingerprint`. The Python code inside an operation of a user
-        is not seen, only what the operation is made of.
+        type and name: see `model_data_fingerprint`. Of an operation of the user's own it holds the
+        properties or attributes, not the Python code.
 
     Raises
     ------
     ModelError
-        If an operation is made of something that looks different in every process, such as a Python
-        function without a name; the message names both.
+        If an operation holds something that has no text which is the same in every process, such
+        as a Python function without a name; the message names both.
     """
     known = {value: digest("value of", rv.name) for rv, value in _roots(model).items()}
     names = {
@@ -50,8 +50,8 @@ def model_fingerprint(model: pm.Model) -> str:
     return digest(*texts, graph_digest(_outputs(model), known))
 
 
-def values_fingerprint(model: pm.Model) -> str:
-    """Hash all numbers that a model was given as data.
+def model_data_fingerprint(model: pm.Model) -> str:
+    """Hash all numbers that a model was given as data, with their names.
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ def values_fingerprint(model: pm.Model) -> str:
     -------
     str
         Hexadecimal SHA-256 of the names, types and bytes of observed values, of `pymc.Data`, and
-        of every other shared variable that the model uses, the noise seeds of its likelihoods
-        among them. (The evidence compares models on one record, whatever they call it: its
-        fingerprint of data is another one.)
+        of every other shared variable that the model uses, including the noise seeds of its
+        likelihoods. (The ``data_fingerprint`` of an evidence is another one: that of the observed
+        values alone, which rival models share under any name.)
     """
     constants = {
         f"observed {rv.name}": value.data
@@ -74,14 +74,14 @@ def values_fingerprint(model: pm.Model) -> str:
     shared = [
         (v.name, v.get_value(borrow=True) if isinstance(v, SharedVariable) else v.data)
         for v in dict.fromkeys([*model.data_vars, *used])
-        # What draws outside the model, as a posterior predictive does, is seeded anew each time.
+        # Generators are for draws outside the log-density, as in a posterior predictive.
         if not isinstance(v.type, RandomType)
     ]
     return digest(described("the model's data", [constants, shared]))
 
 
 def _roots(model: pm.Model) -> dict[Variable, Variable]:
-    """Values of random variables that its graphs begin from: to be moved, or given as numbers."""
+    """Values of random variables at which the graphs begin: of free ones, and constants."""
     return {
         rv: model.rvs_to_values[rv]
         for rv in model.basic_RVs

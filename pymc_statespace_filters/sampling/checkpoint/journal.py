@@ -1,23 +1,28 @@
-"""The log of a chain: draws and states in a file that only grows, whatever kills its writer.
+"""Draws and states of a chain on disk: immutable segments that no kill of the writer can tear.
 
-A record is self-contained: a head (mark, length of the body, length of the list of contents), the
-body (that list as JSON, then the numbers of each array), and a checksum. The checksum covers the
-head, the body and the checksum of the record before, the first one that of the run: a record that
-is torn, altered, out of order or of another chain is not taken for a good one, nor what follows.
+A segment is one file: the names of its arrays as JSON, the arrays in NumPy's npy format, and a
+checksum of the run, the chain, the numbers of the records in it, and the content. It is written
+under another name, brought to the disk and renamed: it is there as a whole or not at all, and a
+damaged file or one of another chain is recognised.
 
-Only the last state is ever needed. Where those before it fill the file (a chain that carries its
-noise has large ones), the log is written anew as a single record, which takes its place at once.
+A record has the draws since the one before, and the whole state of the chain. The last segments are
+merged whenever 16 of them have similar lengths, so a chain of n records has at most some
+16 log_16(n) files, and a draw is written about log_16(n) times. Only the last state is needed: a
+merged segment has no other, and segments are also merged where old states would fill the disk (a
+chain that carries its noise has a state of megabytes).
 """
 
 import json
 import os
-import struct
+import re
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,17 +30,15 @@ from pymc_statespace_filters.errors import CheckpointWarning
 
 Arrays = Mapping[str, np.ndarray]
 
-_HEAD = struct.Struct("<8sQQ")
-_MARK = b"psfchain"
+_FAN_IN = 16
+# Draws of more bytes are not merged.
+_MAX_MERGED_BYTES = 2**28
+_MAX_OLD_STATE_BYTES = 2**28  # beside as many as the draws have
 _CHECKSUM_SIZE = 4
-_FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
-# So many bytes of overtaken states, and as many as the draws have, may lie about in a log.
-_SPARE = 2**28
-_NUMBERS = "biuf"  # the kinds of numpy numbers whose bytes are all there is to them
 
 
-class Stored(NamedTuple):
-    """What a log holds of its chain.
+class StoredChain(NamedTuple):
+    """What a journal holds of its chain.
 
     Attributes
     ----------
@@ -49,160 +52,190 @@ class Stored(NamedTuple):
     state: dict[str, np.ndarray]
 
 
-class _Tip(NamedTuple):
-    """Where the next record goes, and the checksum that it follows on."""
+class _Segment(NamedTuple):
+    """Records ``first`` to ``last`` in one file."""
 
-    end: int
-    checksum: bytes
+    path: Path
+    first: int
+    last: int
+    draw_bytes: int = 0
+    state_bytes: int = 0
+
+    @property
+    def n_records(self) -> int:
+        return self.last - self.first + 1
 
 
-class ChainLog:
-    """The log of one chain; one thread at a time may use it.
+class ChainJournal:
+    """The stored records of one chain; one thread at a time may use it.
 
     Parameters
     ----------
     path : Path
-        The file; it need not exist.
+        The files are named after it, as in ``chain-0.16-31.segment``; its folder exists.
     origin : bytes
-        What its first record follows on: bytes that belong to this run and this chain alone.
+        Identifies the run and the chain; enters each checksum.
     check : callable
-        Raises where this log is not ours any more; called before the file is touched.
+        Raises if the files belong to another job by now; called before they are touched.
     """
 
     def __init__(self, path: Path, origin: bytes, check: Callable[[], None] = lambda: None):
-        self.path = path
-        self._check = check
-        self._origin = _checksum(origin)
-        self._file: BinaryIO | None = None
-        self._tip = _Tip(0, self._origin)
-        self._overtaken = 0
-        self._in_draws = 0
+        self._path, self._origin, self._check = path, origin, check
+        self._segments: list[_Segment] = []
+        self._is_read = False
 
-    def read(self) -> Stored | None:
-        """Read all good records, and cut off what follows them.
+    def read(self) -> StoredChain | None:
+        """Read all records up to the first that is missing or damaged; the later ones are removed.
 
         Returns
         -------
-        Stored or None
+        StoredChain or None
             None if there is no good record.
 
         Warns
         -----
         CheckpointWarning
-            If something was cut off; it names the file and what is lost.
+            If records were removed.
         """
         self._check()
-        stored = self._read()
-        if stored is not None and self._is_loose():
-            self._compact(stored)
-        return stored
-
-    def _read(self) -> Stored | None:
-        file = self._open()
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        tip = _Tip(0, self._origin)
-        parts: list[dict[str, np.ndarray]] = []
-        state: dict[str, np.ndarray] = {}
-        self._overtaken = self._in_draws = 0
-        for body, contents, checksum in _good_records(file, size, self._origin):
-            parts.append(_arrays(body, contents["draws"]))
-            self._overtaken += _n_bytes(state)
-            self._in_draws += _n_bytes(parts[-1])
-            state = _arrays(body, contents["state"])
-            tip = _Tip(file.tell(), checksum)
-        self._tip = tip
-        if tip.end < size:
-            file.truncate(tip.end)
-            self._warn(size - tip.end, len(parts))
-        if not parts:
-            return None
-        return Stored({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, state)
+        stored = _joined(self._good_parts())
+        self._is_read = True
+        self._tidy()
+        return stored if self._segments else None
 
     def append(self, draws: Arrays, state: Arrays) -> None:
         """Write one record; when this returns, it is on the disk.
-
-        The cost is that of the new draws and the state alone; most of it is spent without Python's
-        lock. Until it returns nobody may change the arrays, which are not copied. A record that
-        could not be written is taken back.
 
         Parameters
         ----------
         draws : mapping of str to ndarray, shape (new draws, ...)
             The draws since the last record, under the same names each time; numbers or booleans.
         state : mapping of str to ndarray
-            The state of the chain after them, whole.
+            The whole state of the chain after them.
 
         Raises
         ------
         OSError
-            If the disk refuses, for one because it is full.
+            If the disk refuses, for example because it is full. The record is not kept.
+        ValueError
+            If an array has Python objects.
         """
         self._check()
-        if self._file is None:
+        if not self._is_read:
             self.read()
-        file, is_first = self._open(), self._tip.end == 0
-        pieces = _record(draws, state, self._tip.checksum)
+        number = self._n_records()
+        self._segments.append(self._write(number, number, draws, state))
+        self._tidy()
+
+    def _n_records(self) -> int:
+        return self._segments[-1].last + 1 if self._segments else 0
+
+    def _good_parts(self) -> Iterator[StoredChain]:
+        """Load what follows in order from the first record; remove all else."""
+        self._segments = []
+        listed = self._listed()
+        for i, segment in enumerate(listed):
+            n_records = self._n_records()
+            if segment.first < n_records:  # merged by a process that was killed before the removal
+                segment.path.unlink()
+                continue
+            part = self._load(segment) if segment.first == n_records else None
+            if part is None:
+                self._discard(listed[i:], n_records)
+                return
+            self._segments.append(_Segment(*segment[:3], *map(_n_bytes, part)))
+            yield part
+
+    def _listed(self) -> list[_Segment]:
+        """All segments on disk by their first record, the longest first."""
+        pattern = re.compile(rf"{re.escape(self._path.name)}\.(\d+)-(\d+)\.segment")
+        found = [
+            _Segment(path, int(match[1]), int(match[2]))
+            for path in self._path.parent.iterdir()
+            if (match := pattern.fullmatch(path.name))
+        ]
+        return sorted(found, key=lambda segment: (segment.first, -segment.last))
+
+    def _load(self, segment: _Segment) -> StoredChain | None:
+        """What a segment holds, None if it is damaged or another one."""
+        content = memoryview(segment.path.read_bytes())
+        body, checksum = content[:-_CHECKSUM_SIZE], content[-_CHECKSUM_SIZE:]
+        if checksum != self._checksum(segment.path, body):
+            return None
+        file = BytesIO(body)
+        names = json.loads(file.readline())
+        return StoredChain(*({name: np.load(file) for name in listed} for listed in names))
+
+    def _write(self, first: int, last: int, draws: Arrays, state: Arrays) -> _Segment:
+        body = BytesIO()
+        body.write(json.dumps([list(draws), list(state)]).encode() + b"\n")
+        for array in [*draws.values(), *state.values()]:
+            np.save(body, array, allow_pickle=False)
+        path = self._path.with_name(f"{self._path.name}.{first}-{last}.segment")
+        unfinished = path.with_suffix(".unfinished")
         try:
-            file.seek(self._tip.end)
-            tip = _written(file, pieces)
-        except BaseException:
-            self._take_back(file)
+            with open(unfinished, "wb") as file:
+                file.write(body.getbuffer())
+                file.write(self._checksum(path, body.getbuffer()))
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        except OSError:
+            self._check()  # says so if the files belong to another job by now
+            unfinished.unlink(missing_ok=True)
             raise
-        self._tip = tip
-        self._overtaken += 0 if is_first else _n_bytes(state)
-        self._in_draws += _n_bytes(draws)
-        if self._is_loose():
-            self.read()
+        sync_folder(path.parent)
+        return _Segment(path, first, last, _n_bytes(draws), _n_bytes(state))
 
-    def close(self) -> None:
-        """Close the file; the log may be used again."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+    def _tidy(self) -> None:
+        """Merge segments if their old states fill the disk, or if there are many."""
+        tail = self._small_tail()
+        in_draws = sum(segment.draw_bytes for segment in tail)
+        if sum(s.state_bytes for s in tail[:-1]) > _MAX_OLD_STATE_BYTES + in_draws:
+            self._merge(tail)
+        while len(tail := self._small_tail()[-_FAN_IN:]) == _FAN_IN:
+            if tail[0].n_records > tail[-1].n_records * _FAN_IN // 2:
+                break
+            self._merge(tail)
 
-    def _open(self) -> BinaryIO:
-        if self._file is None:
-            existed = self.path.exists()
-            self._fresh_path().unlink(missing_ok=True)  # of a process killed before the exchange
-            # Not "a": what a failed write has left behind must be written over.
-            self._file = os.fdopen(os.open(self.path, _FLAGS, 0o666), "r+b")
-            if not existed:
-                sync_folder(self.path.parent)
-        return self._file
+    def _small_tail(self) -> list[_Segment]:
+        """As many of the last segments as may be merged."""
+        in_draws = accumulate(segment.draw_bytes for segment in reversed(self._segments))
+        n_small = sum(n_bytes <= _MAX_MERGED_BYTES for n_bytes in in_draws)
+        return self._segments[len(self._segments) - n_small :]
 
-    def _is_loose(self) -> bool:
-        return self._overtaken > _SPARE + self._in_draws
+    def _merge(self, tail: Sequence[_Segment]) -> None:
+        """Write the last segments anew as a single one, with the last state alone."""
+        merged = self._write(tail[0].first, tail[-1].last, *_joined(map(self._load_again, tail)))
+        self._segments = [*self._segments[: -len(tail)], merged]
+        for segment in tail:
+            segment.path.unlink()
 
-    def _compact(self, stored: Stored) -> None:
-        """Put a file of one record in the place of the log."""
-        fresh = self._fresh_path()
-        with os.fdopen(os.open(fresh, _FLAGS | os.O_TRUNC, 0o666), "r+b") as file:
-            self._tip = _written(file, _record(*stored, self._origin))
-        self.close()
-        os.replace(fresh, self.path)
-        sync_folder(self.path.parent)
-        self._overtaken = 0
+    def _load_again(self, segment: _Segment) -> StoredChain:
+        part = self._load(segment)
+        if part is None:
+            raise OSError(
+                f"{segment.path} was damaged after it had been written; the same call resumes from "
+                f"the records before it"
+            )
+        return part
 
-    def _fresh_path(self) -> Path:
-        return self.path.with_name(f"{self.path.name}.new")
-
-    def _take_back(self, file: BinaryIO) -> None:
-        """Cut off a half-written record, and what the file object would still write on closing."""
-        self._file = None
-        with suppress(OSError):
-            file.close()
-        self._check()  # or it would be another's file that is cut
-        os.truncate(self.path, self._tip.end)
-
-    def _warn(self, n_bytes: int, n_good: int) -> None:
-        remains = f"the chain goes on from record {n_good}" if n_good else "the chain begins anew"
+    def _discard(self, segments: Sequence[_Segment], n_good: int) -> None:
+        first = segments[0]
+        for segment in reversed(segments):  # the first last: if we are killed, it is found again
+            segment.path.unlink()
+        resumes = f"the chain resumes after record {n_good}" if n_good else "the chain begins anew"
         warnings.warn(
-            f"{self.path}: record {n_good + 1}, at byte {self._tip.end}, is torn or damaged. "
-            f"The last {n_bytes} bytes are lost and cut off; {remains}",
+            f"{first.path}: record {n_good + 1} is missing, damaged or of another chain. It and "
+            f"all later ones are removed; {resumes}",
             CheckpointWarning,
             stacklevel=3,
         )
+
+    def _checksum(self, path: Path, body: memoryview) -> bytes:
+        """CRC-32: a cryptographic hash would be most of the cost of a record."""
+        checksum = zlib.crc32(body, zlib.crc32(self._origin + path.name.encode()))
+        return checksum.to_bytes(_CHECKSUM_SIZE, "little")
 
 
 def sync_folder(path: Path) -> None:
@@ -216,79 +249,16 @@ def sync_folder(path: Path) -> None:
     os.close(folder)
 
 
-def _checksum(*pieces: Any) -> bytes:
-    """CRC-32: half the cost of a cryptographic hash, which is most of the cost of a record."""
-    checksum = 0
-    for piece in pieces:
-        checksum = zlib.crc32(piece, checksum)
-    return checksum.to_bytes(_CHECKSUM_SIZE, "little")
-
-
-def _good_records(
-    file: BinaryIO, size: int, last: bytes
-) -> Iterator[tuple[bytes, dict[str, Any], bytes]]:
-    """Body, list of contents and checksum of each record, up to the first that is not good."""
-    while (head := file.read(_HEAD.size)) and len(head) == _HEAD.size:
-        mark, body_size, contents_size = _HEAD.unpack(head)
-        if mark != _MARK or body_size + _CHECKSUM_SIZE > size - file.tell():
-            return
-        body, checksum = file.read(body_size), file.read(_CHECKSUM_SIZE)
-        if checksum != _checksum(last, head, body):
-            return
-        yield body, _located(json.loads(body[:contents_size]), contents_size), checksum
-        last = checksum
-
-
-def _record(draws: Arrays, state: Arrays, last: bytes) -> list[Any]:
-    """The pieces of a record that follows on a checksum; the last of them is its own."""
-    new_draws, new_state = _plain(draws), _plain(state)
-    contents = json.dumps({"draws": _contents(new_draws), "state": _contents(new_state)})
-    arrays = [*new_draws.values(), *new_state.values()]
-    body = [contents.encode(), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
-    head = _HEAD.pack(_MARK, sum(map(len, body)), len(body[0]))
-    return [head, *body, _checksum(last, head, *body)]
-
-
-def _written(file: BinaryIO, pieces: list[Any]) -> _Tip:
-    """Write a record where the file stands; when this returns, it is on the disk."""
-    file.writelines(pieces)
-    file.flush()
-    os.fsync(file.fileno())
-    return _Tip(file.tell(), pieces[-1])
+def _joined(parts: Iterable[StoredChain]) -> StoredChain:
+    """All draws, and the last state."""
+    draws: list[dict[str, np.ndarray]] = []
+    state: dict[str, np.ndarray] = {}
+    for part in parts:
+        draws.append(part.draws)
+        state = part.state
+    names = draws[0] if draws else {}
+    return StoredChain({name: np.concatenate([d[name] for d in draws]) for name in names}, state)
 
 
 def _n_bytes(arrays: Arrays) -> int:
     return sum(np.asarray(array).nbytes for array in arrays.values())
-
-
-def _plain(arrays: Arrays) -> dict[str, np.ndarray]:
-    """The arrays as contiguous little-endian numbers."""
-    plain = {}
-    for name, given in arrays.items():
-        array = np.asarray(given, order="C")
-        if array.dtype.kind not in _NUMBERS:
-            raise TypeError(f"{name}: a log holds numbers and booleans, got {array.dtype}")
-        plain[name] = array.astype(array.dtype.newbyteorder("<"), copy=False)
-    return plain
-
-
-def _contents(arrays: Arrays) -> list[tuple[str, str, tuple[int, ...]]]:
-    return [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-
-
-def _located(contents: dict[str, list], begin: int) -> dict[str, Any]:
-    """The contents of a record with the place of each array in its body."""
-    located: dict[str, list] = {"draws": [], "state": []}
-    for kind, listed in located.items():
-        for name, code, shape in contents[kind]:
-            dtype = np.dtype(code)
-            listed.append((name, dtype, shape, begin))
-            begin += int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-    return located
-
-
-def _arrays(body: bytes, located: list[tuple]) -> dict[str, np.ndarray]:
-    """Copies: an array that looked into the body would keep all of it in memory."""
-    return {
-        name: np.ndarray(shape, dtype, body, begin).copy() for name, dtype, shape, begin in located
-    }

@@ -19,7 +19,6 @@ from pymc_statespace_filters.sampling.kernel.state import (
     DONE,
     N_FAILED,
     PAUSE,
-    SCALING,
     STAGE,
     Draws,
     Random,
@@ -120,7 +119,7 @@ class ChainRun:
         self._rng = np.random.default_rng(plan.seeds[index])
         self.key = draw_key(self._rng)
         self._block: tuple[int, Random] | None = None
-        self._log = None if checkpoint is None else checkpoint.log(index)
+        self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             draws, state = stored
             self.key = state.pop("key")
@@ -176,12 +175,9 @@ class ChainRun:
         """What a progress bar shows of the iterations made so far, one at least."""
         draws, done = self.running.draws, self.done
         begin = self._plan.tune if done > self._plan.tune else 0
-        counts = draws.counts[done - 1]
         return {
             "accept_rate": float(np.mean(draws.counts[begin:done, STAGE] > 0)),
-            "stage": int(counts[STAGE]),
-            "scaling": float(draws.numbers[done - 1, SCALING]),
-            "n_failed": int(counts[N_FAILED]),
+            "n_failed": int(draws.counts[done - 1, N_FAILED]),
         }
 
     def _start(self) -> tuple[int, ...]:

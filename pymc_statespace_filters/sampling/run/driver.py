@@ -185,7 +185,7 @@ def _open_checkpoints(
             for run, folder in zip(runs, folders, strict=True):
                 in_words = run.asked.in_words(run.model)
                 run.checkpoint = stack.enter_context(open_checkpoint(folder, in_words))
-                tickets.append(run.checkpoint.ticket())
+                tickets.append(run.checkpoint.ticket)
         return tickets
 
     def join(tickets: list) -> None:

@@ -17,8 +17,8 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
+    model_data_fingerprint,
     model_fingerprint,
-    values_fingerprint,
 )
 from pymc_statespace_filters.sampling.kernel.state import STAGE
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
@@ -87,7 +87,7 @@ class Asked(NamedTuple):
             "discard_tuned_samples": not self.keeps_warmup,
             **{f.name: repr(getattr(self.settings, f.name)) for f in fields(self.settings)},
             "model": fingerprint[:_SHOWN_DIGITS],
-            "data": values_fingerprint(model)[:_SHOWN_DIGITS],
+            "data": model_data_fingerprint(model)[:_SHOWN_DIGITS],
             "version": version("pymc-statespace-filters"),
         }
 

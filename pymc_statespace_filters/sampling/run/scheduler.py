@@ -27,8 +27,8 @@ from pymc_statespace_filters.parallel.signals import (
     interrupts_left_to_another_rank,
     noticed_interrupts,
 )
+from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.kernel.state import Draws
-from pymc_statespace_filters.sampling.output.progress import watch
 from pymc_statespace_filters.sampling.run.chain_task import ChainResult, ChainRun
 from pymc_statespace_filters.sampling.run.model_task import ModelRun
 from pymc_statespace_filters.sampling.run.thread_pool import Crew, Job
@@ -128,7 +128,7 @@ class _Dealer:
         self._ended: dict[int, float] = {}
         self._others = set(range(1, ranks.size))
         asked = models[0].asked
-        self._bars = watch(len(self._places), asked.draws, asked.tune, progressbar)
+        self._bars = ChainProgress(len(self._places), asked.draws, asked.tune, progressbar)
 
     def deal(self) -> None:
         """Have all chains run, here and elsewhere."""
@@ -184,9 +184,6 @@ class _Dealer:
         for job, run in self._crew.at_work.items():
             self._show(job, run)
         self._listen()
-        for model in self._models:
-            if model.checkpoint is not None:
-                model.checkpoint.beat()
 
     def _show(self, job: Job, run: ChainRun) -> None:
         if run.done > 0:
