@@ -11,12 +11,15 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import SEQUENTIAL, terms_at
-from pymc_statespace_filters.diagnostics.truncated_data import record_of, shortened
+from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import (
+    SEQUENTIAL,
+    sequential_terms,
+)
+from pymc_statespace_filters.diagnostics.truncated_data import observed_values, truncate_data
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.variable import chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.variable import select_variables
 from pymc_statespace_filters.system.record import is_whole
 
 Refit = Callable[[pm.Model], xr.DataTree]
@@ -120,11 +123,11 @@ def leave_future_out(
     model = pm.modelcontext(model)
     variable = _one_variable(model, var_name)
     time, name = variable.dims[0], variable.name
-    seen = np.flatnonzero(~np.isnan(record_of(model, name)).all(axis=1))
+    seen = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))
     _check_number(min_observations, 0 if refit is None else 1, seen.size, name)
     terms = _stored(idata, name)
     if terms is None:
-        terms = terms_at(model, variable, draws_of(idata, None))
+        terms = sequential_terms(model, variable, select_draws(idata, None))
     terms = terms.isel({time: seen})
     if refit is None:
         return _backwards(idata, terms, min_observations)
@@ -143,7 +146,7 @@ def leave_future_out(
 
 
 def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
-    variables = chosen_variables(model, var_name)
+    variables = select_variables(model, var_name)
     if len(variables) > 1:
         names = [variable.name for variable in variables]
         raise ModelError(f"var_name must be one of {names}, got None")
@@ -260,7 +263,7 @@ class _Refits(SamplingWrapper):
 
     def sample(self, modified_observed_data: int) -> xr.DataTree:
         """Draws given the record up to a row."""
-        return self._refit(shortened(self.model, self._variable.name, modified_observed_data))
+        return self._refit(truncate_data(self.model, self._variable.name, modified_observed_data))
 
     def get_inference_data(self, fitted_model: xr.DataTree) -> xr.DataTree:
         """They are what the user's function returns."""
@@ -270,5 +273,5 @@ class _Refits(SamplingWrapper):
         self, excluded_obs: NDArray[np.int64], idata__i: xr.DataTree
     ) -> xr.DataArray:
         """Terms of later rows, with the noise of each draw of a shorter record."""
-        terms = terms_at(self.model, self._variable, draws_of(idata__i, None))
+        terms = sequential_terms(self.model, self._variable, select_draws(idata__i, None))
         return terms.isel({self._variable.dims[0]: excluded_obs})

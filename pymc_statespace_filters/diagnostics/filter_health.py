@@ -14,13 +14,13 @@ from pymc_statespace_filters.diagnostics.calibration import (
     uniformity_of,
     whiteness_of,
 )
-from pymc_statespace_filters.diagnostics.truncated_data import record_of
+from pymc_statespace_filters.diagnostics.truncated_data import observed_values
 from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.pymc_model.inspection import COLLAPSED
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
-from pymc_statespace_filters.states.groups import with_group
-from pymc_statespace_filters.states.variable import States, VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
+from pymc_statespace_filters.states.groups import add_group
+from pymc_statespace_filters.states.variable import States, VariableAtDraws, select_variables
 from pymc_statespace_filters.system.record import check_random_seed
 
 Array = NDArray[np.float64]
@@ -134,20 +134,20 @@ def filter_diagnostics(
     """
     model = pm.modelcontext(model)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
         after = before
         if variable.filter.noisy:
             after = at_draws.states("filtered", at_draws.steps, rng, progressbar=progressbar)
         predicted = _observations(at_draws, before.drawn, rng)
-        observed = record_of(model, variable.name)
+        observed = observed_values(model, variable.name)
         part = _of_draws(variable, draws, at_draws, predicted, after)
         parts.append(part.merge(_of_record(variable, observed, predicted, rng)))
     attrs = {"predictions": KNOWN}
-    return with_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
+    return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 
 def _observations(at_draws: VariableAtDraws, states: Array, rng: np.random.Generator) -> Array:

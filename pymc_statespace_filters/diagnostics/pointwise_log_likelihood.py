@@ -7,9 +7,9 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
-from pymc_statespace_filters.states.groups import with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
+from pymc_statespace_filters.states.groups import add_group
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
     "log p(d_j | d_1 .. d_{j-1}, theta): each term is conditional on all earlier observations. "
@@ -90,20 +90,20 @@ def compute_log_likelihood(
     {'chain': 2, 'draw': 100, 'd_time': 3}
     """
     model = pm.modelcontext(model)
-    draws = draws_of(idata, None)
+    draws = select_draws(idata, None)
     found = xr.merge(
         [
-            terms_at(model, variable, draws, progressbar=progressbar).to_dataset()
-            for variable in chosen_variables(model, var_name)
+            sequential_terms(model, variable, draws, progressbar=progressbar).to_dataset()
+            for variable in select_variables(model, var_name)
         ]
     )
     if extend_inferencedata and "log_likelihood" in idata.children:
         present = idata["log_likelihood"].to_dataset()
         found = found.merge(present[[name for name in present.data_vars if name not in found]])
-    return with_group(idata, "log_likelihood", found, {}, extend_inferencedata)
+    return add_group(idata, "log_likelihood", found, {}, extend_inferencedata)
 
 
-def terms_at(
+def sequential_terms(
     model: pm.Model,
     variable: StateSpaceVariable,
     draws: PosteriorDraws,

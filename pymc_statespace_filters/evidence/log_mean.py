@@ -26,7 +26,7 @@ class LogMean(NamedTuple):
         """Inverse squared relative error: as good as so many terms of relative variance one."""
         return self.error**-2
 
-    def n_carrying(self, count: int) -> float:
+    def kish_ess(self, count: int) -> float:
         """Kish's effective number: how many of `count` independent terms carry the mean."""
         return count / (1 + count * self.error**2)
 
@@ -37,7 +37,7 @@ def log_mean(log_terms: Array) -> float:
     return float(peak + np.log(np.exp(log_terms - peak).mean())) if peak > -np.inf else -np.inf
 
 
-def error_of_chains(terms: Array) -> float:
+def mcse_of_chains(terms: Array) -> float:
     """Standard error of the mean of autocorrelated terms, shape (chain, draw).
 
     It is ArviZ's, from Geyer's initial monotone sequence over split chains: it counts the
@@ -46,7 +46,7 @@ def error_of_chains(terms: Array) -> float:
     return float(az.mcse(terms, method="mean"))
 
 
-def error_of_walkers(terms: Array) -> float:
+def mcse_of_walkers(terms: Array) -> float:
     """Standard error of the mean over many independent short chains, shape (chain, draw).
 
     The spread of the chains' means, whatever the autocorrelation within them.
@@ -57,7 +57,7 @@ def error_of_walkers(terms: Array) -> float:
 def log_mean_of_chains(log_terms: Array) -> LogMean:
     """Average autocorrelated terms, shape (chain, draw)."""
     value = log_mean(log_terms)
-    return LogMean(value, error_of_chains(np.exp(log_terms - value)))
+    return LogMean(value, mcse_of_chains(np.exp(log_terms - value)))
 
 
 def log_mean_of_independent(log_terms: Array) -> LogMean:

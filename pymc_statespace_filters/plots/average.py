@@ -12,7 +12,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, written
+from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, format_probability
 
 AVERAGE = "average"
 N_GRID = 512
@@ -165,7 +165,7 @@ def _with_probabilities(members: xr.Dataset) -> MapLabeller:
     probs = zip(members["model"].values, members["prob"].values, strict=True)
     return MapLabeller(
         coord_map={
-            "model": {name: f"{name} ({written(prob)})" for name, prob in probs}
+            "model": {name: f"{name} ({format_probability(prob)})" for name, prob in probs}
             | {AVERAGE: AVERAGE}
         }
     )

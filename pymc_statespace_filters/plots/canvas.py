@@ -128,7 +128,7 @@ def interval(low: xr.Dataset, high: xr.Dataset) -> xr.Dataset:
     return xr.concat([low, high], dim=BOUND).assign_coords({BOUND: ["lower", "upper"]})
 
 
-def note(
+def annotate(
     da: xr.DataArray,
     target: Any,
     *,
@@ -159,7 +159,7 @@ def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
     return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
 
 
-def written(prob: float) -> str:
+def format_probability(prob: float) -> str:
     """Write a probability with the digits that matter, near zero and near one too."""
     if prob < 1e-6:
         return "< 1e-6"

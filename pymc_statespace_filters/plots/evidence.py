@@ -11,7 +11,7 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note
+from pymc_statespace_filters.plots.canvas import annotate, canvas_of_rows, interval
 
 
 def plot_evidence(
@@ -62,7 +62,7 @@ def plot_evidence(
     values = table["log_evidence"]
     texts = xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object])
     middle = (values.min() + values.max()).item() / 2
-    collection.map(note, "text", texts=texts, middle=middle, color="B2")
+    collection.map(annotate, "text", texts=texts, middle=middle, color="B2")
     text = "log-evidence (nats), 1 and 2 standard errors"
     collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
     return collection

@@ -24,8 +24,8 @@ from pymc_statespace_filters.plots.canvas import (
     interval,
     logarithmic_ticks,
 )
-from pymc_statespace_filters.plots.marks import bars, draw_bands, points, time_label, write_key
-from pymc_statespace_filters.plots.results import group_of, named, variable_of
+from pymc_statespace_filters.plots.marks import add_legend, bars, draw_bands, points, time_label
+from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
 COLLAPSED = 3  # a filter with fewer effective particles says little
 PROB, TAIL = 0.95, 1.96  # of the bands that a calibrated filter keeps to
@@ -111,7 +111,8 @@ def plot_filter_health(
     _, results = group_of(idata, "filter_diagnostics")
     name = variable_of(results, var_name, "_residual")
     residual, pit = (
-        named(results[f"{name}_{kind}"], "time", "observable") for kind in ("residual", "pit")
+        rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
+        for kind in ("residual", "pit")
     )
     seen, expected = (
         xr.merge(parts)
@@ -142,7 +143,7 @@ def plot_filter_health(
         key |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
     _name_axes(collection, data, residual["time"])
-    write_key(collection, key, n_columns=in_line)
+    add_legend(collection, key, n_columns=in_line)
     return collection
 
 
@@ -204,7 +205,9 @@ def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
     effective = results.get(f"{name}_n_effective")
     if effective is None or not np.isfinite(effective).any():
         return None
-    return xr.apply_ufunc(np.log10, named(effective.where(np.isfinite(effective)), "time"))
+    return xr.apply_ufunc(
+        np.log10, rename_last_dims(effective.where(np.isfinite(effective)), "time")
+    )
 
 
 def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:

@@ -11,18 +11,18 @@ from pymc_statespace_filters.plots.canvas import canvas
 from pymc_statespace_filters.plots.marks import (
     DATA,
     TRUTH,
+    add_legend,
     draw_bands,
     draw_bars,
-    in_key,
+    label_axes,
+    legend_style,
     points,
-    write_axes,
-    write_key,
 )
 from pymc_statespace_filters.plots.results import (
     check_count,
     data_of,
     group_of,
-    named,
+    rename_last_dims,
     truth_of,
     variable_of,
 )
@@ -100,7 +100,7 @@ def plot_forecast(
     _, results = group_of(idata, "predictions")
     predicted = results[[name for name in results if not str(name).endswith("_states")]]
     name = variable_of(predicted, var_name)
-    draws = named(predicted[name], "time", "observable")
+    draws = rename_last_dims(predicted[name], "time", "observable")
     observables = [str(observable) for observable in draws["observable"].values]
     if truth is not None:
         truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
@@ -125,14 +125,14 @@ def plot_forecast(
             truth = truth.where(truth["time"] > record["time"][-1], drop=True)
         collection.map(vline, "end", data=end.to_dataset(name="end"), color="B2", linestyle="C1")
         collection.map(points, "data", data=past.to_dataset(name="data"), diameter=4, **DATA)
-        key["data"] = in_key(DATA)
+        key["data"] = legend_style(DATA)
         key["end of record"] = {"color": "B2", "linestyle": "C1"}
     if truth is not None:
         came = truth.reindex(observable=observables).to_dataset(name="truth")
         collection.map(points, "truth", data=came, diameter=4, color=TRUTH["color"])
-        key["what came"] = in_key(TRUTH)
-    write_axes(collection, draws["time"])
-    write_key(collection, key)
+        key["what came"] = legend_style(TRUTH)
+    label_axes(collection, draws["time"])
+    add_legend(collection, key)
     return collection
 
 

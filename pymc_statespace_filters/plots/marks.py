@@ -67,7 +67,7 @@ def _ends(quantiles: xr.Dataset, prob: int) -> xr.Dataset:
     )
 
 
-def some_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
+def thin_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
     """Return `n_draws` draws, spread evenly over all that are known, along the dimension "path"."""
     stacked = draws.stack(path=SAMPLE_DIMS).drop_vars(["path", *SAMPLE_DIMS])
     stacked = stacked.dropna("path", how="all")
@@ -130,12 +130,12 @@ def _scatter(x: np.ndarray, y: np.ndarray, target: Any, diameter: float, **kwarg
     return drawing.scatter(x[known], y[known], target, size=size, **kwargs)
 
 
-def in_key(style: Mapping[str, Any]) -> dict[str, Any]:
+def legend_style(style: Mapping[str, Any]) -> dict[str, Any]:
     """Return how points of a style look in a key, which has lines alone: a line of points."""
     return {**style, "linestyle": "C2", "width": 4}
 
 
-def write_key(
+def add_legend(
     collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], n_columns: int = 1
 ) -> None:
     """Write what the marks mean above the panels, which are in so many columns."""
@@ -168,7 +168,7 @@ def write_key(
     )
 
 
-def write_axes(collection: PlotCollection, time: xr.DataArray) -> None:
+def label_axes(collection: PlotCollection, time: xr.DataArray) -> None:
     """Name what each panel shows, and time below the lowest ones, with its unit if it has one."""
     collection.map(
         labelled_y, "y_label", ignore_aes="all", subset_info=True, labeller=NoVarLabeller()

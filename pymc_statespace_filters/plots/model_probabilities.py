@@ -8,7 +8,12 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note, written
+from pymc_statespace_filters.plots.canvas import (
+    annotate,
+    canvas_of_rows,
+    format_probability,
+    interval,
+)
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 
@@ -66,11 +71,11 @@ def plot_model_probabilities(
         width=1.5,
     )
     texts = xr.apply_ufunc(_text, data["prob"], undecided, vectorize=True, output_dtypes=[object])
-    collection.map(note, "text", texts=texts, middle=0.5, color="B2")
+    collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
     collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
     collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the model")
     return collection
 
 
 def _text(prob: float, undecided: bool) -> str:
-    return written(prob) + (", undecided" if undecided else "")
+    return format_probability(prob) + (", undecided" if undecided else "")

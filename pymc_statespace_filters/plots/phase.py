@@ -14,19 +14,19 @@ from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
+    add_legend,
     over_draws,
     path_xy,
     points_xy,
-    some_draws,
-    write_key,
+    thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     are_paths,
     check_count,
-    chosen,
     group_of,
-    named,
+    rename_last_dims,
+    select_names,
     truth_of,
     variable_of,
 )
@@ -104,7 +104,7 @@ def plot_phase(
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
-    states = named(results[f"{name}_states"], "time", "state")
+    states = rename_last_dims(results[f"{name}_states"], "time", "state")
     both = [_quantity("x", x, states), _quantity("y", y, states)]
     sizes = [dict(quantity.sizes) for quantity in both]
     if sizes[0] != sizes[1]:
@@ -117,7 +117,7 @@ def plot_phase(
     if n_draws:
         mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
         style = {**style, "alpha": 0.25}  # beside the thick line
-        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+        collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
         key["draws"] = {**PATHS, "width": 1.5}
     median = over_draws(data).sel(quantile=0.5)
     lines = {"median": ({"color": "C0", "width": 2.5}, median)}
@@ -127,7 +127,7 @@ def plot_phase(
         collection.map(line_xy, label, data=line, **line_style)
     collection.map(labelled_x, "x_label", text=str(both[0].name))
     collection.map(labelled_y, "y_label", text=str(both[1].name))
-    write_key(collection, key | {label: style for label, (style, _) in lines.items()})
+    add_legend(collection, key | {label: style for label, (style, _) in lines.items()})
     return collection
 
 
@@ -149,7 +149,7 @@ def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) ->
             )
         name = given.name or argument
         return given.rename({others[0]: "time"}).reset_coords(drop=True).rename(name)
-    (state,) = chosen(argument, [given], [str(state) for state in states["state"].values])
+    (state,) = select_names(argument, [given], [str(state) for state in states["state"].values])
     return states.sel(state=state, drop=True).rename(state)
 
 
@@ -160,7 +160,7 @@ def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:
         names = [str(state) for state in states["state"].values]
         known = truth_of(truth, "states", "state", names, states["time"].values)
         true_states = [str(state) for state in known["state"].values]
-        both = [known.sel(state=name) for name in chosen("truth", [x, y], true_states)]
+        both = [known.sel(state=name) for name in select_names("truth", [x, y], true_states)]
         return _on_axes([b.drop_vars("state") for b in both]).to_dataset(name="phase")
     pair = [np.asarray(values, dtype=float) for values in truth]
     if len(pair) != 2 or pair[0].ndim != 1 or pair[0].shape != pair[1].shape:

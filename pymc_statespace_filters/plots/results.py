@@ -38,7 +38,7 @@ def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str = "") -> 
     return var_name
 
 
-def named(array: xr.DataArray, *names: str) -> xr.DataArray:
+def rename_last_dims(array: xr.DataArray, *names: str) -> xr.DataArray:
     """Return `array` with these names for its last dimensions: a model may call them otherwise."""
     return array.rename(dict(zip(array.dims[-len(names) :], names, strict=True)))
 
@@ -48,7 +48,7 @@ def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
     if "observed_data" not in idata.children:
         return None
     record = idata["observed_data"].to_dataset().get(name)
-    return None if record is None else named(record, "time", "observable")
+    return None if record is None else rename_last_dims(record, "time", "observable")
 
 
 def are_paths(group: str, results: xr.Dataset) -> bool:
@@ -62,16 +62,16 @@ def check_count(argument: str, count: Any) -> None:
         raise ModelError(f"{argument} must be an integer of at least 0, got {count!r}")
 
 
-def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:
+def select_names(argument: str, names: Any, available: Sequence[str]) -> list[str]:
     """Return `names`, all of them if None, checked against what there is."""
     if names is None:
         return list(available)
     names = [names] if isinstance(names, str) else list(names)
-    known(argument, names, available)
+    check_names(argument, names, available)
     return names
 
 
-def known(argument: str, names: Iterable[str], available: Sequence[str]) -> None:
+def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -> None:
     """Raise an error for names that there are not."""
     unknown = [name for name in names if name not in available]
     if unknown:

@@ -13,23 +13,23 @@ from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
+    add_legend,
     draw_bands,
     draw_bars,
-    in_key,
+    label_axes,
+    legend_style,
     paths,
     points,
-    some_draws,
-    write_axes,
-    write_key,
+    thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
     are_paths,
     check_count,
-    chosen,
+    check_names,
     data_of,
     group_of,
-    known,
-    named,
+    rename_last_dims,
+    select_names,
     truth_of,
     variable_of,
 )
@@ -108,9 +108,9 @@ def plot_states(
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
-    draws = named(results[f"{name}_states"], "time", "state")
+    draws = rename_last_dims(results[f"{name}_states"], "time", "state")
     all_states = [str(state) for state in draws["state"].values]
-    shown = chosen("states", states, all_states)
+    shown = select_names("states", states, all_states)
     record = _record(idata, name, observables, all_states)
     if truth is not None:
         truth = truth_of(truth, "states", "state", all_states, draws["time"].values)
@@ -130,7 +130,7 @@ def plot_states(
     )
     if n_draws:
         mark, style = (paths, PATHS) if are_paths(group, results) else (points, DOTS)
-        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
+        collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
     key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
     if truth is not None:
         true = truth.reindex(state=shown).to_dataset(name="truth")
@@ -139,9 +139,9 @@ def plot_states(
     if record is not None and set(shown) & set(record["state"].values):
         seen = record.reindex(state=shown).to_dataset(name="data")
         collection.map(points, "data", data=seen, diameter=4, **DATA)
-        key["data"] = in_key(DATA)
-    write_axes(collection, draws["time"])
-    write_key(collection, key)
+        key["data"] = legend_style(DATA)
+    label_axes(collection, draws["time"])
+    add_legend(collection, key)
     return collection
 
 
@@ -157,7 +157,7 @@ def _record(
     there = [str(observable) for observable in record["observable"].values]
     if observables is None:
         observables = {state: state for state in states if state in there}
-    known("observables: its states", observables, states)
-    known("observables: its values", observables.values(), there)
+    check_names("observables: its states", observables, states)
+    check_names("observables: its values", observables.values(), there)
     measured = record.sel(observable=list(observables.values()))
     return measured.rename(observable="state").assign_coords(state=list(observables))

@@ -67,7 +67,7 @@ class PosteriorDraws:
         return xr.Dataset(arrays, coords={**of_draws, **coords})
 
 
-def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
+def select_draws(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
     """All draws, or about `n_draws` of them, evenly from every chain."""
     posterior = posterior_group(idata).transpose(*SAMPLE_DIMS, ...)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()

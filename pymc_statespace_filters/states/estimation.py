@@ -8,9 +8,9 @@ import xarray as xr
 
 from pymc_statespace_filters.evaluation.log_likelihood import warn_of
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.groups import state_dims, with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.record import check_at, check_random_seed, rows_at
 
 
@@ -170,10 +170,10 @@ def _add_states(
     model = pm.modelcontext(model)
     check_at(at)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         rows = rows_at(at, at_draws.steps)
         states = at_draws.states(moment, rows, rng, progressbar=progressbar)
@@ -193,4 +193,4 @@ def _add_states(
             part[f"{name}_states"].attrs["smoothing"] = variable.filter.smoothing_method(system)
         parts.append(part)
         warn_of(variable.filter, states.health, stacklevel=4)
-    return with_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)
+    return add_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

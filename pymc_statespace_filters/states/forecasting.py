@@ -12,9 +12,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.log_likelihood import warn_of
 from pymc_statespace_filters.evaluation.simulate import continuation
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.groups import state_dims, with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.record import (
     check_inputs,
     check_random_seed,
@@ -103,10 +103,10 @@ def forecast(
     """
     model = pm.modelcontext(model)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         name, system, (time, observable) = variable.name, variable.system, variable.dims
         at_draws = VariableAtDraws(model, variable, draws)
         last = at_draws.steps[-1:]
@@ -128,7 +128,7 @@ def forecast(
             )
         )
         warn_of(variable.filter, begin.health, stacklevel=3)
-    return with_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
+    return add_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 
 def _future(

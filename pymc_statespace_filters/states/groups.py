@@ -18,7 +18,7 @@ def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     }
 
 
-def with_group(
+def add_group(
     idata: xr.DataTree, name: str, group: xr.Dataset, attrs: Mapping[str, Any], extend: bool
 ) -> xr.DataTree:
     """Put a group into `idata`, in place of one of that name, or into a DataTree of its own."""

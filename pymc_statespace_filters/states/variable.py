@@ -130,7 +130,7 @@ class VariableAtDraws:
         return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
 
 
-def chosen_variables(
+def select_variables(
     model: pm.Model, name: str | None, filter: Any = None
 ) -> list[StateSpaceVariable]:
     """The observed variable of a name, or all of them; read by another filter if one is given."""

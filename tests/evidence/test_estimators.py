@@ -9,7 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.agreement import agreement_of
+from pymc_statespace_filters.evidence.agreement import assess_agreement
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS, EvidenceEstimates
 from tests.evidence.test_models import REGRESSION, exact_draws
 
@@ -101,13 +101,13 @@ def estimates(**values):
 
 class TestAgreement:
     def test_chi_square_by_hand(self):
-        found = agreement_of(estimates(bridge=(-10.0, 0.3), importance=(-10.8, 0.4)))
+        found = assess_agreement(estimates(bridge=(-10.0, 0.3), importance=(-10.8, 0.4)))
         assert found.p_value == pytest.approx(0.10960, abs=1e-5)  # z = 0.8 / 0.5 = 1.6
         assert found.difference == pytest.approx(0.8)
         assert found
 
     def test_what_no_choice_depends_on_is_agreement(self):
-        assert agreement_of(estimates(bridge=(-10.0, 0.001), importance=(-10.04, 0.001)))
+        assert assess_agreement(estimates(bridge=(-10.0, 0.001), importance=(-10.04, 0.001)))
 
     def test_estimates_without_errors_take_no_part(self):
         found = estimates(bridge=(-10.0, 0.01), laplace=(-12.0, np.nan))
@@ -115,7 +115,7 @@ class TestAgreement:
         assert "nothing to compare it with" in repr(found)
 
     def test_an_error_of_zero(self):
-        assert agreement_of(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
+        assert assess_agreement(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
 
     def test_of_three_the_pair_furthest_apart_in_its_errors_is_named(self):
         found = estimates(bridge=(-10.0, 0.01), importance=(-10.5, 0.01), tempered_smc=(-9.0, 1.0))

@@ -12,8 +12,8 @@ from pymc_statespace_filters.evidence.estimators.student_mixture import (
     StudentMixture,
     _maximised,
     choose_mixture,
-    fitted_mixture,
-    scattered,
+    fit_mixture,
+    place_components,
 )
 from tests.evidence.analytic import gaussian
 from tests.evidence.targets import Banana, TwoModes
@@ -58,7 +58,7 @@ def test_steps_of_em_never_lower_the_density_of_the_draws():
     """But for what the components borrow, nothing beside so many draws."""
     rng = np.random.default_rng(44)
     x = some_mixture().sample(4000, rng)
-    mixture, reached = scattered(x, 3, rng), []
+    mixture, reached = place_components(x, 3, rng), []
     for _ in range(30):
         log_joint = mixture.log_joint(x)
         log_density = np.logaddexp.reduce(log_joint)
@@ -72,7 +72,7 @@ def test_the_law_that_made_the_draws_is_where_em_stays():
     """Its 44 parameters follow 4000 draws by 44 / 8000 nats, give or take."""
     mixture = some_mixture()
     x = mixture.sample(4000, np.random.default_rng(44))
-    gain = fitted_mixture(x, mixture).log_density(x).mean() - mixture.log_density(x).mean()
+    gain = fit_mixture(x, mixture).log_density(x).mean() - mixture.log_density(x).mean()
     assert 0 < gain < 0.015
 
 

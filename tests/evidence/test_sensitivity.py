@@ -17,7 +17,7 @@ from pymc_statespace_filters import (
     prior_sensitivity,
 )
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.comparison.scaled_prior import StretchedPrior
+from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.evidence.analytic import Regression
 
@@ -123,7 +123,7 @@ class TestWidths:
         for name, own in (("line", 0.01), ("plane", 0.02)):
             rival = rivals[name]
             draws = rival.idata["posterior"].to_dataset()
-            of_width = StretchedPrior(rival.model, ["w"]).reweighted(draws, 0.5)
+            of_width = ScaledPrior(rival.model, ["w"]).reweighted(draws, 0.5)
             assert of_width.error > own / 2
             assert se.sel(model=name, width=0.5) == pytest.approx(np.hypot(own, of_width.error))
         weights = curves["width_log_evidence"] + np.log([[1], [2]])

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
-from pymc_statespace_filters.evidence.posterior import RowFunction
+from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.observed_data import scalar_count
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_multipliers
 
@@ -39,7 +39,7 @@ MIN_SEPARATION = 0.9  # share of pairs that a parameter must put in order
 Array = NDArray[np.float64]
 
 
-def doubts_of_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
+def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
     """Say if draws (chain, draw, k) owe their likelihood to overshooting, or end at its limit.
 
     Nothing is said of models without Euler-Maruyama steps, or with a system that no deterministic

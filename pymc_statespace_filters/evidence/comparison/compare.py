@@ -12,11 +12,12 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.probabilities import (
+    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
+    select_evidences,
 )
-from pymc_statespace_filters.evidence.comparison.rivals import Given, evidences_of_rivals
 from pymc_statespace_filters.evidence.evidence import Evidence
 
 # Kass and Raftery (1995), 3.2: twice the log Bayes factor at which each word begins.
@@ -68,7 +69,7 @@ class DimensionCorrection:
 
 
 def compare_evidence(
-    evidences: Mapping[str, Given],
+    evidences: Mapping[str, EvidenceLike],
     *,
     prior: Mapping[str, float] | None = None,
     correction: DimensionCorrection | None = None,
@@ -162,7 +163,7 @@ def compare_evidence(
     >>> table.loc["linear", "strength"]
     'positive'
     """
-    found = evidences_of_rivals(evidences, estimator)
+    found = select_evidences(evidences, estimator)
     check_ci_prob(ci_prob)
     if not (correction is None or isinstance(correction, DimensionCorrection)):
         raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")

@@ -19,15 +19,15 @@ from pymc_statespace_filters.evidence.comparison.compare import (
     compare_evidence,
 )
 from pymc_statespace_filters.evidence.comparison.probabilities import (
+    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
 )
-from pymc_statespace_filters.evidence.comparison.rivals import Given
 from pymc_statespace_filters.evidence.comparison.scaled_prior import (
     UNCHANGED,
-    Reweighted,
-    StretchedPrior,
+    ReweightedEvidence,
+    ScaledPrior,
 )
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 
 def prior_sensitivity(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     *,
     exponents: ArrayLike | None = None,
     models: Mapping[str, pm.Model] | None = None,
@@ -151,7 +151,7 @@ def _over_widths(
     table: pd.DataFrame, drawn: Mapping[str, "_Drawn"], widths: Array, ci_prob: float
 ) -> xr.Dataset:
     found = [[drawn[name].reweighted(width) for width in widths.tolist()] for name in table.index]
-    known = np.array([[one.is_known for one in of_model] for of_model in found])
+    known = np.array([[one.is_reliable for one in of_model] for of_model in found])
     ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
     log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
     se = np.where(known, np.hypot(table["se"].to_numpy()[:, np.newaxis], error), np.nan)
@@ -197,7 +197,7 @@ def _grid(name: str, given: ArrayLike | None, default: Array) -> Array:
 
 
 def _table(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     prior: Mapping[str, float] | None,
     estimator: str | None,
 ) -> pd.DataFrame:
@@ -220,16 +220,16 @@ class _Drawn:
     """Draws of a model, and its priors to be stretched (None: it has none of them)."""
 
     posterior: xr.Dataset
-    priors: StretchedPrior | None
+    priors: ScaledPrior | None
 
-    def reweighted(self, width: float) -> Reweighted:
+    def reweighted(self, width: float) -> ReweightedEvidence:
         if self.priors is None:
             return UNCHANGED
         return self.priors.reweighted(self.posterior, width)
 
 
 def _drawn(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     models: Mapping[str, pm.Model],
     names: list[str],
     var_names: str | Iterable[str] | None,
@@ -254,6 +254,6 @@ def _drawn(
     for name in names:
         unconstrained_draws(idatas[name], models[name])  # raises what is wrong with them
         stretched = [one for one in free[name] if not chosen or one in chosen]
-        priors = StretchedPrior(models[name], stretched) if stretched else None
+        priors = ScaledPrior(models[name], stretched) if stretched else None
         found[name] = _Drawn(idatas[name]["posterior"].to_dataset(), priors)
     return found

@@ -32,7 +32,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.posterior.support import has_law
+from pymc_statespace_filters.evidence.posterior.support import can_sample
 
 EDGE = 0.05  # of the length of a bounded support, at each end
 # Past these the draws do not know the evidence under the other priors.
@@ -42,7 +42,7 @@ MAX_BEYOND = 0.02
 Array = NDArray[np.float64]
 
 
-class Reweighted(NamedTuple):
+class ReweightedEvidence(NamedTuple):
     """What an evidence becomes under other priors, as far as the draws know.
 
     Attributes
@@ -64,7 +64,7 @@ class Reweighted(NamedTuple):
     beyond: float
 
     @property
-    def is_known(self) -> bool:
+    def is_reliable(self) -> bool:
         """Whether the draws are enough, and reach far enough."""
         return (
             self.n_effective >= MIN_EFFECTIVE
@@ -73,10 +73,10 @@ class Reweighted(NamedTuple):
         )
 
 
-UNCHANGED = Reweighted(0.0, 0.0, np.inf, -np.inf, 0.0)
+UNCHANGED = ReweightedEvidence(0.0, 0.0, np.inf, -np.inf, 0.0)
 
 
-class StretchedPrior:
+class ScaledPrior:
     """The priors of some free variables of a model, to be stretched together.
 
     Parameters
@@ -113,7 +113,7 @@ class StretchedPrior:
             mode="FAST_COMPILE",
         )
 
-    def reweighted(self, posterior: xr.Dataset, width: float) -> Reweighted:
+    def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
         """Find the evidence under stretched priors.
 
         Parameters
@@ -130,10 +130,10 @@ class StretchedPrior:
         ]
         with np.errstate(all="ignore"):  # a narrow prior may be zero, its logarithm infinite
             log_ratio, beyond = self._function(width, *rows)
-        return reweigh(log_ratio.reshape(shape), np.broadcast_to(beyond, log_ratio.shape))
+        return average_ratios(log_ratio.reshape(shape), np.broadcast_to(beyond, log_ratio.shape))
 
 
-def reweigh(log_ratio: Array, beyond: Array) -> Reweighted:
+def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
     """Average the ratios p_w / p of draws (chain, draw), and judge the average.
 
     Parameters
@@ -144,17 +144,19 @@ def reweigh(log_ratio: Array, beyond: Array) -> Reweighted:
     """
     peak = log_ratio.max()
     if np.isneginf(peak):
-        return Reweighted(-np.inf, np.inf, 0.0, np.inf, 0.0)
+        return ReweightedEvidence(-np.inf, np.inf, 0.0, np.inf, 0.0)
     beyond_share = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
     if np.ptp(log_ratio) < SAME:  # a Uniform prior made wider: all draws weigh the same
-        return Reweighted(float(peak), 0.0, np.inf, -np.inf, beyond_share)
+        return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, beyond_share)
     mean = log_mean_of_chains(log_ratio)
-    return Reweighted(mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share)
+    return ReweightedEvidence(
+        mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share
+    )
 
 
 def _check_stretchable(rv: TensorVariable, model: pm.Model) -> None:
     law = rv.owner.op
-    if not has_law(rv, model):
+    if not can_sample(rv, model):
         raise ModelError(f"the prior of {rv.name!r} is improper and has no width to change")
     support = _default_transform(law, rv)
     if law.ndim_supp > 1 or not isinstance(support, IntervalTransform | LogTransform | None):

@@ -58,7 +58,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, of both halves
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # and so it is with fewer effective terms
@@ -88,6 +88,11 @@ class Bridge:
     """
 
     warped: bool = False
+
+    @property
+    def name(self) -> str:
+        """``"bridge"`` or ``"warp_bridge"``."""
+        return "warp_bridge" if self.warped else "bridge"
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """One for each proposal; warped, also one for each mirror image."""

@@ -35,22 +35,28 @@ Source: Chib and Jeliazkov, Marginal likelihood from the Metropolis-Hastings out
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence.estimators.block_ordinates import (
     BlockEstimate,
     estimate_in_blocks,
 )
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Plan, plan_proposal
-from pymc_statespace_filters.evidence.estimators.single_block import (
-    OneBlockEstimate,
-    estimate_in_one_block,
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import (
+    Proposal,
+    ProposalPlan,
+    plan_proposal,
 )
-from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.log_mean import (
+    MIN_EFFECTIVE,
+    LogMean,
+    log_mean_of_chains,
+    log_mean_of_independent,
+)
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MIN_PROPOSALS = 100
 MOST_PROPOSALS = 20_000
@@ -78,6 +84,7 @@ class ChibJeliazkov:
         Parts into which the parameters fall.
     """
 
+    name: ClassVar[str] = "chib_jeliazkov"
     n_proposals: int | None = None
     n_blocks: int | None = None
 
@@ -133,7 +140,47 @@ class ChibJeliazkov:
         return self.n_proposals or min(max(posterior.log_density.size, 1000), PROPOSALS_OF_RUN)
 
 
-def _choose_n_blocks(k: int, plans: Sequence[Plan]) -> int:
+@dataclass(frozen=True)
+class OneBlockEstimate:
+    """A log-evidence and the two means behind it."""
+
+    log_evidence: float
+    scale: float
+    numerator: LogMean
+    denominator: LogMean
+    zero_density: float  # share of the proposals
+
+    @property
+    def se(self) -> float:
+        """Standard error, from the draws and from the proposals."""
+        return math.hypot(self.numerator.error, self.denominator.error)
+
+
+def estimate_in_one_block(
+    proposal: Proposal, posterior: Posterior, n_proposals: int, *, rng: np.random.Generator
+) -> OneBlockEstimate:
+    """Estimate the log-evidence with a proposal that was fitted to other draws."""
+    # Numerator: the draws, with the log-densities that their chain stored.
+    numerator = log_mean_of_chains(
+        proposal.log_alpha_to_center(posterior.log_density) + proposal.log_q(posterior.draws)
+    )
+
+    # Denominator: draws from q(x*, .), with fresh log-densities.
+    log_alpha = proposal.log_alpha_from_center(
+        posterior.evaluate(proposal.sample(n_proposals, rng), rng)
+    )
+    denominator = log_mean_of_independent(log_alpha)
+    if np.isneginf(denominator.value):
+        raise DataMismatchError(
+            f"none of {n_proposals} proposals around the draws has a density: idata belongs to "
+            "another model or to other data"
+        )
+    log_evidence = proposal.log_density - numerator.value + denominator.value
+    impossible = float(np.isneginf(log_alpha).mean())
+    return OneBlockEstimate(log_evidence, proposal.scale, numerator, denominator, impossible)
+
+
+def _choose_n_blocks(k: int, plans: Sequence[ProposalPlan]) -> int:
     """One block, unless there are many parameters and it promises too large an error."""
     predicted = math.hypot(*(plan.se for plan in plans)) / 2
     if k < MANY_PARAMETERS or predicted <= TOLERABLE:

@@ -17,6 +17,7 @@ averaged as they are, for smoothed ones would be biased.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_independent,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000
 MAX_PARETO_K = 0.7
@@ -46,6 +47,8 @@ class Importance:
     >>> Importance()
     Importance()
     """
+
+    name: ClassVar[str] = "importance"
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """The number of proposals."""
@@ -65,7 +68,7 @@ class Importance:
         log_weights = log_density - q.log_density(proposals)
         evidence = log_mean_of_independent(log_weights)
         tail = pareto_k(log_weights)
-        n_effective = evidence.n_carrying(n_proposals)
+        n_effective = evidence.kish_ess(n_proposals)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,

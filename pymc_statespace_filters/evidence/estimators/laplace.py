@@ -13,6 +13,7 @@ is off by an amount that more draws do not reduce, and so it has no standard err
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import arviz as az
 import numpy as np
@@ -20,15 +21,15 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.newton import (
+    BatchFunction,
     EdgeError,
-    Rows,
     best_of_chains,
-    climb,
     derivatives,
+    newton_maximize,
 )
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 N_STARTS = 3
 STEP = 0.05  # of the finer differences, in standard deviations of the draws; the coarser take two
@@ -65,6 +66,8 @@ class Laplace:
     True
     """
 
+    name: ClassVar[str] = "laplace"
+
     def n_evaluations(self, posterior: Posterior) -> int:
         """The differences of some ten steps upwards from each start."""
         k = posterior.draws.shape[-1]
@@ -91,7 +94,7 @@ class Laplace:
 
         draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
         starts = draws[best_of_chains(posterior.log_density, N_STARTS)]
-        tops = [climb(log_density, z) for z in coordinates.whitened(starts)]
+        tops = [newton_maximize(log_density, z) for z in coordinates.whitened(starts)]
         mode = max(tops, key=lambda top: top.value)
         log_dets = _log_curvature(log_density, mode.point)
         k = len(mode.point)
@@ -104,7 +107,7 @@ class Laplace:
         )
 
 
-def _log_curvature(log_density: Rows, mode: Array) -> tuple[float, float]:
+def _log_curvature(log_density: BatchFunction, mode: Array) -> tuple[float, float]:
     """Log-determinant of -H in whitened coordinates; and its change between the two steps."""
     try:
         gradient, fine = derivatives(log_density, mode, STEP)

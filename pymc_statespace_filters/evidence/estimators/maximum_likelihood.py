@@ -7,15 +7,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from pymc_statespace_filters.evidence.estimators.newton import Rows, best_of_chains, climb
-from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
-    evaluate_factors,
-    log_likelihood_of,
-    prior_of,
+from pymc_statespace_filters.evidence.estimators.newton import (
+    BatchFunction,
+    best_of_chains,
+    newton_maximize,
 )
 from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
 from pymc_statespace_filters.evidence.log_mean import log_mean_of_independent
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, log_likelihood_of
 
 N_STARTS = 3
 BEYOND = -1e300
@@ -71,27 +70,27 @@ def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> Maximu
     coordinates = moments_within_chains(posterior.draws)
 
     def log_likelihood(z: Array) -> Array:
-        return evaluate_factors(posterior, coordinates.unconstrained(z), rng)[1]
+        return posterior.evaluate_factors(coordinates.unconstrained(z), rng)[1]
 
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-    log_prior = prior_of(posterior).log_density(draws).reshape(posterior.log_density.shape)
+    log_prior = posterior.required_prior.log_density(draws).reshape(posterior.log_density.shape)
     at_draws = log_likelihood_of(posterior.log_density, log_prior)
     find = _estimated if posterior.is_noisy else _climbed
     value, z = find(log_likelihood, coordinates.whitened(draws), at_draws)
     return MaximumLikelihood(value, coordinates.unconstrained(z[np.newaxis])[0])
 
 
-def _climbed(log_likelihood: Rows, draws: Array, at_draws: Array) -> tuple[float, Array]:
+def _climbed(log_likelihood: BatchFunction, draws: Array, at_draws: Array) -> tuple[float, Array]:
     """The top of a likelihood that is a function, in whitened coordinates."""
     best = best_of_chains(at_draws, N_STARTS)
-    top = max((climb(log_likelihood, draws[i]) for i in best), key=lambda top: top.value)
+    top = max((newton_maximize(log_likelihood, draws[i]) for i in best), key=lambda top: top.value)
     found = [(top.value, top.point), (float(at_draws.ravel()[best[0]]), draws[best[0]])]
     if top.at_edge:
         found.append(_along_edge(log_likelihood, top.point))
     return max(found, key=lambda candidate: candidate[0])
 
 
-def _along_edge(log_likelihood: Rows, start: Array) -> tuple[float, Array]:
+def _along_edge(log_likelihood: BatchFunction, start: Array) -> tuple[float, Array]:
     """Nelder and Mead's simplex, which needs no derivatives; beyond the edge it is merely low."""
     k = len(start)
     ended = minimize(
@@ -107,7 +106,7 @@ def _along_edge(log_likelihood: Rows, start: Array) -> tuple[float, Array]:
     return -float(ended.fun), ended.x
 
 
-def _estimated(log_likelihood: Rows, draws: Array, at_draws: Array) -> tuple[float, Array]:
+def _estimated(log_likelihood: BatchFunction, draws: Array, at_draws: Array) -> tuple[float, Array]:
     """A high place of a noisy likelihood, and the log of an average of fresh estimates there."""
     candidates = _candidates(draws, at_draws.ravel())
     repeated = log_likelihood(np.repeat(candidates, N_CHOOSING, axis=0))

@@ -14,17 +14,14 @@ parameters there are: this is a check of other estimators for few of them.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
-    evaluate_factors,
-    prior_of,
-)
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE, log_mean_of_independent
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MIN_DRAWS = 100
 
@@ -45,6 +42,7 @@ class PriorMonteCarlo:
     PriorMonteCarlo(n_draws=20000)
     """
 
+    name: ClassVar[str] = "prior_monte_carlo"
     n_draws: int = 10_000
 
     def __post_init__(self) -> None:
@@ -64,15 +62,15 @@ class PriorMonteCarlo:
         ModelError
             If the prior is improper, or if none of its draws has a likelihood.
         """
-        x = prior_of(posterior).sample(self.n_draws, rng)
-        _, log_likelihood = evaluate_factors(posterior, x, rng)
+        x = posterior.required_prior.sample(self.n_draws, rng)
+        _, log_likelihood = posterior.evaluate_factors(x, rng)
         evidence = log_mean_of_independent(log_likelihood)
         if np.isneginf(evidence.value):
             raise ModelError(
                 f"none of {self.n_draws} draws of the prior has a likelihood: narrow the "
                 "priors to values that the model can have"
             )
-        n_effective = evidence.n_carrying(self.n_draws)
+        n_effective = evidence.kish_ess(self.n_draws)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,

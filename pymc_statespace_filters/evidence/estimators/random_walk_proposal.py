@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators.whitening import Whitened, moments
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 N_PILOT = 500  # evaluations that serve the choice of the scale and are then thrown away
@@ -47,7 +47,7 @@ class Proposal:
     def log_q(self, x: Array) -> Array:
         """Log q(x, x*) of x (..., k)."""
         k = len(self.point)
-        z = Whitened(self.point, self.chol).whitened(x.reshape(-1, k)) / self.scale
+        z = Whitening(self.point, self.chol).whitened(x.reshape(-1, k)) / self.scale
         log_det = np.log(np.diag(self.chol)).sum() + k * np.log(self.scale)
         log_q = -0.5 * (z**2).sum(axis=1) - 0.5 * k * np.log(2 * np.pi) - log_det
         return log_q.reshape(x.shape[:-1])
@@ -57,17 +57,17 @@ class Proposal:
         z = rng.standard_normal((count, len(self.point)))
         return self.point + self.scale * z @ self.chol.T
 
-    def log_leaving(self, log_density: Array) -> Array:
+    def log_alpha_from_center(self, log_density: Array) -> Array:
         """Log alpha(x*, x) for x of these log-densities; where there is no density it is -inf."""
         return np.minimum(0.0, log_density - self.log_density)
 
-    def log_arriving(self, log_density: Array) -> Array:
+    def log_alpha_to_center(self, log_density: Array) -> Array:
         """Log alpha(x, x*) for x of these log-densities."""
         return np.minimum(0.0, self.log_density - log_density)
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProposalPlan:
     """A proposal, how many draws of it to take, and what they promise."""
 
     proposal: Proposal
@@ -77,7 +77,7 @@ class Plan:
 
 def plan_proposal(
     posterior: Posterior, *, n_proposals: int | None, most: int, rng: np.random.Generator
-) -> Plan:
+) -> ProposalPlan:
     """Choose x*, the scale s and the number of proposals for the smallest predicted error.
 
     Parameters
@@ -94,11 +94,11 @@ def plan_proposal(
     candidates = _candidates(posterior, rng)
     log_evidence = _pilot(posterior, rng)
 
-    def planned(proposal: Proposal) -> Plan:
+    def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
         allowed = max(SHARE**2 * numerator, NEGLIGIBLE**2)
         count = n_proposals or int(np.clip(relative / allowed, LEAST, most))
-        return Plan(proposal, count, float(np.sqrt(numerator + relative / count)))
+        return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
     best = min(map(planned, candidates), key=lambda plan: plan.se).proposal
     plans = [planned(replace(best, scale=scale)) for scale in SCALES]
@@ -175,7 +175,7 @@ def _predicted_variances(
         E_q[alpha(x*, x)^2] = p(D) / e^f(x*) E_pi[exp(-|f(x) - f(x*)|) q(x, x*)].
     """
     log_q = proposal.log_q(posterior.draws)
-    numerator = log_mean_of_chains(proposal.log_arriving(posterior.log_density) + log_q)
+    numerator = log_mean_of_chains(proposal.log_alpha_to_center(posterior.log_density) + log_q)
     second = log_mean(log_q - np.abs(posterior.log_density - proposal.log_density))
     log_ordinate = proposal.log_density - log_evidence  # of the posterior density
     log_relative = min(second + log_ordinate - 2 * numerator.value, MAX_LOG)

@@ -7,12 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
-    evaluate_factors,
-    prior_of,
-)
-from pymc_statespace_filters.evidence.estimators.whitening import Whitened
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MIN_ALIVE = 50  # draws of the prior that have a likelihood
 
@@ -37,10 +33,10 @@ class Particles(NamedTuple):
         )
 
 
-def particles_of_prior(posterior: Posterior, count: int, rng: np.random.Generator) -> Particles:
+def sample_prior_particles(posterior: Posterior, count: int, rng: np.random.Generator) -> Particles:
     """Independent draws of the prior, some of which may have no likelihood."""
-    x = prior_of(posterior).sample(count, rng)
-    log_prior, log_likelihood = evaluate_factors(posterior, x, rng)
+    x = posterior.required_prior.sample(count, rng)
+    log_prior, log_likelihood = posterior.evaluate_factors(x, rng)
     alive = int(np.isfinite(log_likelihood).sum())
     if alive < MIN_ALIVE:
         raise ModelError(
@@ -50,7 +46,7 @@ def particles_of_prior(posterior: Posterior, count: int, rng: np.random.Generato
     return Particles(x, log_prior, log_likelihood, np.arange(count))
 
 
-def resampled(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+def resample_systematic(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]:
     """Flat indices of particles by their weights (runs, particles), systematically in each run.
 
     A run of which no particle is alive has lost its evidence for good, and stays as it is.
@@ -66,15 +62,15 @@ def resampled(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]
     return (index + n_particles * np.arange(n_runs)[:, np.newaxis]).ravel()
 
 
-class Learnt(NamedTuple):
+class CrossFittedWhitening(NamedTuple):
     """Whitened coordinates for either half of the runs, learnt from the other half.
 
     Proposals fitted to the very particles that they move would not keep their law: in 12 dimensions
     and with 1600 particles the evidence was too large by 0.07 nats.
     """
 
-    first: Whitened
-    second: Whitened
+    first: Whitening
+    second: Whitening
 
     def whitened(self, x: Array) -> Array:
         """Whitened points of all particles x (runs * particles, k)."""
@@ -87,13 +83,13 @@ class Learnt(NamedTuple):
         return np.concatenate([self.first.unconstrained(first), self.second.unconstrained(second)])
 
 
-def learnt_from(x: Array) -> Learnt:
+def cross_fit(x: Array) -> CrossFittedWhitening:
     """Learn from the particles of each half of the runs what the other is to be moved by."""
     first, second = np.split(x, 2)
-    return Learnt(_fitted(second), _fitted(first))
+    return CrossFittedWhitening(_fitted(second), _fitted(first))
 
 
-def _fitted(x: Array) -> Whitened:
+def _fitted(x: Array) -> Whitening:
     """Coordinates in which the particles have mean zero and covariance one."""
     k = x.shape[1]
     try:
@@ -103,13 +99,13 @@ def _fitted(x: Array) -> Whitened:
             f"too few different particles are left to move in {k} dimensions: narrow the priors, "
             "or use an estimator that starts from the draws"
         ) from None
-    return Whitened(x.mean(axis=0), chol)
+    return Whitening(x.mean(axis=0), chol)
 
 
-def metropolis(
+def metropolis_step(
     particles: Particles,
     temperature: float,
-    coordinates: Learnt,
+    coordinates: CrossFittedWhitening,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,
@@ -128,7 +124,7 @@ def metropolis(
     log_jump = np.where(walks, 0.0, 0.5 * ((proposed**2).sum(axis=1) - (z**2).sum(axis=1)))
 
     x = coordinates.unconstrained(proposed)
-    log_prior, log_likelihood = evaluate_factors(posterior, x, rng)
+    log_prior, log_likelihood = posterior.evaluate_factors(x, rng)
     with np.errstate(invalid="ignore"):  # neither here nor there a likelihood: not accepted
         log_ratio = log_prior - particles.log_prior + log_jump
         log_ratio += temperature * (log_likelihood - particles.log_likelihood)

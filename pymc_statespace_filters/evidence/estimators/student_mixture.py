@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from pymc_statespace_filters.evidence.estimators.whitening import moments
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 DEGREES_OF_FREEDOM = 5.0
 MOST_COMPONENTS = 10
@@ -90,19 +90,19 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
     mean, chol = coordinates = moments(posterior.draws)
     halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves()]
     first, second = (coordinates.whitened(half.draws.reshape(-1, len(mean))) for half in halves)
-    best, n_best, least = scattered(first, 1, rng), 0, np.inf
+    best, n_best, least = place_components(first, 1, rng), 0, np.inf
     for n_components in range(1, MOST_COMPONENTS + 1):
-        q = fitted_mixture(first, scattered(first, n_components, rng))
+        q = fit_mixture(first, place_components(first, n_components, rng))
         moment = logsumexp(halves[1].log_density.ravel() - q.log_density(second))
         if moment < least - MIN_GAIN:
             best, n_best, least = q, n_components, moment
         elif n_components == n_best + PATIENCE:
             break
     # On from where the best was found, lest EM end elsewhere.
-    return fitted_mixture(np.concatenate([first, second]), best).widened().mapped(mean, chol)
+    return fit_mixture(np.concatenate([first, second]), best).widened().mapped(mean, chol)
 
 
-def scattered(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
+def place_components(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
     """Place components at draws x (n, k) far from each other, as k-means++ does."""
     chosen = [x[rng.integers(len(x))]]
     while len(chosen) < n_components:
@@ -116,7 +116,7 @@ def scattered(x: Array, n_components: int, rng: np.random.Generator) -> StudentM
     )
 
 
-def fitted_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
+def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
     """Fit to standardised draws x (n, k) by expectation-maximisation."""
     reached = -np.inf
     for _ in range(N_STEPS):

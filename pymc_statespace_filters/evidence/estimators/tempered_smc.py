@@ -30,7 +30,7 @@ No draw of the posterior is used. So modes that the chains have missed are found
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,12 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.smc_moves import (
     Particles,
-    learnt_from,
-    metropolis,
-    particles_of_prior,
-    resampled,
+    cross_fit,
+    metropolis_step,
+    resample_systematic,
+    sample_prior_particles,
 )
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
 SHARE = (
@@ -90,6 +90,7 @@ class TemperedSMC:
     TemperedSMC(n_particles=500, n_runs=16)
     """
 
+    name: ClassVar[str] = "tempered_smc"
     n_particles: int = 250
     n_runs: int = 16
 
@@ -114,26 +115,26 @@ class TemperedSMC:
         ModelError
             If the prior is improper, or too few of its draws have a likelihood.
         """
-        particles = particles_of_prior(posterior, self.n_runs * self.n_particles, rng)
+        particles = sample_prior_particles(posterior, self.n_runs * self.n_particles, rng)
         log_evidences = np.zeros(self.n_runs)
         temperature, scale = 0.0, 1.0
         stages: list[_Stage] = []
         while True:
             # Weight the particles where they are; only then resample and move them.
-            raised = raised_from(temperature, particles.log_likelihood)
+            raised = next_temperature(temperature, particles.log_likelihood)
             log_weights = (raised - temperature) * particles.log_likelihood
             log_weights = log_weights.reshape(self.n_runs, self.n_particles)
             log_evidences += logsumexp(log_weights, axis=1) - np.log(self.n_particles)
-            particles = particles.at(resampled(log_weights, rng))
+            particles = particles.at(resample_systematic(log_weights, rng))
             temperature = raised
             if temperature == 1:
                 return _summary(log_evidences, particles.ancestor, stages)
-            particles, stage = moved(particles, temperature, scale, posterior, rng)
+            particles, stage = move_particles(particles, temperature, scale, posterior, rng)
             scale = stage.scale
             stages.append(stage)
 
 
-def raised_from(temperature: float, log_likelihood: Array) -> float:
+def next_temperature(temperature: float, log_likelihood: Array) -> float:
     """The next temperature, at which the effective number has fallen to `SHARE`; at most one.
 
     Particles without a likelihood are lost at the first step, however small: the share is one of
@@ -151,7 +152,7 @@ def raised_from(temperature: float, log_likelihood: Array) -> float:
     return temperature + brentq(surplus, 0.0, 1 - temperature, xtol=1e-300, rtol=1e-9)
 
 
-def moved(
+def move_particles(
     particles: Particles,
     temperature: float,
     scale: float,
@@ -159,11 +160,11 @@ def moved(
     rng: np.random.Generator,
 ) -> tuple[Particles, _Stage]:
     """Move particles by steps that keep p(x) L(x)^temperature, until they are far enough."""
-    coordinates = learnt_from(particles.x)
+    coordinates = cross_fit(particles.x)
     start = coordinates.whitened(particles.x)
     distance, rates = 0.0, []
     for _ in range(MAX_MOVES):
-        particles, walks, jumps = metropolis(
+        particles, walks, jumps = metropolis_step(
             particles, temperature, coordinates, scale, posterior, rng
         )
         rates.append((walks + jumps) / 2)

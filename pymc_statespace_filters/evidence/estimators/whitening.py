@@ -10,7 +10,7 @@ from pymc_statespace_filters.errors import ModelError
 Array = NDArray[np.float64]
 
 
-class Whitened(NamedTuple):
+class Whitening(NamedTuple):
     """Coordinates z in which draws have mean zero and covariance one: x = mean + chol z."""
 
     mean: Array  # (k,)
@@ -26,7 +26,7 @@ class Whitened(NamedTuple):
         return (x - self.mean) @ np.linalg.inv(self.chol).T
 
 
-def moments(draws: Array) -> Whitened:
+def moments(draws: Array) -> Whitening:
     """Mean and lower Cholesky factor of the covariance of draws (..., k).
 
     Raises
@@ -39,7 +39,7 @@ def moments(draws: Array) -> Whitened:
     return _factored(flat.mean(axis=0), np.cov(flat, rowvar=False).reshape(k, k), len(flat))
 
 
-def moments_within_chains(draws: Array) -> Whitened:
+def moments_within_chains(draws: Array) -> Whitening:
     """Mean of draws (chain, draw, k), and the factor of their covariance within chains.
 
     Chains in separate modes would otherwise blur the width of each.
@@ -54,9 +54,9 @@ def moments_within_chains(draws: Array) -> Whitened:
     return _factored(draws.mean(axis=(0, 1)), about_mean.T @ about_mean / count, count)
 
 
-def _factored(mean: Array, covariance: Array, count: int) -> Whitened:
+def _factored(mean: Array, covariance: Array, count: int) -> Whitening:
     try:
-        return Whitened(mean, np.linalg.cholesky(covariance))
+        return Whitening(mean, np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
         raise ModelError(
             "idata must hold draws that vary in every direction; the covariance of "

@@ -58,6 +58,20 @@ class Posterior:
     is_noisy: bool = False
     prior: Prior | None = None
 
+    @property
+    def required_prior(self) -> Prior:
+        """The prior, for estimators that cannot do without it."""
+        assert self.prior is not None, "a posterior without a prior"
+        return self.prior
+
+    def evaluate_factors(self, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Log prior and log-likelihood of points x (m, k), each of shape (m,).
+
+        A noisy likelihood is estimated with fresh noise for each point.
+        """
+        log_prior = self.required_prior.log_density(x)
+        return log_prior, log_likelihood_of(self.evaluate(x, rng), log_prior)
+
     def halves(self) -> tuple["Posterior", "Posterior"]:
         """Split every chain in the middle."""
         middle = self.draws.shape[1] // 2
@@ -72,7 +86,13 @@ class Posterior:
         return replace(self, draws=self.draws[:, ::step], log_density=self.log_density[:, ::step])
 
 
-def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
+def log_likelihood_of(log_density: Array, log_prior: Array) -> Array:
+    """Log-density minus log prior; -inf wherever the log-density is -inf."""
+    finite = np.isfinite(log_density)
+    return np.subtract(log_density, log_prior, out=np.full_like(log_density, -np.inf), where=finite)
+
+
+def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
     """Bring the draws of `idata` and their model together.
 
     Parameters

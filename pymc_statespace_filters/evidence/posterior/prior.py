@@ -10,7 +10,7 @@ from pymc.pytensorf import compile as compile_pymc
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
-from pymc_statespace_filters.evidence.posterior.support import has_law, is_restricted
+from pymc_statespace_filters.evidence.posterior.support import can_sample, is_restricted
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class ModelPrior:
             draws lie where the transform has no number for them.
         """
         model = self._model
-        if lawless := [rv.name for rv in model.free_RVs if not has_law(rv, model)]:
+        if lawless := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
             raise ModelError(
                 f"the prior of {', '.join(lawless)} is improper and cannot be drawn from: "
                 "give it a proper prior"

@@ -33,7 +33,7 @@ class Support:
         improper = [rv.name for rv in model.free_RVs if is_improper(rv, model)]
         return cls(float(sum(widths.values())), ", ".join(widths), ", ".join(improper))
 
-    def doubts(self) -> Iterator[str]:
+    def check(self) -> Iterator[str]:
         """An evidence under an improper prior says little about a model."""
         if self.improper:
             yield (
@@ -44,10 +44,10 @@ class Support:
 
 def is_improper(rv: TensorVariable, model: pm.Model) -> bool:
     """Whether the density of a free variable is known not to integrate to one."""
-    return not has_law(rv, model) or is_restricted(rv, model)
+    return not can_sample(rv, model) or is_restricted(rv, model)
 
 
-def has_law(rv: TensorVariable, model: pm.Model) -> bool:
+def can_sample(rv: TensorVariable, model: pm.Model) -> bool:
     """Whether there is a law to draw from, as far as PyMC's own distributions are concerned."""
     return not any(isinstance(op, _IMPROPER) for op in _operations(rv, model))
 
