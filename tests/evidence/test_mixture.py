@@ -49,7 +49,7 @@ def test_an_affine_map_changes_the_density_by_its_determinant():
     mixture, rng = some_mixture(), np.random.default_rng(43)
     mean, chol = rng.standard_normal(4), np.diag([1e-6, 1.0, 3.0, 1e6]) + np.tril(np.ones(4), -1)
     x = rng.standard_normal((20, 4))
-    moved = mixture.mapped(mean, chol).log_density(mean + x @ chol.T)
+    moved = mixture.affine(mean, chol).log_density(mean + x @ chol.T)
     expected = mixture.log_density(x) - np.log(np.diag(chol)).sum()
     np.testing.assert_allclose(moved, expected, rtol=1e-6)
 

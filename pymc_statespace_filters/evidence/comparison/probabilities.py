@@ -1,4 +1,4 @@
-"""Probabilities of models from log weights that carry errors (thesis, Eq. 3.3)."""
+"""Select one evidence per model; model probabilities from log weights with errors (Eq. 3.3)."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -18,7 +18,7 @@ EvidenceLike = Evidence | Mapping[str, Evidence] | xr.DataTree
 
 
 class Probabilities(NamedTuple):
-    """Of m models, with the ends of their central intervals; each of shape (m,)."""
+    """Probabilities of m models and the ends of their central intervals, each of shape (m,)."""
 
     prob: Array
     low: Array
@@ -28,9 +28,9 @@ class Probabilities(NamedTuple):
 def probabilities(log_weight: Array, se: Array, ci_prob: float) -> Probabilities:
     """Normalise weights, with intervals under independent normal errors of their logarithms.
 
-    The normals are always the same ones: equal evidences give equal intervals, and along a curve
-    of weights the intervals are smooth. An unknown error leaves every interval unknown, because
-    every probability contains it.
+    The normal draws are fixed: equal evidences give equal intervals, and along a curve of weights
+    the intervals are smooth. One unknown error makes all intervals unknown, because every
+    probability depends on it.
     """
     prob = np.exp(log_softmax(log_weight))
     if not np.isfinite(log_weight + se).all():
@@ -52,7 +52,7 @@ def prior_weights(prior: Mapping[str, float] | None, names: list[str]) -> Array:
         weights = np.array([prior[name] for name in names], dtype=np.float64)
     except (TypeError, ValueError):
         weights = np.array(np.nan)
-    # Their sum may overflow, and beside the largest the smallest vanish.
+    # Divide by the largest first: the sum may overflow. Shares may still underflow to zero.
     share = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
     if not (np.isfinite(weights).all() and (share > 0).all()):
         raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
@@ -68,14 +68,14 @@ def check_ci_prob(ci_prob: float) -> None:
 def select_evidences(
     given: Mapping[str, EvidenceLike], estimator: str | None = None
 ) -> dict[str, Evidence]:
-    """Find one evidence for each model, and see that all saw the same data.
+    """Select one evidence for each model, and check that all belong to the same data.
 
     Parameters
     ----------
     given : mapping of str to Evidence, mapping of estimators to Evidence, or xarray.DataTree
         By model.
     estimator : str, optional
-        Whose evidence to take; may be left out where there is only one.
+        Name of the estimator; may be omitted if a model has only one evidence.
 
     Returns
     -------
@@ -84,9 +84,9 @@ def select_evidences(
     Raises
     ------
     ModelError
-        If something else was given, or an estimator is ambiguous or missing.
+        If an entry is of another type, or the estimator is ambiguous or missing.
     DataMismatchError
-        If the models were given different data.
+        If the models belong to different data.
     """
     if not isinstance(given, Mapping) or not given:
         raise ModelError(
@@ -102,7 +102,7 @@ def select_evidences(
     if len(by_data) > 1:
         groups = " | ".join(", ".join(map(repr, names)) for names in by_data.values())
         raise DataMismatchError(
-            f"evidences of different data cannot be compared; models that share data: {groups}"
+            f"evidences must belong to the same data, got models grouped by their data: {groups}"
         )
     return found
 
@@ -121,9 +121,11 @@ def _chosen(name: str, found: Mapping[str, Evidence], estimator: str | None) -> 
         return next(iter(found.values()))
     if estimator is None:
         raise ModelError(
-            f"{name!r} holds the evidence of several estimators: choose one, as "
-            f"estimator={next(iter(found), '')!r}, of {list(found)}"
+            f"estimator must be given, because {name!r} has evidences by several: choose one of "
+            f"{list(found)}"
         )
     if estimator not in found:
-        raise ModelError(f"{name!r} has no evidence by {estimator!r}, only by {list(found)}")
+        raise ModelError(
+            f"estimator must be one of {list(found)}, those of {name!r}, got {estimator!r}"
+        )
     return found[estimator]

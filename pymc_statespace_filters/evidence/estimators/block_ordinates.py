@@ -1,28 +1,30 @@
-r"""Chib and Jeliazkov's ordinate block by block (Chib and Jeliazkov 2001, section 2.2).
+r"""Chib and Jeliazkov's posterior ordinate, block by block (their section 2.2).
 
-The parameters fall into blocks, and the ordinate of the posterior at x* into conditional ones,
+The parameters are divided into blocks, and the ordinate of the posterior at x* is a product of
+conditional ordinates,
 
 .. math::
 
     p(x^*|D) = \prod_b p(x_b^* | x_{<b}^*, D), \qquad p(x_b^* | x_{<b}^*, D) =
         \frac{E_b[\alpha(x, x')\, q(x_b, x_b^*)]}{E_{b+1}[\alpha(x', x)]}.
 
-E_b is the mean over draws x of the conditional posterior of the blocks from b on, the earlier ones
-fixed at x*; x' is x with its block b put to x_b*. In E_{b+1} x' is such a draw of the blocks after
-b, and x is x' with a block b from q(x_b*, .). Draws of run 1 are those of the posterior; the later,
-reduced runs are this file's own. The last one has nothing left to move and is the point x*.
+E_b is the mean over draws x of the conditional posterior of the blocks from b on, with the earlier
+blocks fixed at x*; x' is x with block b replaced by x_b*. In E_{b+1}, x' is such a draw of the
+blocks after b, and x is x' with block b drawn from q(x_b*, .). The draws of run 1 are those of the
+posterior; the later, reduced runs are made here. The last one has no free block and is the point
+x*.
 
-Blocks are of whitened coordinates y, x = x* + L y with L L^T the covariance of the draws: there a
-Gaussian posterior has independent blocks of unit variance, for which q = N(0, I) serves as it is.
-The ordinate in x is that in y over det L.
+Blocks are of whitened coordinates y, x = x* + L y, where L L^T is the covariance of the draws. A
+Gaussian posterior has independent blocks of unit variance there, so that q = N(0, I) needs no
+scale. The ordinate in x is that in y divided by det L.
 
 Each run serves two means, the denominator of one block and the numerator of the next: the error is
 that of the difference of the two terms, draw by draw.
 
-With a noisy likelihood a draw keeps the estimate by which its chain accepted, and a point that is
-proposed, x' in the numerators and x in the denominators, gets a fresh one. On (x, noise) the
-proposal is q times the law of the noise, and both sides of detailed balance, integrated over
-everything, are
+With a noisy likelihood a draw keeps the estimate by which its chain accepted it, and a proposed
+point (x' in the numerators, x in the denominators) gets a fresh one. On (x, noise) the proposal is
+q times the distribution of the noise, and both sides of detailed balance, integrated over all
+variables, are
 
 .. math::
 
@@ -50,7 +52,7 @@ from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 N_WALKERS = 64
 N_WARMUP = 30
-START_SCALE = 0.7  # narrower than the draws, so that no draw of the tails starts many walkers
+START_SCALE = 0.7  # below one, so that no draw in the tails starts many walkers
 
 Array = NDArray[np.float64]
 Target = Callable[[Array], Array]  # log-densities (m,) of whitened points (m, k)
@@ -58,14 +60,14 @@ Target = Callable[[Array], Array]  # log-densities (m,) of whitened points (m, k
 
 @dataclass(frozen=True)
 class Run:
-    """Draws in whitened coordinates, y (chain, draw, k), with the estimates that they keep."""
+    """Draws in whitened coordinates, y (chain, draw, k), with their stored estimates."""
 
     y: Array
     log_density: Array  # (chain, draw)
     n_moves: float = math.inf  # accepted by a walker on average
 
     def with_block(self, values: Array | float, block: slice) -> Array:
-        """The draws with other values in one block, flat (m, k)."""
+        """The draws with `values` in one block, flat (m, k)."""
         moved = self.y.copy()
         moved[..., block] = values
         return moved.reshape(-1, moved.shape[-1])
@@ -73,7 +75,7 @@ class Run:
 
 @dataclass(frozen=True)
 class BlockEstimate:
-    """A log-evidence and how far its means can be trusted."""
+    """A log-evidence with its error and diagnostics."""
 
     log_evidence: float
     se: float
@@ -168,7 +170,7 @@ def _choose_walkers(
 
 
 def _thinned(proposal: Proposal, posterior: Posterior, most: int) -> Run:
-    """The draws of the posterior, evenly thinned to about `most`, in whitened coordinates."""
+    """Draws of the posterior, thinned evenly to about `most`, in whitened coordinates."""
     thinned = posterior.thinned(most)
     flat = thinned.draws.reshape(-1, len(proposal.point))
     y = Whitening(proposal.point, proposal.chol).whitened(flat)
@@ -184,17 +186,16 @@ def _walk(
     n_draws: int,
     rng: np.random.Generator,
 ) -> Run:
-    """Draw the free coordinates given the others by Metropolis walkers side by side.
+    """Sample the free coordinates given the others, by independent Metropolis walkers.
 
-    A proposal turns a walker by a random angle towards a new normal draw around `centre`, which
-    leaves N(centre, I) as it is: far turns suit a posterior that is nearly Gaussian, small ones any
-    other.
+    A proposal rotates a walker by a random angle towards a new draw of N(centre, I), which leaves
+    N(centre, I) invariant: large angles suit a nearly Gaussian posterior, small ones any other.
 
     Parameters
     ----------
     target : callable
     y, log_density : ndarray (walker, k), (walker,)
-        Starts and their kept estimates, nearly draws already: those of the run before, resampled.
+        Starting points with their stored estimates, resampled from the previous run.
     """
     n_kept = -(-n_draws // len(y))
     kept_y, kept_log_density, n_moves = [], [], 0.0
@@ -223,11 +224,11 @@ def _log_normal(y: Array) -> Array:
 
 
 def _normalised(log_terms: Array, what: str) -> tuple[float, Array]:
-    """Log of the mean of positive terms, and the terms over their mean."""
+    """Log of the mean of positive terms, and the terms divided by their mean."""
     value = log_mean(log_terms)
     if np.isneginf(value):
         raise DataMismatchError(
-            f"none of {log_terms.size} {what} has a density: idata belongs to another model or to "
-            "other data, or n_blocks=1 suits it better"
+            f"all {log_terms.size} {what} have zero density: idata belongs to another model or to "
+            "other data, or needs n_blocks=1"
         )
     return value, np.exp(log_terms - value)

@@ -35,7 +35,7 @@ class EdgeError(Exception):
 
 
 def best_of_chains(values: Array, n_best: int) -> NDArray[np.int64]:
-    """Flat indices of the largest value of each chain (chain, draw), best first, at most `n_best`."""
+    """Flat indices of the largest value in each chain, best first, at most `n_best`."""
     flat = values.argmax(axis=1) + np.arange(len(values)) * values.shape[1]
     return flat[np.argsort(-values.ravel()[flat], kind="stable")][:n_best]
 

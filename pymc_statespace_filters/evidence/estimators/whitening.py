@@ -1,4 +1,4 @@
-"""Location and scale of draws, by which proposals are placed and spaces are standardised."""
+"""Whitening of draws by their mean and the Cholesky factor of their covariance."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ class Whitening(NamedTuple):
 
     def whitened(self, x: Array) -> Array:
         """Whitened points of x (m, k)."""
-        # SciPy's triangular solution wakes BLAS's threads, for milliseconds, whatever the size.
+        # SciPy's triangular solver starts BLAS threads, which takes milliseconds at any size.
         return (x - self.mean) @ np.linalg.inv(self.chol).T
 
 
@@ -42,7 +42,8 @@ def moments(draws: Array) -> Whitening:
 def moments_within_chains(draws: Array) -> Whitening:
     """Mean of draws (chain, draw, k), and the factor of their covariance within chains.
 
-    Chains in separate modes would otherwise blur the width of each.
+    Between-chain variance is excluded: with chains in separate modes it would hide the widths of
+    the modes.
 
     Raises
     ------
@@ -59,6 +60,6 @@ def _factored(mean: Array, covariance: Array, count: int) -> Whitening:
         return Whitening(mean, np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
         raise ModelError(
-            "idata must hold draws that vary in every direction; the covariance of "
-            f"{count} draws of {len(mean)} unconstrained parameters is singular"
+            "the draws of idata must vary in every direction, got a singular covariance of "
+            f"{count} draws of {len(mean)} unconstrained parameters"
         ) from None
