@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence, average_models, compare_evidence
-from pymc_statespace_filters.evidence.comparison.averaging import _counts
+from pymc_statespace_filters.evidence.comparison.averaging import _systematic_counts
 
 X = xr.DataArray([-1.0, 0.5, 2.0], dims="x", coords={"x": [-1.0, 0.5, 2.0]})
 
@@ -131,7 +131,7 @@ def test_same_seed_same_average():
 
 def test_numbers_of_draws_are_systematic():
     prob, rng = np.array([0.36, 0.29, 0.35]), np.random.default_rng(4)
-    counts = np.array([_counts(prob, 10, rng) for _ in range(2000)])
+    counts = np.array([_systematic_counts(prob, 10, rng) for _ in range(2000)])
     assert (counts.sum(axis=1) == 10).all()
     assert (np.abs(counts - 10 * prob) < 1).all()
     # On average as probable: standard deviations below 1/2, so that the errors are below 0.012.

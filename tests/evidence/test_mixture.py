@@ -10,7 +10,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
-    _maximised,
+    _m_step,
     choose_mixture,
     fit_mixture,
     place_components,
@@ -63,7 +63,7 @@ def test_steps_of_em_never_lower_the_density_of_the_draws():
         log_joint = mixture.log_joint(x)
         log_density = np.logaddexp.reduce(log_joint)
         reached.append(log_density.mean())
-        mixture = _maximised(mixture, x, np.exp(log_joint - log_density))
+        mixture = _m_step(mixture, x, np.exp(log_joint - log_density))
     assert np.min(np.diff(reached)) > -1e-3
     assert reached[-1] > reached[0] + 0.3
 
