@@ -1,4 +1,4 @@
-"""Probabilities of rival models, with what the errors of the evidences leave open."""
+"""Plot of model probabilities with their intervals."""
 
 from typing import Any
 
@@ -21,17 +21,17 @@ COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 def plot_model_probabilities(
     table: pd.DataFrame, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Draw the probabilities of rival models with their intervals.
+    """Plot model probabilities with their intervals.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Of `compare_evidence`. Models among which the errors do not decide have an open mark and
-        the word "undecided".
+        Result of `compare_evidence`. Undecided models have an open marker and the label
+        "undecided".
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def plot_model_probabilities(
     Raises
     ------
     ModelError
-        If it is not such a table.
+        If `table` is no such table.
 
     Examples
     --------
