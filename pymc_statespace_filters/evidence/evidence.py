@@ -100,8 +100,9 @@ class Evidence:
         notes = []
         if self.improper:
             notes.append(
-                f"The prior of {self.improper} is improper or not normalised: the evidence depends "
-                "on the unit of each of these parameters."
+                f"The prior of {self.improper} is improper or not normalised: the evidence "
+                "integrates the likelihood over the whole support of the prior's density, and "
+                "depends on the unit of each of these parameters."
             )
         if self.uniform:
             notes.append(

@@ -98,7 +98,7 @@ def test_the_gap_between_halves_is_in_units_of_its_error(monkeypatch):
     for run in range(100):
         rng = np.random.default_rng([21, run])
         found = ChibJeliazkov(500).estimate(gaussian(2, (4, 250), rng), rng=rng)
-        gaps.append(float(found.doubts[-1].split("differ by ")[1].split(" of")[0]))
+        gaps.append(float(found.doubts[-1].split("differ by ")[1].split(" standard")[0]))
     assert 0.6 < np.mean(np.square(gaps)) < 1.6  # 1 within 0.14
 
 

@@ -71,7 +71,7 @@ def test_other_filters_are_judged_by_the_ekf():
 
 def test_all_draws_may_lie_there():
     (doubt,) = doubts(linear_model(linear()), near(-19.0))
-    assert doubt.startswith("100% of the draws owe")
+    assert doubt.startswith("100% of the draws have a likelihood due")
 
 
 @pytest.mark.parametrize(("a", "n", "size"), [(-1.0, 10, 100), (-6.0, 1, 100), (-9.0, 1, 2000)])

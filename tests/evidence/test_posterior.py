@@ -120,7 +120,7 @@ def test_discrete_variables_are_refused():
     with pm.Model() as model:
         count = pm.Poisson("count", 3)
         pm.Normal("y", count, 1, observed=DATA)
-    with pytest.raises(ModelError, match=r"\['count'\] are discrete"):
+    with pytest.raises(ModelError, match=r"got discrete \['count'\]"):
         ModelDensity(model)
 
 

@@ -195,13 +195,13 @@ def test_vectors_of_every_shape():
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (lambda: pm.Flat("x"), "improper and has no width"),
-        (lambda: pm.HalfFlat("x"), "improper and has no width"),
-        (lambda: pm.Beta("x", 2, 2), "cannot be stretched"),
-        (lambda: pm.Dirichlet("x", np.ones(3)), "cannot be stretched"),
-        (lambda: pm.VonMises("x", 0, 1), "cannot be stretched"),
-        (lambda: pm.LKJCorr("x", n=3, eta=2), "cannot be stretched"),
-        (lambda: pm.ZeroSumNormal("x", shape=3), "cannot be stretched"),
+        (lambda: pm.Flat("x"), "improper and cannot be scaled"),
+        (lambda: pm.HalfFlat("x"), "improper and cannot be scaled"),
+        (lambda: pm.Beta("x", 2, 2), "cannot be scaled"),
+        (lambda: pm.Dirichlet("x", np.ones(3)), "cannot be scaled"),
+        (lambda: pm.VonMises("x", 0, 1), "cannot be scaled"),
+        (lambda: pm.LKJCorr("x", n=3, eta=2), "cannot be scaled"),
+        (lambda: pm.ZeroSumNormal("x", shape=3), "cannot be scaled"),
     ],
 )
 def test_priors_without_a_width(law, message):
