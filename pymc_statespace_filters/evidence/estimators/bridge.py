@@ -193,7 +193,7 @@ def _bridge(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
     """
     log_odds = math.log(at_draws.size / at_proposals.size)
     shift = log_odds - _fixed_point(at_draws, at_proposals, log_odds)
-    # One step suffices: the terms depend only weakly on the effective sample size that weights h.
+    # One fixed-point step suffices: the effective sample size depends only weakly on itself.
     n_effective = float(az.ess(expit(-at_draws - shift), method="mean"))
     log_odds = math.log(n_effective / at_proposals.size)
     log_evidence = _fixed_point(at_draws, at_proposals, log_odds)
