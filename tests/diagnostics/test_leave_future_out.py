@@ -128,7 +128,7 @@ def test_what_the_draws_cannot_tell_is_missing(exact):
     assert np.isnan(found.elpd)
     assert found.warning
     enough = 2 + int(np.flatnonzero(unknown)[-1]) + 1
-    assert f"take min_observations={enough}, or" in str(caught[0].message)
+    assert f"set min_observations={enough}, or" in str(caught[0].message)
     assert np.isfinite(psf.leave_future_out(few, exact, min_observations=enough).elpd)
 
 

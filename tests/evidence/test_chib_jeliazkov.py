@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.estimation import chib_jeliazkov as module
+from pymc_statespace_filters.evidence.estimators import chib_jeliazkov as module
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import (
     ChibJeliazkov,
     estimate_in_one_block,
