@@ -45,4 +45,4 @@ def test_densities_without_an_integral_or_with_another_one():
     support = Support.of(model)
     assert support.improper == "flat, half, walk, field, sorted, positive"
     (doubt,) = support.check()
-    assert "depends on the unit of each: give it a proper prior" in doubt
+    assert "depends on the units of the parameters: give them proper priors" in doubt
