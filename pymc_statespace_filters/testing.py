@@ -1,9 +1,8 @@
-"""Exact answers for checking filters, the package's own and anybody else's.
+"""Exact log-likelihood of linear-Gaussian systems, to test filters.
 
-A linear system with Gaussian noise is the one family whose likelihood has a closed form. Every
-filter must reproduce it, exactly (the extended Kalman filter) or in the limit of many members (all
-others). The code below is the covariance form of any textbook: slow, short, and independent of the
-package's kernels.
+A filter must reproduce it exactly (the extended Kalman filter) or in the limit of many members (all
+others). The code is the textbook covariance form of the Kalman filter: slow, short, and independent
+of the package's compiled code.
 """
 
 import numpy as np
@@ -30,15 +29,15 @@ def kalman_log_likelihood(
 
     The model is :math:`x_{k+1} = A x_k + b_k + w_k` with :math:`w_k \sim N(0, Q)` for every step,
     and :math:`d_j = C x_{d(j)} + e_j` with :math:`e_j \sim N(0, R)` at the steps :math:`d(j)`,
-    where :math:`x_0 \sim N(m_0, P_0)`. Every second argument of N is a covariance. The terms are
-    thesis, Eqs. 4.5-4.7, 4.10-4.11 and 4.14, which are exact for this model.
+    where :math:`x_0 \sim N(m_0, P_0)`. The second argument of N is a covariance. The terms follow
+    from thesis, Eqs. 4.5-4.7, 4.10-4.11 and 4.14, which are exact for this model.
 
     Parameters
     ----------
     transition_matrix : array_like, shape (n, n)
         A.
     process_cov : array_like, shape (n, n)
-        Q, the covariance of the whole noise of one step; may be singular. Noise that enters as
+        Q, the covariance of the process noise of one step; may be singular. Noise that enters as
         ``B q`` with covariance S of q has ``Q = B @ S @ B.T``.
     observation_matrix : array_like, shape (p, n)
         C.
@@ -59,17 +58,17 @@ def kalman_log_likelihood(
     Returns
     -------
     ndarray, shape (J,)
-        ``log p(d_j | d_1 .. d_{j-1})``; 0 for a row that is wholly missing. Their sum is the
+        ``log p(d_j | d_1 .. d_{j-1})``; 0 for a row that is entirely missing. Their sum is the
         log-likelihood.
 
     Raises
     ------
     ModelError
-        If shapes disagree, steps do not increase, or rows of `forcing` are too few.
+        If shapes disagree, steps do not increase, or `forcing` has too few rows.
 
     Examples
     --------
-    A random walk with unit steps, seen with unit noise at steps 0 and 2:
+    A random walk with unit steps, observed with unit noise at steps 0 and 2:
 
     >>> from pymc_statespace_filters.testing import kalman_log_likelihood
     >>> terms = kalman_log_likelihood(
@@ -120,7 +119,7 @@ def _check_shapes(A: Array, Q: Array, C: Array, R: Array, x: Array, P: Array) ->
     if x.ndim != 1 or C.ndim != 2:
         raise ModelError(
             "initial_mean must be a vector and observation_matrix a matrix, "
-            f"given shapes {x.shape} and {C.shape}"
+            f"got shapes {x.shape} and {C.shape}"
         )
     n, p = x.size, len(C)
     expected = {
@@ -132,7 +131,7 @@ def _check_shapes(A: Array, Q: Array, C: Array, R: Array, x: Array, P: Array) ->
     }
     for name, (value, shape) in expected.items():
         if value.shape != shape:
-            raise ModelError(f"{name} has shape {value.shape}, expected {shape}")
+            raise ModelError(f"{name} must have shape {shape}, got {value.shape}")
 
 
 def _check_record(
@@ -140,20 +139,20 @@ def _check_record(
 ) -> tuple[NDArray[np.int64], Array, Array]:
     steps = np.asarray(steps)
     if steps.ndim != 1 or not np.issubdtype(steps.dtype, np.integer):
-        raise ModelError(f"steps must be a vector of integers, given {steps!r}")
+        raise ModelError(f"steps must be a vector of integers, got {steps!r}")
     if (steps < 0).any() or (np.diff(steps) <= 0).any():
-        raise ModelError(f"steps must be non-negative and strictly increasing, given {steps!r}")
+        raise ModelError(f"steps must be non-negative and strictly increasing, got {steps!r}")
     observed = np.asarray(observed, dtype=np.float64)
     if observed.ndim == 1 and p == 1:
         observed = observed[:, None]
     if observed.shape != (len(steps), p):
-        raise ModelError(f"observed has shape {observed.shape}, expected {(len(steps), p)}")
+        raise ModelError(f"observed must have shape {(len(steps), p)}, got {observed.shape}")
     n_transitions = int(steps[-1]) if len(steps) else 0
     if forcing is None:
         forcing = np.zeros((n_transitions, n))
     forcing = np.asarray(forcing, dtype=np.float64)
     if forcing.ndim != 2 or forcing.shape[1] != n or len(forcing) < n_transitions:
         raise ModelError(
-            f"forcing has shape {forcing.shape}, expected at least {n_transitions} rows of {n}"
+            f"forcing must have at least {n_transitions} rows of {n}, got shape {forcing.shape}"
         )
     return steps.astype(np.int64), observed, forcing

@@ -83,9 +83,9 @@ def test_scalar_record_may_be_a_vector():
         ({"steps": [0, 2, 2]}, "strictly increasing"),
         ({"steps": [-1, 0, 1]}, "non-negative"),
         ({"steps": [0.0, 1.0, 2.0]}, "integers"),
-        ({"observed": np.zeros((2, 2))}, r"observed has shape \(2, 2\), expected \(3, 2\)"),
+        ({"observed": np.zeros((2, 2))}, r"observed must have shape \(3, 2\), got \(2, 2\)"),
         ({"forcing": np.zeros((1, 2))}, "at least 2 rows of 2"),
-        ({"process_cov": np.eye(3)}, r"process_cov has shape \(3, 3\), expected \(2, 2\)"),
+        ({"process_cov": np.eye(3)}, r"process_cov must have shape \(2, 2\), got \(3, 3\)"),
     ],
 )
 def test_wrong_shapes_are_named(change, message):

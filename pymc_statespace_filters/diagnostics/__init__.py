@@ -1,4 +1,4 @@
-"""What draws and data say of the filter and of the model: one step ahead, observation by one."""
+"""Diagnostics of filter and model by one-step-ahead prediction of the observations."""
 
 from pymc_statespace_filters.diagnostics.cross_validation import leave_future_out
 from pymc_statespace_filters.diagnostics.filter_health import filter_diagnostics

@@ -1,4 +1,4 @@
-"""Whether predictions are calibrated: where data fall among draws of their predictions."""
+"""Calibration of predictions: PIT values, residuals, coverage, and tests of both."""
 
 import numpy as np
 from arviz_stats.base import array_stats
@@ -7,15 +7,15 @@ from scipy.stats import chi2, norm
 
 Array = NDArray[np.float64]
 
-MAX_LAGS, OBSERVATIONS_PER_LAG = 10, 5  # of the test of whiteness
+MAX_LAGS, OBSERVATIONS_PER_LAG = 10, 5  # of the whiteness test
 
 
 def pit_of(observed: Array, predicted: Array, rng: np.random.Generator) -> Array:
-    """The share of draws (S, ...) not above the observed (...), between those it lies between.
+    """Randomised probability integral transform of observations (...) given draws (S, ...).
 
-    The rank of the datum among itself and the draws, ties and the place within a rank at random:
-    uniform if the datum is one of them, for counts too (Czado, Gneiting and Held 2009). NaN where
-    the datum is missing; draws that are NaN are left out.
+    The rank of the observation among itself and the draws, randomised over ties and within the
+    rank: uniform if the observation follows the distribution of the draws, for counts too (Czado,
+    Gneiting and Held 2009). NaN where the observation is missing; NaN draws are ignored.
     """
     n_draws = np.isfinite(predicted).sum(axis=0)
     below = (predicted < observed).sum(axis=0)
@@ -25,13 +25,13 @@ def pit_of(observed: Array, predicted: Array, rng: np.random.Generator) -> Array
 
 
 def residual_of(pit: Array, n_draws: int) -> Array:
-    """Standard normal quantiles, no further out than the draws can tell."""
+    """Standard normal quantiles of PIT values, limited to the resolution of the draws."""
     furthest = 0.5 / n_draws
     return norm.ppf(np.clip(pit, furthest, 1 - furthest))
 
 
 def coverage_of(pit: Array, prob: float) -> Array:
-    """The share of data (J, p) within the central interval of their predictions, (p,)."""
+    """Share of observations (J, p) within the central prediction interval, (p,)."""
     known = np.isfinite(pit)
     inside = np.abs(pit - 0.5) <= prob / 2
     n_known = known.sum(axis=0)
@@ -39,10 +39,10 @@ def coverage_of(pit: Array, prob: float) -> Array:
 
 
 def uniformity_of(pit: Array) -> float:
-    """The p-value of a test that the numbers that are not missing are uniform, or NaN.
+    """The p-value of a test that the values that are not missing are uniform, or NaN.
 
-    Where each order statistic lies in its own law, joined as truncated Cauchy variables: the test
-    that ArviZ writes into its pictures of PIT values.
+    The test of ArviZ's PIT plots: p-values of the order statistics, combined by the truncated
+    Cauchy method.
     """
     known = pit[np.isfinite(pit)]
     if known.size < 2:
@@ -51,9 +51,9 @@ def uniformity_of(pit: Array) -> float:
 
 
 def whiteness_of(residual: Array) -> float:
-    """The p-value of the test of Ljung and Box (1978), or NaN: no autocorrelation at any lag.
+    """The p-value of the test of Ljung and Box (1978) for autocorrelation, or NaN.
 
-    Up to lag 10, or a fifth of the number of residuals; missing ones are left out.
+    Up to lag 10, or a fifth of the number of residuals; missing residuals are dropped.
     """
     known = residual[np.isfinite(residual)]
     n = known.size

@@ -1,4 +1,4 @@
-"""How well a model foretells the next observation from those before it."""
+"""Leave-future-out cross-validation of one-step-ahead predictions."""
 
 import warnings
 from collections.abc import Callable
@@ -11,12 +11,15 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import SEQUENTIAL, terms_at
-from pymc_statespace_filters.diagnostics.truncated_data import record_of, shortened
+from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import (
+    SEQUENTIAL,
+    sequential_terms,
+)
+from pymc_statespace_filters.diagnostics.truncated_data import observed_values, truncate_data
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.variable import chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.variable import select_variables
 from pymc_statespace_filters.system.checks import is_integer
 
 Refit = Callable[[pm.Model], xr.DataTree]
@@ -30,64 +33,65 @@ def leave_future_out(
     var_name: str | None = None,
     refit: Refit | None = None,
 ) -> ELPDDataLFO:
-    r"""Score each observation by its density given those before it, the parameters integrated out.
+    r"""Score each observation by its predictive density given the observations before it.
 
     Leave-future-out cross-validation one step ahead: the sum over :math:`j > L` of
     :math:`\log p(d_j \mid d_1 \dots d_{j-1})
     = \log E[p(d_j \mid d_1 \dots d_{j-1}, \theta)]`, where :math:`\theta` has the posterior given
-    :math:`d_1 \dots d_{j-1}` alone. This is the cross-validation that the sequential terms of a
-    state-space model belong to; taken for leave-one-out (``az.loo``) they give a number without a
-    meaning.
+    :math:`d_1 \dots d_{j-1}` alone. This is the cross-validation to which the sequential terms of a
+    state-space model belong; leave-one-out cross-validation (``az.loo``) is invalid with them.
 
-    Without `refit` the posteriors of shorter records come from that of the whole one, whose draws
-    are weighted by :math:`\exp(-\sum_{i \ge j} \log p(d_i \mid d_1 \dots d_{i-1}, \theta))`,
-    Pareto-smoothed. That costs nothing and reaches back as far as the later data taught little;
-    what the draws cannot tell is NaN. With `refit` it is ``az.lfo_cv``: a first fit to the first
-    `min_observations`, weights that add later observations, and a new fit wherever those fail.
+    Without `refit`, the posteriors given fewer observations are obtained from the full posterior by
+    Pareto-smoothed weights
+    :math:`\exp(-\sum_{i \ge j} \log p(d_i \mid d_1 \dots d_{i-1}, \theta))`. This needs no further
+    sampling and is reliable as long as the later data are not too informative; scores with
+    unreliable weights are NaN. With `refit` it is ``az.lfo_cv``: a first fit to the first
+    `min_observations`, weights that add later observations, and a new fit where the weights become
+    unreliable.
 
-    Each draw is taken with the noise of its own estimate. With an unbiased filter
-    (`BootstrapPF`) both ways are therefore exact as the draws grow in number, for any number of
-    particles: parameters and noise together have a posterior, and the estimates are its terms.
+    Each draw is used with the noise of its own likelihood estimate. With an unbiased filter
+    (`BootstrapPF`) both methods are therefore exact in the limit of many draws, for any number of
+    particles: parameters and noise have a joint posterior, whose likelihood terms are the
+    estimates.
 
-    The sum from :math:`L` on is the logarithm of the evidence of the whole record over that of the
-    first :math:`L` observations; from :math:`L = 0` on it is the log-evidence, which
-    `estimate_evidence` finds by better ways. What is left out of it is the part that the width of
-    the priors decides.
+    The sum over :math:`j > L` is the log-evidence of all observations minus that of the first
+    :math:`L`; for :math:`L = 0` it is the log-evidence, which `estimate_evidence` estimates better.
+    The terms left out are those that depend most on the width of the priors.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Draws of the posterior given the whole record. The terms of its group ``log_likelihood``
-        are used if `compute_log_likelihood` made it; else they are computed.
+        Draws of the posterior given all observations. The terms in its group ``log_likelihood`` are
+        used if `compute_log_likelihood` stored them; otherwise they are computed.
     model : pymc.Model, optional
-        The model of the ``with`` block if not given.
+        The model of the draws; by default that of the ``with`` block.
     min_observations : int
-        Observations before the first that is scored, not counting those wholly missing. At least 1
-        with `refit`, else 0. Models to be compared need the same.
+        Number of observations before the first that is scored, not counting those entirely missing.
+        At least 1 with `refit`, else 0. It must be the same for models to be compared.
     var_name : str, optional
-        The StateSpace variable, if the model has several. Everything else that the model observed
-        counts as known from the beginning.
+        Name of the StateSpace variable, if the model has several. Other observed variables count as
+        known from the beginning.
     refit : callable, optional
-        Given a copy of the model whose record ends early (later rows are missing), returns draws of
-        its posterior, such as ``lambda model: psf.sample_dram(1000, model=model, random_seed=1)``.
+        Returns posterior draws of a copy of the model whose later observations are missing, such as
+        ``lambda model: psf.sample_dram(1000, model=model, random_seed=1)``.
 
     Returns
     -------
     arviz_stats.ELPDDataLFO
-        ``elpd`` with ``se``, the error from the data being as few as they are, not that of the
-        computation; ``elpd_i`` and ``pareto_k`` by time; ``refits``; ``p``, by how much less the
-        score is than with parameters that know the whole record. ``az.compare`` takes several.
+        ``elpd`` with ``se``, the sampling error due to the number of observations, not that of the
+        computation; ``elpd_i`` and ``pareto_k`` by time; ``refits``; ``p``, the amount by which the
+        score is below that with parameters given all observations. ``az.compare`` compares several.
 
     Raises
     ------
     ModelError
         If `min_observations` leaves nothing to score, or the model has several StateSpace variables
-        and none is named; and as `compute_log_likelihood`.
+        and `var_name` is not given; further as `compute_log_likelihood`.
 
     Warns
     -----
     EvidenceWarning
-        If draws of the whole record cannot tell some of the scores, and which they can.
+        If some scores are NaN because the weights of the draws are unreliable.
 
     References
     ----------
@@ -120,20 +124,20 @@ def leave_future_out(
     model = pm.modelcontext(model)
     variable = _one_variable(model, var_name)
     time, name = variable.dims[0], variable.name
-    seen = np.flatnonzero(~np.isnan(record_of(model, name)).all(axis=1))
-    _check_number(min_observations, 0 if refit is None else 1, seen.size, name)
-    terms = _stored(idata, name)
+    observed = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))
+    _check_min_observations(min_observations, 0 if refit is None else 1, observed.size, name)
+    terms = _stored_terms(idata, name)
     if terms is None:
-        terms = terms_at(model, variable, draws_of(idata, None))
-    terms = terms.isel({time: seen})
+        terms = sequential_terms(model, variable, select_draws(idata, None))
+    terms = terms.isel({time: observed})
     if refit is None:
-        return _backwards(idata, terms, min_observations)
+        return _score_by_reweighting(idata, terms, min_observations)
     with warnings.catch_warnings():
-        # Many refits are no reason for doubt, and no argument of ours makes them more.
+        # ArviZ warns of many refits, which are no problem here.
         warnings.filterwarnings("ignore", "LFO-CV triggered")
         return lfo_cv(
             xr.DataTree.from_dict({"log_likelihood": terms.to_dataset(name=name)}),
-            _Refits(model, variable, seen, refit),
+            _Refits(model, variable, observed, refit),
             min_observations,
             forecast_horizon=1,
             time_dim=time,
@@ -143,14 +147,14 @@ def leave_future_out(
 
 
 def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
-    variables = chosen_variables(model, var_name)
+    variables = select_variables(model, var_name)
     if len(variables) > 1:
         names = [variable.name for variable in variables]
         raise ModelError(f"var_name must be one of {names}, got None")
     return variables[0]
 
 
-def _check_number(given: int, least: int, n_observations: int, name: str) -> None:
+def _check_min_observations(given: int, least: int, n_observations: int, name: str) -> None:
     if not (is_integer(given) and least <= given < n_observations):
         raise ModelError(
             f"min_observations must be an integer from {least} to {n_observations - 1}, as "
@@ -158,8 +162,8 @@ def _check_number(given: int, least: int, n_observations: int, name: str) -> Non
         )
 
 
-def _stored(idata: xr.DataTree, name: str) -> xr.DataArray | None:
-    """Terms that `compute_log_likelihood` left, each with the noise of its draw."""
+def _stored_terms(idata: xr.DataTree, name: str) -> xr.DataArray | None:
+    """Terms stored by `compute_log_likelihood`, each with the noise of its draw."""
     if "log_likelihood" not in idata.children or name not in idata["log_likelihood"]:
         return None
     terms = idata["log_likelihood"].to_dataset()[name]
@@ -168,24 +172,26 @@ def _stored(idata: xr.DataTree, name: str) -> xr.DataArray | None:
 
 
 def _good_k(terms: xr.DataArray) -> float:
-    """The Pareto k up to which so many draws are reliable (Vehtari et al. 2024)."""
+    """The Pareto k up to which weights of this many draws are reliable (Vehtari et al. 2024)."""
     n_draws = terms.sizes["chain"] * terms.sizes["draw"]
     return min(0.7, 1 - 1 / np.log10(n_draws))
 
 
-def _backwards(idata: xr.DataTree, terms: xr.DataArray, min_observations: int) -> ELPDDataLFO:
-    """Scores from draws of the whole record, whose weights forget its end."""
+def _score_by_reweighting(
+    idata: xr.DataTree, terms: xr.DataArray, min_observations: int
+) -> ELPDDataLFO:
+    """Scores from draws given all observations, reweighted to those given the earlier ones."""
     rows = terms.values.reshape(-1, terms.shape[-1])
     scored = rows[:, min_observations:]
-    forgotten = np.cumsum(scored[:, ::-1], axis=1)[:, ::-1]
+    removed = np.cumsum(scored[:, ::-1], axis=1)[:, ::-1]  # log-likelihood of d_j and all later
     efficiency = _efficiency(idata)
-    weighted = [_smoothed(column, efficiency) for column in forgotten.T]
+    weighted = [_pareto_smoothed(column, efficiency) for column in removed.T]
     log_weights, pareto_k = map(np.array, zip(*weighted, strict=True))
     good_k = _good_k(terms)
     known = pareto_k <= good_k
     scores = logsumexp(log_weights + scored.T, axis=1) - logsumexp(log_weights, axis=1)
     elpd_i = np.where(known, scores, np.nan)
-    gained = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
+    p_i = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
     if not known.all():
         _warn(known, good_k, min_observations)
 
@@ -197,7 +203,7 @@ def _backwards(idata: xr.DataTree, terms: xr.DataArray, min_observations: int) -
     return ELPDDataLFO(
         elpd=float(elpd_i.sum()),
         se=float(np.sqrt(elpd_i.size) * elpd_i.std()),
-        p=float(gained.sum()),
+        p=float(p_i.sum()),
         n_samples=len(rows),
         n_data_points=elpd_i.size,
         scale="log",
@@ -209,22 +215,22 @@ def _backwards(idata: xr.DataTree, terms: xr.DataArray, min_observations: int) -
         min_observations=min_observations,
         refits=np.array([], dtype=int),
         n_refits=0,
-        p_lfo_i=by_time(gained),
+        p_lfo_i=by_time(p_i),
     )
 
 
-def _smoothed(
+def _pareto_smoothed(
     log_likelihood: NDArray[np.float64], efficiency: float
 ) -> tuple[NDArray[np.float64], float]:
-    """Pareto-smoothed logarithms of weights that divide by a likelihood, and Pareto's k."""
+    """Pareto-smoothed log weights 1 / likelihood, and the Pareto shape k."""
     try:
         return array_stats.psislw(log_likelihood, r_eff=efficiency)
-    except ValueError:  # the largest weights are one draw's, at which a chain stood
+    except ValueError:  # all weights of the tail are equal, from a chain that rejected
         return -log_likelihood, np.inf
 
 
 def _efficiency(idata: xr.DataTree) -> float:
-    """Effective over actual number of draws, the mean over the parameters."""
+    """Effective over actual number of draws, averaged over the parameters."""
     posterior = idata["posterior"].to_dataset()
     n_draws = posterior.sizes["chain"] * posterior.sizes["draw"]
     sizes = ess(posterior, method="mean")
@@ -234,41 +240,45 @@ def _efficiency(idata: xr.DataTree) -> float:
 def _warn(known: NDArray[np.bool_], good_k: float, min_observations: int) -> None:
     last_unknown = int(np.flatnonzero(~known)[-1])
     least = min_observations + last_unknown + 1
-    from_there = f"take min_observations={least}, or " if last_unknown < known.size - 1 else ""
+    remedy = f"set min_observations={least}, or " if last_unknown < known.size - 1 else ""
     warnings.warn(
-        f"draws of the whole record cannot tell {np.sum(~known)} of the {known.size} scores "
-        f"(Pareto k above {good_k:.2f}), which are NaN, as is their sum: {from_there}give refit= "
-        "to sample posteriors of shorter records",
+        f"{np.sum(~known)} of the {known.size} scores are NaN, as is their sum, because the "
+        f"weights of the draws are unreliable (Pareto k above {good_k:.2f}): {remedy}give refit= "
+        "to sample the posteriors given fewer observations",
         EvidenceWarning,
         stacklevel=4,
     )
 
 
 class _Refits(SamplingWrapper):
-    """What ArviZ asks of a model that it has fitted again; fits are draws."""
+    """ArviZ's interface to a model that is fitted repeatedly."""
 
     def __init__(
-        self, model: pm.Model, variable: StateSpaceVariable, seen: NDArray[np.int64], refit: Refit
+        self,
+        model: pm.Model,
+        variable: StateSpaceVariable,
+        observed: NDArray[np.int64],
+        refit: Refit,
     ) -> None:
         super().__init__(model)
-        self._variable, self._seen, self._refit = variable, seen, refit
+        self._variable, self._observed, self._refit = variable, observed, refit
 
     def sel_observations(self, idx: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
-        """The row at which the record ends, and the rows that are left out."""
-        left_out = self._seen[idx]
+        """The first row that is left out, and all rows that are."""
+        left_out = self._observed[idx]
         return int(left_out[0]), left_out
 
     def sample(self, modified_observed_data: int) -> xr.DataTree:
-        """Draws given the record up to a row."""
-        return self._refit(shortened(self.model, self._variable.name, modified_observed_data))
+        """Posterior draws given the rows before `modified_observed_data`."""
+        return self._refit(truncate_data(self.model, self._variable.name, modified_observed_data))
 
     def get_inference_data(self, fitted_model: xr.DataTree) -> xr.DataTree:
-        """They are what the user's function returns."""
+        """The draws themselves: `refit` returns a DataTree."""
         return fitted_model
 
     def log_likelihood__i(
         self, excluded_obs: NDArray[np.int64], idata__i: xr.DataTree
     ) -> xr.DataArray:
-        """Terms of later rows, with the noise of each draw of a shorter record."""
-        terms = terms_at(self.model, self._variable, draws_of(idata__i, None))
+        """Terms of later rows, with the noise of each draw."""
+        terms = sequential_terms(self.model, self._variable, select_draws(idata__i, None))
         return terms.isel({self._variable.dims[0]: excluded_obs})

@@ -1,4 +1,4 @@
-"""Does a filter do its work, and does its model foretell the record one observation ahead."""
+"""Filter diagnostics: one-step-ahead predictions compared with the observations."""
 
 from typing import Any
 
@@ -14,21 +14,21 @@ from pymc_statespace_filters.diagnostics.calibration import (
     uniformity_of,
     whiteness_of,
 )
-from pymc_statespace_filters.diagnostics.truncated_data import record_of
+from pymc_statespace_filters.diagnostics.truncated_data import observed_values
 from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.pymc_model.inspection import COLLAPSED
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
-from pymc_statespace_filters.states.groups import with_group
-from pymc_statespace_filters.states.variable import States, VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
+from pymc_statespace_filters.states.groups import add_group
+from pymc_statespace_filters.states.variable import States, VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed
 
 Array = NDArray[np.float64]
 
-PROBS = (0.5, 0.9)  # of the intervals whose coverage is counted
-KNOWN = (
+PROBS = (0.5, 0.9)  # of the prediction intervals
+PREDICTION_NOTE = (
     "each observation is predicted from those before it, at parameters drawn from their posterior "
-    "given the whole record: the predictions are slightly better than real ones"
+    "given all observations: the predictions are slightly better than real ones"
 )
 
 
@@ -43,35 +43,36 @@ def filter_diagnostics(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Predict each observation from those before it, and compare with what came.
+    """Compare each observation with its prediction from the observations before it.
 
-    If filter and model are right, the place of an observation among draws of its prediction (the
-    probability integral transform, PIT) is uniform, and independent of all others. Predictions that
-    are too narrow put too many observations near 0 and 1, too wide ones too few; a model that lacks
-    dynamics leaves autocorrelation.
+    If filter and model are correct, the probability integral transform (PIT) of an observation, its
+    rank among draws of its prediction, is uniform and independent of all others. Too narrow
+    predictions give too many PIT values near 0 and 1, too wide ones too few; unmodelled dynamics
+    give autocorrelation.
 
-    The parameters are drawn from their posterior given the whole record, as in posterior predictive
-    checks, so that predictions know a little of what they predict: right models look slightly too
-    good, the more so the shorter the record. `leave_future_out` scores models without that.
+    The parameters are drawn from their posterior given all observations, as in posterior predictive
+    checks. The predictions therefore use a little of the data they predict, and correct models
+    appear slightly too good, the more so with fewer observations. `leave_future_out` scores models
+    without this effect.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Draws of the posterior, whoever made them.
+        Posterior draws from any sampler.
     model : pymc.Model, optional
-        The model of the ``with`` block if not given.
+        The model of the draws; by default that of the ``with`` block.
     var_name : str, optional
-        A StateSpace variable; all of them if not given.
+        Name of a StateSpace variable; all of them by default.
     filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter, optional
-        Another filter than the variable's own.
+        A filter to use instead of the variable's own.
     n_draws : int, optional
-        How many draws, spread evenly over every chain; all if not given.
+        Number of draws, spread evenly over every chain; all by default.
     random_seed : None, int or numpy.random.Generator
-        For states, simulated observations and the breaking of ties.
+        Seed of states, simulated observations and random tie-breaking.
     extend_inferencedata : bool
-        Whether `idata` gets the new group; otherwise a new DataTree has it alone.
+        Whether to add the group to `idata`; otherwise it is returned in a new DataTree.
     progressbar : bool
-        Whether work of more than two seconds shows a bar.
+        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------
@@ -79,29 +80,30 @@ def filter_diagnostics(
         With the group ``filter_diagnostics``. For a variable "d":
 
         * ``d_predicted`` (chain, draw, d_time, observable): a simulated observation of a state
-          drawn given the observations before; NaN from a failure of the filter on.
-        * ``d_n_effective`` (chain, draw, d_time): the effective number of particles or members that
-          carry each observation's update, infinite for a deterministic filter.
-        * ``d_pit`` (d_time, observable): the share of predictions not above the observation, ties
-          broken at random so that counts are uniform too; NaN where it is missing.
-        * ``d_residual`` (d_time, observable): the standard normal quantile of that share.
+          drawn given the earlier observations; NaN after a failure of the filter.
+        * ``d_n_effective`` (chain, draw, d_time): the effective number of particles or members in
+          the update by each observation, infinite for a deterministic filter.
+        * ``d_pit`` (d_time, observable): the share of predictions not above the observation, with
+          ties broken at random so that counts are uniform too; NaN where the observation is
+          missing.
+        * ``d_residual`` (d_time, observable): the standard normal quantile of ``d_pit``.
         * ``d_coverage`` (interval, observable): the share of observations within the central 50 %
-          and 90 % of their predictions.
+          and 90 % prediction intervals.
         * ``d_uniformity``, ``d_whiteness`` (observable): p-values of tests that ``d_pit`` is
-          uniform (that of ArviZ's pictures), and that ``d_residual`` has no autocorrelation
-          (Ljung-Box, up to lag 10, missing ones left out).
+          uniform (the test of ArviZ's PIT plots), and that ``d_residual`` has no autocorrelation
+          (Ljung-Box, up to lag 10, missing ones dropped).
         * ``d_failed``, ``d_collapsed``: the share of draws at which the filter failed, and at which
-          fewer than 3 effective particles were left at some observation.
+          the effective number of particles fell below 3 at some observation.
 
-        `plot_filter_health` draws it, and ArviZ the PIT alone, as
+        `plot_filter_health` plots the group. ArviZ plots the PIT alone by
         ``az.plot_ecdf_pit(idata, var_names="d_pit", group="filter_diagnostics",
-        sample_dims=["d_time"])`` where no observation is missing.
+        sample_dims=["d_time"])`` if no observation is missing.
 
     Raises
     ------
     ModelError
-        If draws, model and settings do not fit together, or the system has a density of
-        observations but nothing to draw them from.
+        If draws, model and settings are inconsistent, or the system defines the density of
+        observations but no distribution to simulate them from.
 
     References
     ----------
@@ -134,44 +136,46 @@ def filter_diagnostics(
     """
     model = pm.modelcontext(model)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
         after = before
         if variable.filter.noisy:
             after = at_draws.states("filtered", at_draws.steps, rng, progressbar=progressbar)
-        predicted = _observations(at_draws, before.drawn, rng)
-        observed = record_of(model, variable.name)
-        part = _of_draws(variable, draws, at_draws, predicted, after)
-        parts.append(part.merge(_of_record(variable, observed, predicted, rng)))
-    attrs = {"predictions": KNOWN}
-    return with_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
+        predicted = _simulate_observations(at_draws, before.drawn, rng)
+        observed = observed_values(model, variable.name)
+        part = _results_by_draw(variable, draws, at_draws, predicted, after)
+        parts.append(part.merge(_results_by_time(variable, observed, predicted, rng)))
+    attrs = {"predictions": PREDICTION_NOTE}
+    return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 
-def _observations(at_draws: VariableAtDraws, states: Array, rng: np.random.Generator) -> Array:
-    """An observation (draws, J, p) of each state (draws, J, n), NaN where that is."""
+def _simulate_observations(
+    at_draws: VariableAtDraws, states: Array, rng: np.random.Generator
+) -> Array:
+    """Simulate an observation (draws, J, p) of each state (draws, J, n); NaN where that is NaN."""
     system = at_draws.variable.system
-    look, theta, rows = observer(system).function, at_draws.parameters(), at_draws.inputs()
-    seen = np.full((*states.shape[:2], system.p), np.nan)
+    observe, theta, rows = observer(system).function, at_draws.parameters(), at_draws.inputs()
+    simulated = np.full((*states.shape[:2], system.p), np.nan)
     for i, path in enumerate(states):
         known = np.isfinite(path).all(axis=1)
         inputs = rows[i if len(rows) > 1 else 0]
-        seen[i, known] = look(
+        simulated[i, known] = observe(
             rng, theta[i], path[known], at_draws.steps[known], inputs, at_draws.t0
         )
-    return seen
+    return simulated
 
 
-def _of_draws(
+def _results_by_draw(
     variable: StateSpaceVariable,
     draws: PosteriorDraws,
     at_draws: VariableAtDraws,
     predicted: Array,
     after: States,
 ) -> xr.Dataset:
-    """What there is of every draw, and shares of the draws."""
+    """Predictions and effective sample sizes of every draw, and shares of the draws."""
     name, (time, observable) = variable.name, variable.dims
     smallest = np.fmin.reduce(after.n_effective, axis=1, initial=np.inf)
     found = draws.dataset(
@@ -190,10 +194,10 @@ def _of_draws(
     return found
 
 
-def _of_record(
+def _results_by_time(
     variable: StateSpaceVariable, observed: Array, predicted: Array, rng: np.random.Generator
 ) -> xr.Dataset:
-    """Where the observations fall, and what tests make of it."""
+    """PIT values and residuals of the observations, their coverage and tests."""
     name, dims = variable.name, variable.dims
     pit = pit_of(observed, predicted, rng)
     residual = residual_of(pit, len(predicted))

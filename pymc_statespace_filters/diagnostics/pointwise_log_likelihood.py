@@ -1,4 +1,4 @@
-"""The terms of a record's log-likelihood at every draw, each with the noise of its own estimate."""
+"""Sequential log-likelihood terms at every draw, each with the noise of its own estimate."""
 
 import numpy as np
 import pymc as pm
@@ -7,15 +7,14 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import PosteriorDraws, draws_of
-from pymc_statespace_filters.states.groups import with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
+from pymc_statespace_filters.states.groups import add_group
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
     "log p(d_j | d_1 .. d_{j-1}, theta): each term is conditional on all earlier observations. "
-    "Leave-one-out cross-validation (az.loo) on such terms is not leave-one-out, for a left-out "
-    "observation would still be known to the terms of later ones; leave_future_out is what they "
-    "are for."
+    "Leave-one-out cross-validation (az.loo) is invalid with such terms, because later terms "
+    "depend on the observation left out; use leave_future_out."
 )
 
 
@@ -27,45 +26,43 @@ def compute_log_likelihood(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    r"""Evaluate the terms of the log-likelihood at every draw, with the draw's own noise.
+    r"""Evaluate the log-likelihood terms at every draw, with the draw's own noise.
 
-    The terms :math:`\log p(d_j \mid d_1 \dots d_{j-1}, \theta)` are **sequential**: each knows all
-    earlier observations. They are what `leave_future_out` needs. ``az.loo`` on them is not
-    leave-one-out cross-validation: it would weight draws as if one term held all that an
-    observation says, while the later terms go on knowing it.
+    The terms :math:`\log p(d_j \mid d_1 \dots d_{j-1}, \theta)` are **sequential**: each is
+    conditional on all earlier observations. `leave_future_out` uses them. ``az.loo`` is invalid
+    with them, because the terms of later observations depend on the observation that is left out.
 
-    The likelihood by a particle or ensemble filter is an estimate, which depends on a noise seed.
+    The likelihood by a particle or ensemble filter is an estimate that depends on a noise seed.
     `sample_dram` stores the seed of each draw, and with it the terms add up to the estimate by
-    which the draw was accepted. (``pm.compute_log_likelihood`` gives all draws the one seed that
-    the model holds: other estimates than those that the draws follow.)
+    which the draw was accepted. (``pm.compute_log_likelihood`` uses the seed held by the model for
+    all draws, and so gives other estimates.)
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Draws of the posterior. Where ``sample_stats`` holds no seeds, they were drawn with the
-        model's own.
+        Posterior draws. If ``sample_stats`` holds no seeds, the seed of the model is used.
     model : pymc.Model, optional
-        The model of the ``with`` block if not given.
+        The model of the draws; by default that of the ``with`` block.
     var_name : str, optional
-        A StateSpace variable; all of the model's if not given.
+        Name of a StateSpace variable; all of them by default.
     extend_inferencedata : bool
-        Whether `idata` gets the group, beside the terms of other variables that it has there;
-        otherwise a new DataTree has it alone.
+        Whether to add the terms to the group of `idata`, beside those of other variables; otherwise
+        the group is returned in a new DataTree.
     progressbar : bool
-        Whether work of more than two seconds shows a bar.
+        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------
     xarray.DataTree
         With the group ``log_likelihood``: for a variable "d" its terms ``d`` (chain, draw, d_time),
-        0 where a row of the record is wholly missing, minus infinity from a failing observation on.
-        The attribute ``terms`` says that they are sequential.
+        0 for an observation that is entirely missing, -inf from a failure of the filter on. The
+        attribute ``terms`` says that they are sequential.
 
     Raises
     ------
     ModelError
-        If draws and model do not fit together; or if the noise was moved along the chain
-        (``correlation``), so that no seed gives the estimates again: sample without, for terms.
+        If draws and model are inconsistent, or the chain moved its noise (``correlation``), so that
+        no seed reproduces the estimates.
 
     Examples
     --------
@@ -90,20 +87,20 @@ def compute_log_likelihood(
     {'chain': 2, 'draw': 100, 'd_time': 3}
     """
     model = pm.modelcontext(model)
-    draws = draws_of(idata, None)
+    draws = select_draws(idata, None)
     found = xr.merge(
         [
-            terms_at(model, variable, draws, progressbar=progressbar).to_dataset()
-            for variable in chosen_variables(model, var_name)
+            sequential_terms(model, variable, draws, progressbar=progressbar).to_dataset()
+            for variable in select_variables(model, var_name)
         ]
     )
     if extend_inferencedata and "log_likelihood" in idata.children:
         present = idata["log_likelihood"].to_dataset()
         found = found.merge(present[[name for name in present.data_vars if name not in found]])
-    return with_group(idata, "log_likelihood", found, {}, extend_inferencedata)
+    return add_group(idata, "log_likelihood", found, {}, extend_inferencedata)
 
 
-def terms_at(
+def sequential_terms(
     model: pm.Model,
     variable: StateSpaceVariable,
     draws: PosteriorDraws,
@@ -112,8 +109,8 @@ def terms_at(
 ) -> xr.DataArray:
     """The terms (chain, draw, time) of one variable at draws, with the noise of each.
 
-    They are a function of the values that a posterior stores, not of unconstrained ones, so that
-    every digit of an estimate comes again.
+    They are evaluated at the stored, constrained values, so that the estimates of the chain are
+    reproduced to the last digit.
 
     Raises
     ------
@@ -123,12 +120,12 @@ def terms_at(
     name, noisy = variable.name, variable.filter.noisy
     if noisy and draws.noise_moved:
         raise ModelError(
-            f"the noise of {name!r} was moved along the chain (correlation), so that no seed gives "
-            "the estimates of these draws again: for terms sample without correlation"
+            f"the noise of {name!r} was moved along the chain (correlation), so that no seed "
+            "reproduces the estimates of these draws: sample without correlation"
         )
     at_draws = VariableAtDraws(model, variable, draws)
-    seeds = draws.own_seeds(name) if noisy else None
-    if seeds is None:  # held, or not read
+    seeds = draws.stored_seeds(name) if noisy else None
+    if seeds is None:  # held by the model, or not used by the filter
         held = variable.seed.eval(mode="FAST_COMPILE")
         seeds = np.full(np.prod(draws.shape), held, dtype=np.int64)
     seed = pt.lscalar("seed")

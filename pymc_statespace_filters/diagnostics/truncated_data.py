@@ -1,4 +1,4 @@
-"""A model that has seen the beginning of its record alone."""
+"""Copy a model with its later observations set to missing."""
 
 import numpy as np
 import pymc as pm
@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 
 
-def record_of(model: pm.Model, name: str) -> NDArray[np.float64]:
-    """The data (J, p) that a StateSpace variable has observed."""
+def observed_values(model: pm.Model, name: str) -> NDArray[np.float64]:
+    """The observations (J, p) of a StateSpace variable."""
     return np.asarray(model.rvs_to_values[model[name]].eval(mode="FAST_COMPILE"), np.float64)
 
 
-def shortened(model: pm.Model, name: str, n_rows: int) -> pm.Model:
-    """A copy of a model in which a StateSpace variable observed its first rows alone.
+def truncate_data(model: pm.Model, name: str, n_rows: int) -> pm.Model:
+    """Copy a model, keeping only the first `n_rows` observations of a StateSpace variable.
 
-    The rows after them are missing, so that dimensions, coordinates and noise seeds stay, and the
-    noise of an estimate on them is that of the whole record at the same seed.
+    The later rows are set to missing, so that dimensions, coordinates and noise seeds stay, and an
+    estimate uses the same noise as one from all observations at the same seed.
     """
-    observed = record_of(model, name)
+    observed = observed_values(model, name)
     observed[n_rows:] = np.nan
     graph, copies = fgraph_from_model(model)
     node = copies[model[name]].owner

@@ -1,4 +1,4 @@
-"""Evidence of a model from its draws, and what follows for the choice between models."""
+"""Evidence of a model from posterior draws, and model comparison by evidence."""
 
 from pymc_statespace_filters.evidence.comparison import (
     DimensionCorrection,

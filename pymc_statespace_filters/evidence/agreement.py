@@ -1,4 +1,4 @@
-"""Whether several estimates of one evidence agree, and what it means if they do not."""
+"""Test whether several estimates of one evidence agree, and diagnose a disagreement."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,40 +9,40 @@ from scipy.stats import chi2
 
 from pymc_statespace_filters.evidence.evidence import Evidence
 
-# One false alarm in a thousand sets of estimates, and none over what no choice depends on.
+# One false alarm in a thousand sets of estimates; none for differences too small to matter.
 LEVEL = 0.001
 NEGLIGIBLE = 0.05  # nats
-_SMALLEST_ERROR = 1e-6  # an estimate may be exact
+_SMALLEST_ERROR = 1e-6  # avoids division by zero: an estimate may be exact
 
 FROM_PRIOR = ("prior_monte_carlo", "tempered_smc")
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What several estimates of one evidence say of each other.
+    """Agreement of several estimates of one evidence; true if they agree.
 
     Attributes
     ----------
     p_value : float
-        Of estimates as far apart as these, if their errors are what they say: Cochran's chi-square
-        test of homogeneity, as if they were independent. Estimates from the same draws err
-        together, so that they would be nearer to each other. 1 if fewer than two have an error.
+        Of Cochran's chi-square test of homogeneity, which treats the estimates as independent.
+        Estimates from the same draws have correlated errors, so that the test is conservative for
+        them. 1 if fewer than two estimates have a standard error.
     difference : float
-        Between the largest and the smallest estimate, in nats.
-    reading : str
-        The likely cause and what to do, empty if they agree.
+        Largest minus smallest estimate, in nats.
+    diagnosis : str
+        The likely cause of a disagreement and its remedy; empty if the estimates agree.
     """
 
     p_value: float
     difference: float
-    reading: str
+    diagnosis: str
 
     def __bool__(self) -> bool:
-        return not self.reading
+        return not self.diagnosis
 
 
-def agreement_of(evidences: Mapping[str, Evidence]) -> Agreement:
-    """Compare estimates of one evidence; those without an error take no part.
+def assess_agreement(evidences: Mapping[str, Evidence]) -> Agreement:
+    """Compare estimates of one evidence; those without a standard error are ignored.
 
     Parameters
     ----------
@@ -53,44 +53,44 @@ def agreement_of(evidences: Mapping[str, Evidence]) -> Agreement:
     -------
     Agreement
     """
-    judged = {name: e for name, e in evidences.items() if np.isfinite(e.se)}
-    if len(judged) < 2:
+    compared = {name: e for name, e in evidences.items() if np.isfinite(e.se)}
+    if len(compared) < 2:
         return Agreement(1.0, 0.0, "")
-    values = np.array([e.log_evidence for e in judged.values()])
-    weights = 1 / np.maximum([e.se for e in judged.values()], _SMALLEST_ERROR) ** 2
+    values = np.array([e.log_evidence for e in compared.values()])
+    weights = 1 / np.maximum([e.se for e in compared.values()], _SMALLEST_ERROR) ** 2
     mean = np.average(values, weights=weights)
     p_value = float(chi2.sf((weights * (values - mean) ** 2).sum(), len(values) - 1))
     difference = float(np.ptp(values))
     agree = p_value >= LEVEL or difference <= NEGLIGIBLE
-    return Agreement(p_value, difference, "" if agree else _reading(judged))
+    return Agreement(p_value, difference, "" if agree else _diagnose(compared))
 
 
-def _reading(evidences: Mapping[str, Evidence]) -> str:
-    """The likely cause, from which estimates are apart."""
+def _diagnose(evidences: Mapping[str, Evidence]) -> str:
+    """State the likely cause, judged from the pair furthest apart in units of its error."""
     low, high = max(combinations(evidences.values(), 2), key=_distance)
     if low.log_evidence > high.log_evidence:
         low, high = high, low
-    apart = f"{high.estimator} is {high.log_evidence - low.log_evidence:.2f} above {low.estimator}"
-    independent = [e.estimator in FROM_PRIOR for e in (low, high)]
-    if independent == [False, True]:
+    gap = f"{high.estimator} is {high.log_evidence - low.log_evidence:.2f} above {low.estimator}"
+    from_prior = [e.estimator in FROM_PRIOR for e in (low, high)]
+    if from_prior == [False, True]:
         cause = (
-            "the chains have probably not visited all of the posterior, a mode or a tail is "
-            "missing: run more chains, longer, from dispersed starts"
+            "the chains have probably not visited all of the posterior and miss a mode or a tail: "
+            "run more chains, longer, from dispersed starting points"
         )
-    elif independent == [True, False]:
+    elif from_prior == [True, False]:
         cause = (
-            f"{low.estimator} has probably missed a narrow peak, which the draws have found: trust "
-            "it less the narrower the posterior is in its prior"
+            f"{low.estimator} has probably missed a narrow peak that the chains have found: it is "
+            "less reliable the narrower the posterior is relative to the prior"
         )
-    elif all(independent):
-        cause = "the posterior is too narrow in its prior for prior_monte_carlo"
+    elif all(from_prior):
+        cause = "the posterior is too narrow relative to the prior for prior_monte_carlo"
     else:
         cause = (
             "the draws are too few, or the posterior is far from the shape that the estimators "
-            "fit to it (several modes, heavy tails): run longer, and let tempered_smc decide, "
-            "which needs no draws"
+            "fit to it (several modes, heavy tails): run longer chains, and compare with "
+            "tempered_smc, which does not use the draws"
         )
-    return f"{apart}; {cause}"
+    return f"{gap}; {cause}"
 
 
 def _distance(pair: tuple[Evidence, Evidence]) -> float:

@@ -1,4 +1,4 @@
-"""What a user calls: one estimator, or several on the same draws and whether they agree."""
+"""The public functions: one estimator, or several on the same draws and their agreement."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -9,28 +9,27 @@ import pymc as pm
 import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.agreement import Agreement, agreement_of
-from pymc_statespace_filters.evidence.estimators import (
-    Bridge,
-    ChibJeliazkov,
-    Estimator,
-    Importance,
-    Laplace,
-    PriorMonteCarlo,
-    TemperedSMC,
-)
+from pymc_statespace_filters.evidence.agreement import Agreement, assess_agreement
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.importance import Importance
+from pymc_statespace_filters.evidence.estimators.laplace import Laplace
+from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.protocol import Estimator
+from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
 from pymc_statespace_filters.evidence.evidence import Evidence
-from pymc_statespace_filters.evidence.runner import evidences_of
+from pymc_statespace_filters.evidence.runner import run_estimators
 
-ESTIMATORS: Mapping[str, Estimator] = {
-    "chib_jeliazkov": ChibJeliazkov(),
-    "bridge": Bridge(),
-    "warp_bridge": Bridge(warped=True),
-    "importance": Importance(),
-    "tempered_smc": TemperedSMC(),
-    "prior_monte_carlo": PriorMonteCarlo(),
-    "laplace": Laplace(),
-}
+_BUILT_IN: tuple[Estimator, ...] = (
+    ChibJeliazkov(),
+    Bridge(),
+    Bridge(warped=True),
+    Importance(),
+    TemperedSMC(),
+    PriorMonteCarlo(),
+    Laplace(),
+)
+ESTIMATORS: Mapping[str, Estimator] = {estimator.name: estimator for estimator in _BUILT_IN}
 
 
 def chib_jeliazkov(
@@ -48,56 +47,56 @@ def chib_jeliazkov(
     Parameters
     ----------
     idata : xarray.DataTree
-        Posterior draws by any sampler (NUTS, nutpie, DRAM, ...), warm-up removed. If `model` has a
-        noisy likelihood, ``sample_stats`` must hold ``lp`` or the noise seed of each draw, as DRAM
-        leaves them.
+        Posterior draws from any sampler (NUTS, nutpie, DRAM, ...), warm-up removed. If `model` has
+        a noisy likelihood, ``sample_stats`` must hold the log-density ``lp`` or the noise seed of
+        each draw; DRAM stores both.
     model : pymc.Model, optional
-        The model that was sampled; by default that of the ``with`` block. Everything in it counts:
-        priors, observed variables, Potentials.
+        The model that was sampled; by default that of the ``with`` block. The evidence includes
+        all of it: priors, observed variables, Potentials.
     n_proposals : int, optional
-        Evaluations of the log-density around a central point. By default so many that their error
-        is a third of that of the draws, or that the whole is below 0.01 nats; but no more than
-        there are draws, and at most 20 000. With several blocks, those in every mean, 5000 by
-        default; in all they are about 3 n_blocks - 2 times as many.
+        Number of log-density evaluations around a central point. The default is chosen such that
+        their error is a third of that of the draws, or the total error is below 0.01 nats; it is
+        at most the number of draws, and at most 20 000. With several blocks it is the number per
+        mean, 5000 by default, and the total is about ``3 * n_blocks - 2`` times as large.
     n_blocks : int, optional
-        Blocks of neighbouring parameters whose ordinates are estimated one after the other. One by
-        default; with ten parameters or more, and if one block promises an error above 0.1 nats,
-        blocks of about ten.
+        Number of blocks of neighbouring parameters whose posterior ordinates are estimated in
+        turn. The default is one block; with ten parameters or more, and a predicted error above
+        0.1 nats for one block, it is blocks of about ten.
     random_seed : int or numpy.random.Generator, optional
-        For the proposals and the noise of their likelihoods.
+        Seed of the proposals and of the noise of their likelihoods.
     extend_inferencedata : bool
-        Also store the result as the group ``evidence`` of `idata`.
+        Whether to store the result in the group ``evidence`` of `idata`.
     progressbar : bool
-        Show one if the evaluations take more than two seconds.
+        Whether to show a progress bar if the evaluations take more than two seconds.
 
     Returns
     -------
     Evidence
-        Its `se` counts the autocorrelation of the draws and the proposals' own error. If the chains
-        held one noise seed (``noise="held"``), this is the evidence under that seed and `se` lacks
-        the error of the filter.
+        Its `se` accounts for the autocorrelation of the draws and the error of the proposals. If
+        the chains held one noise seed (``noise="held"``), this is the evidence under that seed, and
+        `se` excludes the error of the filter.
 
     Raises
     ------
     ModelError
-        If an argument is wrong, a free variable is discrete, the draws are too few or do not vary,
-        or chains of held noise have different seeds.
+        If an argument is invalid, a free variable is discrete, the draws are too few or do not
+        vary, or chains of held noise have different seeds.
     DataMismatchError
-        If the draws lack free variables of the model or belong to another model or to other data,
-        or the estimates of a noisy likelihood cannot be found again.
+        If the draws lack free variables of the model, belong to another model or other data, or
+        the likelihood estimates of the chain cannot be recovered.
     TypeError
         If no model is given, by argument or ``with`` block.
 
     Warns
     -----
     EvidenceWarning
-        If the error or the number deserves doubt: few terms dominate a mean, the chains disagree, a
-        prior is improper or not normalised, part of the posterior lies at the stability limit of
+        If the estimate may be unreliable: few terms dominate a mean, the chains disagree, a prior
+        is improper or not normalised, or part of the posterior lies at the stability limit of
         Euler-Maruyama steps.
 
     Examples
     --------
-    One parameter, three observations, and draws from the posterior that is known:
+    One parameter, three observations, and exact draws from the posterior:
 
     >>> import arviz as az
     >>> import numpy as np
@@ -112,10 +111,10 @@ def chib_jeliazkov(
     >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
     True
     """
-    found = evidences_of(
+    found = run_estimators(
         idata,
         model,
-        {"chib_jeliazkov": ChibJeliazkov(n_proposals, n_blocks)},
+        [ChibJeliazkov(n_proposals, n_blocks)],
         random_seed=random_seed,
         extend_inferencedata=extend_inferencedata,
         progressbar=progressbar,
@@ -124,21 +123,21 @@ def chib_jeliazkov(
 
 
 class EvidenceEstimates(dict[str, Evidence]):
-    """What `estimate_evidence` found, by estimator: a dictionary that is shown as a table.
+    """Result of `estimate_evidence`: a dictionary by estimator, displayed as a table.
 
     Attributes
     ----------
     agreement : Agreement
-        True if the estimates agree.
+        True if the estimates agree within their errors.
     """
 
     @property
     def agreement(self) -> Agreement:
-        """Whether the estimates agree, and the likely cause if they do not."""
-        return agreement_of(self)
+        """Whether the estimates agree, with a diagnosis if they do not."""
+        return assess_agreement(self)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Index ``estimator``; columns ``log_evidence``, ``se``, ``doubts``."""
+        """Table with index ``estimator`` and columns ``log_evidence``, ``se``, ``doubts``."""
         rows = {
             name: {"log_evidence": e.log_evidence, "se": e.se, "doubts": e.doubts}
             for name, e in self.items()
@@ -146,7 +145,7 @@ class EvidenceEstimates(dict[str, Evidence]):
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("estimator")
 
     def __repr__(self) -> str:
-        # Doubts are sentences: in a column they would push the errors out of sight.
+        # Doubts are sentences: in a column they would push the errors off the screen.
         table = self.to_dataframe().drop(columns="doubts").to_string()
         doubts = [f"{name}: {e.doubts}" for name, e in self.items() if e.doubts]
         return "\n".join([table, self._verdict(), *doubts])
@@ -155,67 +154,71 @@ class EvidenceEstimates(dict[str, Evidence]):
         return f"{self.to_dataframe().to_html()}<p>{self._verdict()}</p>"
 
     def _verdict(self) -> str:
-        judged = sum(np.isfinite(e.se) for e in self.values())
-        if judged < 2:
-            return "one estimate with an error: nothing to compare it with"
+        if sum(np.isfinite(e.se) for e in self.values()) < 2:
+            return "fewer than two estimates with a standard error: agreement not tested"
         if self.agreement:
-            apart = self.agreement.difference
-            return f"the estimates agree within their errors, {apart:.3f} nats apart at most"
-        return f"the estimates disagree: {self.agreement.reading}"
+            largest = self.agreement.difference
+            return (
+                f"the estimates agree within their errors (largest difference {largest:.3f} nats)"
+            )
+        return f"the estimates disagree: {self.agreement.diagnosis}"
 
 
 def estimate_evidence(
     idata: xr.DataTree,
     model: pm.Model | None = None,
     *,
-    estimators: Iterable[str] = ("chib_jeliazkov", "bridge"),
+    estimators: str | Estimator | Iterable[str | Estimator] = ("chib_jeliazkov", "bridge"),
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> EvidenceEstimates:
-    """Estimate the evidence of a model in several ways, and see whether they agree.
+    """Estimate the evidence of a model by several estimators and test whether they agree.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Posterior draws by any sampler, as for `chib_jeliazkov`.
+        Posterior draws from any sampler, as for `chib_jeliazkov`.
     model : pymc.Model, optional
         The model that was sampled; by default that of the ``with`` block.
-    estimators : iterable of str
-        Any of "chib_jeliazkov", "bridge" (bridge sampling from a normal), "warp_bridge" (from a
-        normal that is moved, scaled and mirrored, for skewed posteriors), "importance" (from a
-        mixture of Student-t densities, for several modes), "tempered_smc" (from the prior, needs no
-        draws), "prior_monte_carlo" (the mean likelihood of draws of the prior, for few parameters)
-        and "laplace" (an approximation without error).
+    estimators : str, Estimator, or iterable of them
+        Names among "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution),
+        "warp_bridge" (warp-III bridge sampling, for skewed posteriors), "importance" (importance
+        sampling from a mixture of Student-t distributions, for several modes), "tempered_smc"
+        (tempered sequential Monte Carlo from the prior, without the draws), "prior_monte_carlo"
+        (mean likelihood of prior draws, for few parameters) and "laplace" (Laplace's approximation,
+        without a standard error); or any
+        `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other settings or
+        your own.
     random_seed : int or numpy.random.Generator, optional
-        Gives each estimator a stream of its own, whatever the others are.
+        Seed. Each estimator gets its own stream, independent of which others run.
     extend_inferencedata : bool
-        Also store the results in the group ``evidence`` of `idata`, dimension ``estimator``.
+        Whether to store the results in the group ``evidence`` of `idata`, dimension ``estimator``.
     progressbar : bool
-        Show one if the evaluations take more than two seconds.
+        Whether to show a progress bar if the evaluations take more than two seconds.
 
     Returns
     -------
     EvidenceEstimates
-        A dictionary of name to `Evidence`, shown as a table. Its ``agreement`` is true if they
-        agree, and has ``p_value``, ``difference`` (nats) and ``reading`` (the likely cause if they
-        do not); ``to_dataframe()`` is the table.
+        A dictionary of name to `Evidence`, displayed as a table. Its ``agreement`` is true if the
+        estimates agree and has the attributes ``p_value``, ``difference`` (nats) and ``diagnosis``
+        (the likely cause of a disagreement). ``to_dataframe()`` returns the table.
 
     Raises
     ------
     ModelError
-        If an estimator is unknown, or none can treat the model: "laplace" cannot with a noisy
-        likelihood or a mode at the edge of the support, "tempered_smc" and "prior_monte_carlo" with
-        a prior that cannot be drawn from. And as `chib_jeliazkov`.
+        If an estimator is unknown, or none can treat the model: "laplace" needs a deterministic
+        likelihood and a mode inside the support, "tempered_smc" and "prior_monte_carlo" a prior
+        that can be sampled. Further as `chib_jeliazkov`.
     DataMismatchError, TypeError
         As `chib_jeliazkov`.
 
     Warns
     -----
     EvidenceWarning
-        If an estimate is doubtful; if an estimator cannot treat the model, which is then missing
-        from the result; or if the estimates disagree: p < 0.001 by Cochran's chi-square
-        test, and by more than 0.05 nats. The warning names the likely cause.
+        If an estimate may be unreliable; if an estimator cannot treat the model and is missing from
+        the result; or if the estimates disagree, with p < 0.001 by Cochran's chi-square test and by
+        more than 0.05 nats. The warning states the likely cause.
 
     Examples
     --------
@@ -232,16 +235,11 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
-    names = [estimators] if isinstance(estimators, str) else list(estimators or ())
-    if not names or not set(names) <= set(ESTIMATORS):
-        raise ModelError(
-            f"estimators must name at least one of {list(ESTIMATORS)} and nothing else, got {names}"
-        )
     found = EvidenceEstimates(
-        evidences_of(
+        run_estimators(
             idata,
             model,
-            {name: ESTIMATORS[name] for name in names},
+            _select_estimators(estimators),
             random_seed=random_seed,
             extend_inferencedata=extend_inferencedata,
             progressbar=progressbar,
@@ -249,8 +247,28 @@ def estimate_evidence(
     )
     if not found.agreement:
         warnings.warn(
-            f"the estimates of the log-evidence disagree: {found.agreement.reading}",
+            f"the estimates of the log-evidence disagree: {found.agreement.diagnosis}",
             EvidenceWarning,
             stacklevel=2,
         )
     return found
+
+
+def _select_estimators(given: str | Estimator | Iterable[str | Estimator]) -> list[Estimator]:
+    """Look up names and check that the estimators are valid and their names differ."""
+    entries = [given] if isinstance(given, str | Estimator) else list(given or ())
+    found: dict[str, Estimator] = {}
+    for entry in entries:
+        estimator = ESTIMATORS.get(entry) if isinstance(entry, str) else entry
+        if not isinstance(estimator, Estimator):
+            raise ModelError(
+                f"estimators must be names among {list(ESTIMATORS)} or Estimator objects, "
+                f"got {entry!r}"
+            )
+        if found.setdefault(estimator.name, estimator) is not estimator:
+            raise ModelError(
+                f"estimators must have different names, got {estimator.name!r} more than once"
+            )
+    if not found:
+        raise ModelError(f"estimators must have at least one of {list(ESTIMATORS)}, got {given!r}")
+    return list(found.values())

@@ -1,4 +1,4 @@
-"""What every evidence estimator returns, and the group in which it is stored beside the draws."""
+"""The result `Evidence`, and the DataTree group ``evidence`` in which it is stored."""
 
 import math
 from dataclasses import dataclass, fields
@@ -14,7 +14,7 @@ NOISE = ("none", "refreshed", "held")
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence p(D | M) of one model and what is needed to compare it with others.
+    """The evidence p(D | M) of one model, with the quantities needed to compare models.
 
     Attributes
     ----------
@@ -24,29 +24,29 @@ class Evidence:
     se : float
         Numerical standard error of `log_evidence`, in nats; NaN where the estimator has none.
     estimator : str
-        Name of the function that made it.
+        Name of the estimator.
     n_parameters : int
-        k, the free scalar variables: the dimension of the unconstrained parameter vector.
+        k, the number of free scalar variables: the dimension of the unconstrained parameter vector.
     n_observations : int
-        J, the observations that are not wholly missing.
+        J, the number of observations that are not entirely missing.
     max_log_likelihood : float
-        Largest log-likelihood, searched for from the draws, for the information criteria. The
-        likelihood is everything in the model that is not the prior of a free variable, Potentials
-        included. A noisy one is averaged at the point that is found.
+        Largest log-likelihood found by a search from the draws, for the information criteria. The
+        likelihood is everything in the model except the priors of free variables, Potentials
+        included. A noisy likelihood is averaged at the point found.
     data_fingerprint : str
-        Hash of the observed values: equal for rival models of one record, different for other data.
+        Hash of the observed values: equal for models of the same data, different otherwise.
     noise : {"none", "refreshed", "held"}
-        "none": the likelihood is a number. "refreshed": the likelihood is an estimate, and the
-        evidence that of its expectation. "held": the chains kept one noise seed, and this is that
-        seed's evidence; `se` then lacks the error of the filter, which takes whole chains at
-        several seeds.
+        "none": the likelihood is deterministic. "refreshed": the likelihood is estimated with fresh
+        noise, and this is the evidence of its expectation. "held": the chains kept one noise seed,
+        and this is the evidence under that seed; `se` excludes the error of the filter, which needs
+        chains at several seeds.
     doubts : str
-        Why the error may be larger than `se` says, or the number depend on more than model and
-        data; empty if nothing speaks for that.
+        Reasons why the error may be larger than `se`, or why the value depends on more than model
+        and data; empty if there are none.
     log_volume : float
-        Sum of the log widths of the Uniform priors of constant bounds, over their scalars:
-        ``log_evidence + log_volume`` is the integral under a density of one on the same supports,
-        the number of the thesis (Eq. 3.7).
+        Sum of the log widths of Uniform priors with constant bounds, over their scalars:
+        ``log_evidence + log_volume`` is the integral with these prior densities replaced by one,
+        the thesis's number (Eq. 3.7).
     uniform : str
         Names of the variables with such priors, separated by commas.
     improper : str
@@ -56,8 +56,8 @@ class Evidence:
     Raises
     ------
     ModelError
-        If a number is not what it must be: `log_evidence` and `log_volume` finite, `se` not
-        negative, the counts neither, `noise` one of the three.
+        If `log_evidence` or `log_volume` is not finite, `se` or a count is negative, or `noise` is
+        none of the three.
 
     Examples
     --------
@@ -86,7 +86,7 @@ class Evidence:
             raise ModelError(f"se must be a finite number >= 0 or NaN, got {self.se!r}")
         if self.n_parameters < 0 or self.n_observations < 0:
             raise ModelError(
-                "n_parameters and n_observations must be counts, "
+                "n_parameters and n_observations must not be negative, "
                 f"got {self.n_parameters!r} and {self.n_observations!r}"
             )
         if self.noise not in NOISE:
@@ -96,19 +96,19 @@ class Evidence:
 
     @property
     def prior_note(self) -> str:
-        """What the number owes to the supports of the priors; empty if they have no such part."""
+        """How the value depends on the supports of the priors; empty if it does not."""
         notes = []
         if self.improper:
             notes.append(
-                f"The prior of {self.improper} is improper or not normalised: the evidence is the "
-                "integral of the likelihood over the whole support of the prior's density, and it "
-                "changes with the unit in which each of these parameters is expressed."
+                f"The prior of {self.improper} is improper or not normalised: the evidence "
+                "integrates the likelihood over the whole support of the prior's density, and "
+                "depends on the unit of each of these parameters."
             )
         if self.uniform:
             notes.append(
                 f"The Uniform priors of {self.uniform} have a log volume of "
-                f"{self.log_volume:.2f}: halving the support of one scalar adds log 2 as long as "
-                "the posterior stays inside."
+                f"{self.log_volume:.2f}: halving the support of one scalar adds log 2 to the "
+                "log-evidence as long as the posterior stays inside."
             )
         return " ".join(notes)
 
@@ -126,16 +126,16 @@ class Evidence:
 
 
 def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, float]) -> None:
-    """Write `evidence` into the group of `idata`, in place of an earlier one of the same estimator.
+    """Store `evidence` in the group of `idata`, replacing an earlier one of the same estimator.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Changed in place. The group has the dimension ``estimator``.
+        Modified in place. The group has the dimension ``estimator``.
     evidence : Evidence
         Each field becomes a variable.
     settings : dict of str to float
-        What the estimator did and met (scale, counts, effective numbers), variables as well.
+        Settings and diagnostics of the estimator, further variables.
     """
     record = {field.name: getattr(evidence, field.name) for field in fields(evidence)} | settings
     name = record.pop("estimator")
@@ -152,14 +152,14 @@ def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, f
 
 
 def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
-    """Read the evidences that `idata` carries.
+    """Read the evidences stored in `idata`.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Has the group ``evidence``, as estimators left it.
+        With the group ``evidence``.
     name : str
-        What to call `idata` in an error.
+        Name of `idata` in error messages.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
             f"its groups are {sorted(idata.children)}"
         )
     group = idata[GROUP].to_dataset()
-    # Groups that earlier versions stored lack some.
+    # Groups stored by earlier versions lack some fields.
     known = [field.name for field in fields(Evidence) if field.name in group]
     found = {}
     for i, estimator in enumerate(map(str, group["estimator"].values)):

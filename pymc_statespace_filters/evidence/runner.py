@@ -1,7 +1,8 @@
-"""From draws and a model to `Evidence`: what every estimator has in common."""
+"""Run estimators on the draws of a model and turn each `Estimate` into an `Evidence`."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -9,18 +10,16 @@ import pymc as pm
 import xarray as xr
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.checks import doubts_of_draws, doubts_of_steps
+from pymc_statespace_filters.evidence.checks.convergence import check_convergence
+from pymc_statespace_filters.evidence.checks.discretisation import check_discretisation
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     max_log_likelihood,
 )
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
 from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
-from pymc_statespace_filters.evidence.posterior import (
-    ModelDensity,
-    Posterior,
-    posterior_of,
-)
+from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, build_posterior
 from pymc_statespace_filters.evidence.posterior.observed_data import (
     data_fingerprint,
     observation_count,
@@ -32,49 +31,50 @@ from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, 
 MAXIMUM = "maximum likelihood"
 
 
-def evidences_of(
+def run_estimators(
     idata: xr.DataTree,
     model: pm.Model | None,
-    estimators: Mapping[str, Estimator],
+    estimators: Iterable[Estimator],
     *,
     random_seed: int | np.random.Generator | None,
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> dict[str, Evidence]:
-    """Run estimators on the same draws and report each as an `Evidence`.
+    """Run estimators on the same draws and report each result as an `Evidence`.
 
     Parameters
     ----------
     idata, model, random_seed, extend_inferencedata, progressbar
         As in `chib_jeliazkov`.
-    estimators : mapping of str to Estimator
-        By the name that the result will carry.
+    estimators : iterable of Estimator
+        With different names.
 
     Returns
     -------
     dict of str to Evidence
+        By name of the estimator.
 
     Warns
     -----
     EvidenceWarning
-        Once for what is doubtful whatever the estimator, once for each estimate that is, and once
-        for each estimator that cannot treat the model while another can.
+        Once for all problems that do not depend on the estimator, once for each unreliable
+        estimate, and once for each estimator that cannot treat the model while another can.
     """
     if not isinstance(model, pm.Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
-    posterior_group(idata)  # raises what is wrong with it, before anything is compiled
+    posterior_group(idata)  # fails early, before anything is compiled
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
-    posterior, noise = posterior_of(idata, density)
+    posterior, noise = build_posterior(idata, density)
     support = Support.of(density.model)
     common = (
-        *support.doubts(),
-        *doubts_of_draws(posterior),
-        *doubts_of_steps(density.model, idata, posterior.draws),
+        *support.check(),
+        *check_convergence(posterior),
+        *check_discretisation(density.model, idata, posterior.draws),
     )
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2)
 
     def stream(name: str) -> np.random.Generator:
-        """The same for an estimator whatever the others are."""
+        """An estimator's random numbers, independent of which others run."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
     with row_progress(density, enabled=progressbar) as announce:
@@ -82,23 +82,18 @@ def evidences_of(
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
-    _warn("the log-evidence is less certain than its error says", common)
+    _warn("the log-evidence is less certain than its standard error suggests", common)
     for name, refusal in refusals.items():
         _warn(f"no estimate by {name}", [str(refusal)])
-    of_model = {
-        "n_parameters": posterior.draws.shape[-1],
-        "n_observations": observation_count(density.model),
-        "max_log_likelihood": largest,
-        "data_fingerprint": data_fingerprint(density.model),
-        "noise": noise,
-        "log_volume": support.log_volume,
-        "uniform": support.uniform,
-        "improper": support.improper,
-    }
+    of_model = _model_fields(density.model, posterior, support)
+    of_model |= {"max_log_likelihood": largest, "noise": noise}
     found = {}
     for name, estimate in estimates.items():
         number = f"{estimate.log_evidence:.2f} ({name})"
-        _warn(f"log-evidence {number} is less certain than its error says", estimate.doubts)
+        _warn(
+            f"log-evidence {number} is less certain than its standard error suggests",
+            estimate.doubts,
+        )
         doubts = "; ".join((*common, *estimate.doubts))
         found[name] = Evidence(estimate.log_evidence, estimate.se, name, doubts=doubts, **of_model)
         if extend_inferencedata:
@@ -106,16 +101,29 @@ def evidences_of(
     return found
 
 
+def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> dict[str, Any]:
+    """The fields of `Evidence` that describe model, data and priors."""
+    return {
+        "n_parameters": posterior.draws.shape[-1],
+        "n_observations": observation_count(model),
+        "data_fingerprint": data_fingerprint(model),
+        "log_volume": support.log_volume,
+        "uniform": support.uniform,
+        "improper": support.improper,
+    }
+
+
 def _estimates(
-    estimators: Mapping[str, Estimator],
+    estimators: Iterable[Estimator],
     posterior: Posterior,
     stream: Callable[[str], np.random.Generator],
     announce: Callable[[str, int], None],
 ) -> tuple[dict[str, Estimate], dict[str, ModelError]]:
-    """Run one after the other; one that cannot treat the model does not cost the others' work."""
+    """Run the estimators in turn; raise only if none of them can treat the model."""
     estimates: dict[str, Estimate] = {}
     refusals: dict[str, ModelError] = {}
-    for name, estimator in estimators.items():
+    for estimator in estimators:
+        name = estimator.name
         announce(name, estimator.n_evaluations(posterior))
         try:
             estimates[name] = estimator.estimate(posterior, rng=stream(name))
@@ -127,6 +135,6 @@ def _estimates(
     return estimates, refusals
 
 
-def _warn(message: str, doubts: Sequence[str]) -> None:
-    if doubts:
-        warnings.warn(f"{message}: {'; '.join(doubts)}", EvidenceWarning, stacklevel=4)
+def _warn(message: str, reasons: Sequence[str]) -> None:
+    if reasons:
+        warnings.warn(f"{message}: {'; '.join(reasons)}", EvidenceWarning, stacklevel=4)

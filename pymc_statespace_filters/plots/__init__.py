@@ -1,4 +1,4 @@
-"""Pictures of results: each function takes one and gives an ``arviz_plots.PlotCollection``."""
+"""Plots of results; each function returns an ``arviz_plots.PlotCollection``."""
 
 from pymc_statespace_filters.plots.average import plot_average
 from pymc_statespace_filters.plots.evidence import plot_evidence

@@ -1,4 +1,4 @@
-"""An average over models beside what each model says alone (thesis, Figs. 15, 19 and 23)."""
+"""Plot of a model average beside the individual models (thesis, Figs. 15, 19 and 23)."""
 
 import math
 from collections.abc import Hashable
@@ -12,29 +12,29 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, written
+from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, format_probability
 
 AVERAGE = "average"
 N_GRID = 512
-PROB_SHOWN = 1e-3  # the x axis of densities is that of models with this probability
+PROB_SHOWN = 1e-3  # models above this probability determine the x range of densities
 
 
 def plot_average(
     average: xr.DataTree, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Draw an average over models and its members.
+    """Plot a model average and the individual models.
 
-    A curve (one dimension with numbers as coordinate) is drawn as mean and interval, a scalar as
-    density; the densities of the members carry the weights of their models and add up to that of
-    the average. Other dimensions become panels.
+    A curve (one dimension with numeric coordinates) is shown as mean and interval, a scalar as
+    density; the densities of the models are multiplied by their weights and add up to that of the
+    average. Other dimensions become panels.
 
     Parameters
     ----------
     average : xarray.DataTree
-        Of `average_models`.
+        Result of `average_models`.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``. Kind and probability of the
-        intervals are those of ``arviz.rcParams`` too.
+        Default: ``arviz.rcParams["plot.backend"]``. Kind and probability of the intervals are taken
+        from ``arviz.rcParams`` too.
     **pc_kwargs
         For ``arviz_plots.PlotCollection.wrap``.
 
@@ -42,12 +42,12 @@ def plot_average(
     -------
     arviz_plots.PlotCollection
         Visuals ``curve``, ``band``, ``lower`` and ``upper``, or ``density``, along ``model``: the
-        average, and then its members, whose lines lie upon it.
+        average first, then the models, drawn on top of it.
 
     Raises
     ------
     ModelError
-        If it is no such average, or has more than one dimension with numbers.
+        If `average` is no result of `average_models`, or has several numeric dimensions.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def plot_average(
     if len(along) > 1:
         raise ModelError(
             f"average must have at most one dimension with numbers, got {along}: give the others "
-            "names as coordinates, or select from them"
+            "text coordinates, or select from them"
         )
 
     data = _means(members, mixture) if along else _densities(members)
@@ -108,7 +108,7 @@ def plot_average(
 
 
 def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Dataset) -> None:
-    """Draw means; intervals of the members as bands, that of the average by its ends."""
+    """Draw means, intervals of the models as bands, and that of the average as two lines."""
     of_members, of_average = (
         getattr(draws.azstats, rcParams["stats.ci_kind"])() for draws in (members, mixture)
     )
@@ -129,13 +129,13 @@ def _numeric_dims(array: xr.DataArray) -> list[Hashable]:
 
 
 def _means(members: xr.Dataset, mixture: xr.Dataset) -> xr.Dataset:
-    """Return the mean of the average, and after it those under each model."""
+    """Return the mean of the average, followed by those under each model."""
     of_average = mixture.azstats.mean().expand_dims(model=[AVERAGE])
     return xr.concat([of_average, members.azstats.mean().drop_vars("prob")], "model")
 
 
 def _densities(members: xr.Dataset) -> xr.Dataset:
-    """Return the density of the average, and those of its members times weight: its summands."""
+    """Return the density of the average, followed by the weighted densities of the models."""
 
     def weighted(x: np.ndarray, y: np.ndarray, prob: np.ndarray) -> np.ndarray:
         shown = x[prob >= min(PROB_SHOWN, prob.max())]
@@ -165,7 +165,7 @@ def _with_probabilities(members: xr.Dataset) -> MapLabeller:
     probs = zip(members["model"].values, members["prob"].values, strict=True)
     return MapLabeller(
         coord_map={
-            "model": {name: f"{name} ({written(prob)})" for name, prob in probs}
+            "model": {name: f"{name} ({format_probability(prob)})" for name, prob in probs}
             | {AVERAGE: AVERAGE}
         }
     )

@@ -1,4 +1,4 @@
-"""What the plots share: a figure of the right size, rows with names, curves and bands."""
+"""Shared by the plots: figures, labelled rows, curves, bands, annotations and ticks."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from arviz_plots.plot_collection import backend_from_object
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
-DOTS_PER_INCH = 100  # where a backend counts dots
+DOTS_PER_INCH = 100  # of backends that measure in dots
 
 
 def canvas(
@@ -29,25 +29,25 @@ def canvas(
     legend: bool = False,
     **defaults: Any,
 ) -> PlotCollection:
-    """Make an empty figure for `data`; what the user gave in `pc_kwargs` goes before our defaults.
+    """Make an empty figure for `data`; `pc_kwargs` of the user override the defaults.
 
     Parameters
     ----------
     data : xarray.Dataset
     backend : str or None
     pc_kwargs : mapping
-        Of the public function.
+        Keyword arguments of the public function.
     aes : mapping of str to list of str
-        Aesthetics by dimension.
+        Aesthetics and the dimensions that they encode.
     height : float
-        Of a panel, in rows as ``scale_fig_size`` of arviz_plots counts them.
+        Height of a panel in rows, the unit of ``scale_fig_size`` in arviz_plots.
     size : tuple of float, optional
-        Width and height of the figure in inches, in place of what follows from its panels.
+        Width and height of the figure in inches; by default derived from the panels.
     n_panels, panels_in_line : int
     legend : bool
-        Leave room for one beside the panels.
+        Whether to leave room for a legend beside the panels.
     **defaults
-        Of `PlotCollection.wrap`.
+        Default arguments of `PlotCollection.wrap`.
     """
     backend = rcParams["plot.backend"] if backend is None else backend
     drawing = import_module(f"arviz_plots.backend.{backend}")
@@ -62,9 +62,9 @@ def canvas(
             dots, rows=height * n_lines, cols=n_columns, figsize_units=dots and "dots"
         )
         figure["figsize_units"] = "dots"
-    if backend == "matplotlib":  # it alone must be told to keep room for a legend
+    if backend == "matplotlib":  # the only backend that needs it to make room for a legend
         figure.setdefault("layout", "constrained")
-    if backend == "plotly" and size is not None:  # it keeps room for titles
+    if backend == "plotly" and size is not None:  # its default leaves room for titles
         figure.setdefault("vertical_spacing", 0.25 / n_lines)
     given = {
         "col_wrap": panels_in_line,
@@ -80,7 +80,7 @@ def canvas(
 def canvas_of_rows(
     data: xr.Dataset, *, backend: str | None, pc_kwargs: Mapping[str, Any]
 ) -> PlotCollection:
-    """Make a figure with one named row for each entry of the only dimension, the first on top."""
+    """Make a figure with one labelled row per entry of the only dimension, the first on top."""
     (dim,) = map(str, data.dims)
     places = np.arange(data.sizes[dim])[::-1]
     collection = canvas(
@@ -92,27 +92,27 @@ def canvas_of_rows(
         y=places,
     )
     names = [str(name) for name in data[dim].values]
-    collection.map(name_rows, ignore_aes="all", places=places, names=names, store_artist=False)
+    collection.map(label_rows, ignore_aes="all", places=places, names=names, store_artist=False)
     return collection
 
 
-def name_rows(da: xr.DataArray, target: Any, *, places: np.ndarray, names: list[str]) -> None:
-    """Write the names of the rows at the y axis, and leave room above and below."""
+def label_rows(da: xr.DataArray, target: Any, *, places: np.ndarray, names: list[str]) -> None:
+    """Label the rows at the y axis, with space above and below."""
     drawing = backend_from_object(target)
     drawing.ylim((-0.5, len(names) - 0.3), target)
     drawing.yticks(places, names, target)
 
 
 def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Draw values against the coordinate of their only dimension."""
+    """Plot values against the coordinate of their only dimension."""
     (dim,) = da.dims
     return backend_from_object(target).line(da[dim].values, da.values, target, **kwargs)
 
 
 def band(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Fill the space between two curves, the ends of the dimension `BOUND`; return the last part.
+    """Fill between the two curves along the dimension `BOUND`; return the last part.
 
-    A backend that fills a polygon cannot have gaps in it: what lies between gaps is one each.
+    Gaps are left out by filling each contiguous part separately, as some backends fill a polygon.
     """
     (dim,) = (dim for dim in da.dims if dim != BOUND)
     low, high = da.transpose(BOUND, dim).values
@@ -124,11 +124,11 @@ def band(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
 
 
 def interval(low: xr.Dataset, high: xr.Dataset) -> xr.Dataset:
-    """Lay two ends side by side along the dimension `BOUND`."""
+    """Concatenate lower and upper ends along the dimension `BOUND`."""
     return xr.concat([low, high], dim=BOUND).assign_coords({BOUND: ["lower", "upper"]})
 
 
-def note(
+def annotate(
     da: xr.DataArray,
     target: Any,
     *,
@@ -137,7 +137,7 @@ def note(
     middle: float,
     **kwargs: Any,
 ) -> Any:
-    """Write a text above the point of a row, from there towards the middle of the panel."""
+    """Write a text above the point of a row, extending towards the middle of the panel."""
     return backend_from_object(target).text(
         da.item(),
         np.asarray(y).item() + 0.15,
@@ -150,7 +150,7 @@ def note(
 
 
 def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
-    """Return ticks in decades, or finer where there are few decades."""
+    """Return tick positions (log10) and labels: decades, or finer if there are few decades."""
     low, high = logs.min() - 1e-9, logs.max() + 1e-9
     digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
     decades = range(math.floor(low), math.ceil(high) + 1)
@@ -159,8 +159,8 @@ def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
     return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
 
 
-def written(prob: float) -> str:
-    """Write a probability with the digits that matter, near zero and near one too."""
+def format_probability(prob: float) -> str:
+    """Format a probability with enough digits near zero and near one."""
     if prob < 1e-6:
         return "< 1e-6"
     if prob < 0.01:

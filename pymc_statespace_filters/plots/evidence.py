@@ -1,4 +1,4 @@
-"""Log-evidences with their errors, of rival models or of several estimators."""
+"""Plot of log-evidences with their errors, by model or by estimator."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note
+from pymc_statespace_filters.plots.canvas import annotate, canvas_of_rows, interval
 
 
 def plot_evidence(
@@ -20,18 +20,18 @@ def plot_evidence(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    """Draw log-evidences with one and two standard errors.
+    """Plot log-evidences with one and two standard errors.
 
     Parameters
     ----------
     idata_or_table : pandas.DataFrame, xarray.DataTree or mapping of str to Evidence
-        The table of `compare_evidence` (a row for each model), or the result of
-        `estimate_evidence` or draws with a group ``evidence`` (a row for each estimator). An
-        estimate without error has no bar.
+        The table of `compare_evidence` (one row per model), the result of `estimate_evidence`, or
+        a DataTree with the group ``evidence`` (one row per estimator). An estimate without standard
+        error has no bar.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``, as ``figure_kwargs={"figsize": (6, 3)}``.
+        Passed to ``arviz_plots.PlotCollection.wrap``, as ``figure_kwargs={"figsize": (6, 3)}``.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def plot_evidence(
     Raises
     ------
     ModelError
-        If there are no log-evidences in what was given.
+        If `idata_or_table` has no log-evidences.
 
     Examples
     --------
@@ -62,14 +62,14 @@ def plot_evidence(
     values = table["log_evidence"]
     texts = xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object])
     middle = (values.min() + values.max()).item() / 2
-    collection.map(note, "text", texts=texts, middle=middle, color="B2")
+    collection.map(annotate, "text", texts=texts, middle=middle, color="B2")
     text = "log-evidence (nats), 1 and 2 standard errors"
     collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
     return collection
 
 
 def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dataset:
-    """Return log_evidence and se along one dimension, whatever they were given in."""
+    """Return log_evidence and se along one dimension."""
     if isinstance(given, xr.DataTree) and "evidence" in given.children:
         return given["evidence"].to_dataset()[["log_evidence", "se"]]
     if isinstance(given, Mapping) and not isinstance(given, xr.DataTree):

@@ -1,4 +1,4 @@
-"""Whether a filter does its work: its particles, and what it expected of the next observation."""
+"""Plot of filter diagnostics: residuals, their autocorrelation, PIT, effective particles."""
 
 from functools import lru_cache
 from typing import Any
@@ -24,14 +24,14 @@ from pymc_statespace_filters.plots.canvas import (
     interval,
     logarithmic_ticks,
 )
-from pymc_statespace_filters.plots.marks import bars, draw_bands, points, time_label, write_key
-from pymc_statespace_filters.plots.results import group_of, named, variable_of
+from pymc_statespace_filters.plots.marks import add_legend, bars, draw_bands, points, time_label
+from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
-COLLAPSED = 3  # a filter with fewer effective particles says little
-PROB, TAIL = 0.95, 1.96  # of the bands that a calibrated filter keeps to
+COLLAPSED = 3  # effective particles below which a filter counts as collapsed
+PROB, TAIL = 0.95, 1.96  # of the bands expected of a calibrated filter
 MAX_LAG = 25
 PIT_GRID = np.linspace(0, 1, 101)
-N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their distribution
+N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their ECDF
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
 LIMIT = {"color": "B1", "linestyle": "C1"}
@@ -44,31 +44,31 @@ def plot_filter_health(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    r"""Draw what tells whether a filter and its model fit the record, before each observation.
+    r"""Plot diagnostics of the one-step-ahead predictions of a filter.
 
-    For each observable three panels, with the band in which 95 % would be:
+    Three panels per observable, each with the 95 % band expected of a correct model:
 
-    * the standardised residuals of one-step-ahead prediction over time. Too many outside the
-      band, or runs of one sign, tell when the model is wrong;
-    * their autocorrelation: that of white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
-    * the distribution function of the probability integral transform (PIT) less that of a uniform
-      one, which it would have, with a simultaneous band [1]_. Prediction that is too wide goes
-      below the band and then above it, one that is too narrow the other way round; a bias is a
-      bow to one side.
+    * the standardised residuals of one-step-ahead prediction over time. Many residuals outside the
+      band, or long runs of one sign, show when the model is wrong;
+    * their autocorrelation: white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
+    * the empirical distribution function of the probability integral transform (PIT) minus that of
+      a uniform distribution, with a simultaneous band [1]_. Too wide predictions go below and then
+      above the band, too narrow ones the other way round; a bias lies on one side.
 
-    One more for filters with particles: their effective number, of all draws. Below 3 (the dashed
-    line) the filter has collapsed. Above it stands how many evaluations failed while sampling.
+    For particle and ensemble filters, one more panel with the effective number of particles over
+    the draws. Below 3 (the dashed line) the filter has collapsed. Its title is the number of
+    evaluations that failed while sampling.
 
     Parameters
     ----------
     idata : xarray.DataTree
         With the group ``filter_diagnostics``.
     var_name : str, optional
-        The StateSpace variable, where there are several.
+        Name of the StateSpace variable, if there are several.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def plot_filter_health(
     Raises
     ------
     ModelError
-        If there are no diagnostics.
+        If `idata` has no such group, or `var_name` is none of its variables.
 
     References
     ----------
@@ -111,7 +111,8 @@ def plot_filter_health(
     _, results = group_of(idata, "filter_diagnostics")
     name = variable_of(results, var_name, "_residual")
     residual, pit = (
-        named(results[f"{name}_{kind}"], "time", "observable") for kind in ("residual", "pit")
+        rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
+        for kind in ("residual", "pit")
     )
     seen, expected = (
         xr.merge(parts)
@@ -137,12 +138,12 @@ def plot_filter_health(
     collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
     collection.map(bars, "seen", data=_from_zero(seen[["autocorrelation"]]), width=2, **SEEN)
     collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
-    key = {"95 % if all is well": {**EXPECTED, "width": 8}}
+    legend = {"95 % if calibrated": {**EXPECTED, "width": 8}}
     if effective is not None:
-        key |= _draw_effective(collection, data[["effective"]])
+        legend |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
-    _name_axes(collection, data, residual["time"])
-    write_key(collection, key, n_columns=in_line)
+    _label_panels(collection, data, residual["time"])
+    add_legend(collection, legend, n_columns=in_line)
     return collection
 
 
@@ -153,7 +154,7 @@ def _residuals(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def _autocorrelations(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return autocorrelations of the residuals that there are, and the band of white noise."""
+    """Return autocorrelations of the non-missing residuals, and the band of white noise."""
     n_lags = max(1, min(MAX_LAG, residual.sizes["time"] // 4))
 
     def autocorrelation(values: np.ndarray) -> np.ndarray:
@@ -173,12 +174,12 @@ def _autocorrelations(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return distribution functions less that of a uniform number, and their simultaneous band."""
+    """Return ECDFs minus the uniform distribution function, and their simultaneous band."""
 
     def of_one(values: np.ndarray) -> np.ndarray:
         values = values[np.isfinite(values)]
         found = [compute_ecdf(values, PIT_GRID[1:-1]), *_uniform_band(values.size)]
-        return np.pad(np.array(found) - PIT_GRID[1:-1], ((0, 0), (1, 1)))  # all meet at 0 and at 1
+        return np.pad(np.array(found) - PIT_GRID[1:-1], ((0, 0), (1, 1)))  # zero at 0 and at 1
 
     found = xr.apply_ufunc(
         of_one,
@@ -193,33 +194,35 @@ def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
 
 @lru_cache(maxsize=16)
 def _uniform_band(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the band in which the distribution function of n uniform numbers stays."""
-    rng = np.random.default_rng(1)  # the same picture each time
+    """Return the simultaneous band of the ECDF of n uniform numbers."""
+    rng = np.random.default_rng(1)  # reproducible plots
     level = simulate_confidence_bands(n, 1, PIT_GRID[1:-1], PROB, N_SIMULATIONS, rng)
     return get_pointwise_confidence_band(level, n, PIT_GRID[1:-1])
 
 
 def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
-    """Return logs (not every backend has such an axis), or None: a filter without particles."""
+    """Return log10 of the effective number (not every backend has a log axis), or None."""
     effective = results.get(f"{name}_n_effective")
     if effective is None or not np.isfinite(effective).any():
         return None
-    return xr.apply_ufunc(np.log10, named(effective.where(np.isfinite(effective)), "time"))
+    return xr.apply_ufunc(
+        np.log10, rename_last_dims(effective.where(np.isfinite(effective)), "time")
+    )
 
 
 def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:
-    key = draw_bands(collection, logs)
+    legend = draw_bands(collection, logs)
     limit = np.log10(COLLAPSED)
     collection.map(hline, "collapsed", data=xr.Dataset({"effective": limit}), **LIMIT)
     ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])
     collection.map(
-        name_ticks, data=logs, ticks=logarithmic_ticks(ends), ignore_aes="all", store_artist=False
+        label_ticks, data=logs, ticks=logarithmic_ticks(ends), ignore_aes="all", store_artist=False
     )
-    return {**key, "collapse": LIMIT}
+    return {**legend, "collapse": LIMIT}
 
 
 def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataTree) -> None:
-    """Write above the panel of particles how many evaluations failed while sampling."""
+    """Write the number of failed evaluations above the panel of effective particles."""
     stats = idata.children.get("sample_stats")
     n_failed = 0 if stats is None or "n_failed" not in stats else int(stats["n_failed"].sum())
     if n_failed:
@@ -227,8 +230,8 @@ def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataT
         collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
 
 
-def name_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
-    """Write ticks at the y axis."""
+def label_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
+    """Set positions and labels of the ticks at the y axis."""
     backend_from_object(target).yticks(ticks["values"], ticks["labels"], target)
 
 
@@ -236,11 +239,11 @@ def _from_zero(values: xr.Dataset) -> xr.Dataset:
     return interval(xr.zeros_like(values), values)
 
 
-def _name_axes(collection: PlotCollection, data: xr.Dataset, time: xr.DataArray) -> None:
+def _label_panels(collection: PlotCollection, data: xr.Dataset, time: xr.DataArray) -> None:
     axes = {
         "residual": (time_label(time), "standardised residual"),
         "autocorrelation": ("lag (observations)", "autocorrelation"),
-        "pit": ("PIT", "ECDF less uniform"),
+        "pit": ("PIT", "ECDF minus uniform"),
         "effective": (time_label(time), "effective number"),
     }
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}

@@ -1,4 +1,4 @@
-"""What is to come after a record, beside what came."""
+"""Plot of forecasts beside the observations."""
 
 from typing import Any
 
@@ -11,24 +11,24 @@ from pymc_statespace_filters.plots.canvas import canvas
 from pymc_statespace_filters.plots.marks import (
     DATA,
     TRUTH,
+    add_legend,
     draw_bands,
     draw_bars,
-    in_key,
+    label_axes,
+    legend_style,
     points,
-    write_axes,
-    write_key,
 )
 from pymc_statespace_filters.plots.results import (
     data_of,
     group_of,
-    named,
+    rename_last_dims,
     truth_of,
     variable_of,
 )
 from pymc_statespace_filters.system.checks import check_count
 
-PAST = 2.0  # so much of the record, in lengths of the forecast, is drawn
-FEWEST_OF_PAST = 10
+PAST = 2.0  # length of the observations shown, in lengths of the forecast
+MIN_PAST = 10  # observations
 
 
 def plot_forecast(
@@ -40,28 +40,28 @@ def plot_forecast(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    """Draw predicted observations after the end of the record, one panel for each observable.
+    """Plot predicted observations after the last observation, one panel per observable.
 
-    Bands hold 50 % and 90 % of the draws: the uncertainty of parameters and states, the noise to
-    come and that of the measurement. The end of the record is a vertical line.
+    Bands contain 50 % and 90 % of the draws, which include the uncertainty of parameters and
+    states, the process noise and the observation noise. A vertical line marks the last observation.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Of `forecast`.
+        Result of `forecast`.
     var_name : str, optional
-        The StateSpace variable, where there are several.
+        Name of the StateSpace variable, if there are several.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
-        What came: an array of shape (number of predictions, number of observables); a DataArray
-        with a dimension ``observable`` and another whose coordinate is time; or what `simulate`
-        returned. What is not after the end of the record is not drawn.
+        The actual observations: an array of shape (number of predictions, number of observables); a
+        DataArray with a dimension ``observable`` and another whose coordinate is time; or the
+        result of `simulate`. Only values after the last observation are shown.
     n_past : int, optional
-        So many of the last observations are drawn; by default those of a time twice as long as
-        the forecast, and at least ten.
+        Number of past observations to show; by default those in a time span twice as long as the
+        forecast, and at least ten.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def plot_forecast(
     Raises
     ------
     ModelError
-        If there is no forecast, or the truth does not fit it.
+        If there is no forecast, or the truth does not match it.
 
     Examples
     --------
@@ -80,7 +80,7 @@ def plot_forecast(
     >>> import xarray as xr
     >>> from pymc_statespace_filters import plot_forecast
     >>> times, rng = np.arange(150) / 10, np.random.default_rng(1)
-    >>> came = np.sin(times) + 0.1 * rng.normal(size=150)
+    >>> observed = np.sin(times) + 0.1 * rng.normal(size=150)
     >>> drawn = np.sin(times[100:])[:, None] + 0.1 * rng.normal(size=(2, 100, 50, 1))
     >>> observable = {"observable": ["position"]}
     >>> predictions = xr.Dataset(
@@ -88,11 +88,11 @@ def plot_forecast(
     ...     coords={"d_time": times[100:], **observable},
     ... )
     >>> record = xr.Dataset(
-    ...     {"d": (("d_time", "observable"), came[:100, None])},
+    ...     {"d": (("d_time", "observable"), observed[:100, None])},
     ...     coords={"d_time": times[:100], **observable},
     ... )
     >>> idata = xr.DataTree.from_dict({"predictions": predictions, "observed_data": record})
-    >>> collection = plot_forecast(idata, truth=came[100:])
+    >>> collection = plot_forecast(idata, truth=observed[100:])
     >>> collection.savefig("forecast.png")  # doctest: +SKIP
     """
     if n_past is not None:
@@ -100,7 +100,7 @@ def plot_forecast(
     _, results = group_of(idata, "predictions")
     predicted = results[[name for name in results if not str(name).endswith("_states")]]
     name = variable_of(predicted, var_name)
-    draws = named(predicted[name], "time", "observable")
+    draws = rename_last_dims(predicted[name], "time", "observable")
     observables = [str(observable) for observable in draws["observable"].values]
     if truth is not None:
         truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
@@ -117,7 +117,7 @@ def plot_forecast(
         panels_in_line=1,
         cols=["observable"],
     )
-    key = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
+    legend = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
     if record is not None:
         past = record.tail(time=_n_past(record, draws) if n_past is None else n_past)
         end = record["time"][-1].expand_dims(observable=observables).drop_vars("time")
@@ -125,19 +125,19 @@ def plot_forecast(
             truth = truth.where(truth["time"] > record["time"][-1], drop=True)
         collection.map(vline, "end", data=end.to_dataset(name="end"), color="B2", linestyle="C1")
         collection.map(points, "data", data=past.to_dataset(name="data"), diameter=4, **DATA)
-        key["data"] = in_key(DATA)
-        key["end of record"] = {"color": "B2", "linestyle": "C1"}
+        legend["data"] = legend_style(DATA)
+        legend["end of record"] = {"color": "B2", "linestyle": "C1"}
     if truth is not None:
-        came = truth.reindex(observable=observables).to_dataset(name="truth")
-        collection.map(points, "truth", data=came, diameter=4, color=TRUTH["color"])
-        key["what came"] = in_key(TRUTH)
-    write_axes(collection, draws["time"])
-    write_key(collection, key)
+        actual = truth.reindex(observable=observables).to_dataset(name="truth")
+        collection.map(points, "truth", data=actual, diameter=4, color=TRUTH["color"])
+        legend["truth"] = legend_style(TRUTH)
+    label_axes(collection, draws["time"])
+    add_legend(collection, legend)
     return collection
 
 
 def _n_past(record: xr.DataArray, draws: xr.DataArray) -> int:
-    """Return how many of the last observations are of a time `PAST` times that of the forecast."""
+    """Return the number of observations in a time span `PAST` times that of the forecast."""
     end = record["time"].values[-1]
     begin = end - PAST * (draws["time"].values[-1] - end)
-    return max(int(np.sum(record["time"].values >= begin)), FEWEST_OF_PAST)
+    return max(int(np.sum(record["time"].values >= begin)), MIN_PAST)

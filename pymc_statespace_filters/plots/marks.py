@@ -1,4 +1,4 @@
-"""What pictures over time are made of: bands and bars of draws, points, paths, and their key."""
+"""Elements of plots over time: bands and bars of draws, points, paths, legend and axis labels."""
 
 from collections.abc import Hashable, Mapping
 from importlib import import_module
@@ -14,20 +14,20 @@ from arviz_plots.visuals import labelled_x, labelled_y
 from pymc_statespace_filters.plots.canvas import BOUND, band, curve, interval
 from pymc_statespace_filters.plots.results import SAMPLE_DIMS
 
-# Blue and orange are told apart by everyone; what is certain is black.
+# Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
 DRAWS = {"color": "C0"}
 DATA = {"color": "C1"}
 TRUTH = {"color": "B1", "width": 0.9}
 PATHS = {"color": "C0", "alpha": 0.4, "width": 0.6}
 DOTS = {"color": "C0", "alpha": 0.4, "diameter": 2}
-LONGEST_KEY = 5
+MAX_IN_LINE = 5  # legend entries
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
 
 
 def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw median, 50 % and 90 % of draws over time; return their entries in the key."""
+    """Draw median, 50 % and 90 % bands of draws over time; return their legend entries."""
     quantiles = over_draws(draws)
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
@@ -41,7 +41,7 @@ def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[
 
 
 def draw_bars(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw the same at each time by itself: nothing is claimed for the time between."""
+    """Draw 50 % and 90 % bars of draws at separate times; return their legend entries."""
     quantiles = over_draws(draws)
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
@@ -50,7 +50,7 @@ def draw_bars(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[s
 
 
 def over_draws(draws: xr.Dataset) -> xr.Dataset:
-    """Return quantiles over the draws that are known; where none is, they are missing."""
+    """Return quantiles over the draws that are not NaN; NaN where all are."""
     known = draws.notnull().any(SAMPLE_DIMS)
     tails = [(1 - prob / 100) / 2 for prob in PROBABILITIES]
     levels = [*tails, 0.5, *(1 - tail for tail in tails[::-1])]
@@ -67,8 +67,8 @@ def _ends(quantiles: xr.Dataset, prob: int) -> xr.Dataset:
     )
 
 
-def some_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
-    """Return `n_draws` draws, spread evenly over all that are known, along the dimension "path"."""
+def thin_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
+    """Return `n_draws` of the draws that are not all NaN, evenly, along the dimension "path"."""
     stacked = draws.stack(path=SAMPLE_DIMS).drop_vars(["path", *SAMPLE_DIMS])
     stacked = stacked.dropna("path", how="all")
     n_draws = min(n_draws, stacked.sizes["path"])
@@ -76,14 +76,14 @@ def some_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
 
 
 def bars(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Draw a vertical line from bound to bound at each time."""
+    """Draw a vertical line between the bounds at each time."""
     dim = _dim_of(da, BOUND)
     low, high = da.transpose(BOUND, dim).values
     return _broken_line([da[dim].values] * 2, [low, high], target, **kwargs)
 
 
 def points(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
-    """Draw values, of each path if there are some, as points over time."""
+    """Draw values over time as points, those of all paths if there is a dimension "path"."""
     dim = _dim_of(da, "path")
     times, values = xr.broadcast(da[dim], da)
     return _scatter(times.values.ravel(), values.values.ravel(), target, diameter, **kwargs)
@@ -104,43 +104,43 @@ def _dim_of(da: xr.DataArray, *others: str) -> Hashable:
 
 
 def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
-    """Draw the columns of x against those of y as one line with gaps, which all backends know."""
+    """Draw the columns of y against those of x as one line with gaps."""
     gaps = np.full((1, np.shape(x)[1]), np.nan)
     x, y = (np.concatenate([values, gaps]).T.ravel() for values in (x, y))
     return backend_from_object(target).line(x, y, target, **kwargs)
 
 
 def path_xy(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Draw each path of x and y, the ends of the dimension "plot_axis", as a line."""
+    """Draw each path as a line, with x and y along the dimension "plot_axis"."""
     dim = _dim_of(da, "path", "plot_axis")
     x, y = da.transpose("plot_axis", dim, "path").values
     return _broken_line(x, y, target, **kwargs)
 
 
 def points_xy(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
-    """Draw the same as points."""
+    """Draw points, with x and y along the dimension "plot_axis"."""
     x, y = da.stack(point=[dim for dim in da.dims if dim != "plot_axis"]).values
     return _scatter(x, y, target, diameter, **kwargs)
 
 
 def _scatter(x: np.ndarray, y: np.ndarray, target: Any, diameter: float, **kwargs: Any) -> Any:
     drawing = backend_from_object(target)
-    size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # others take an area
+    size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # other backends: area
     known = np.isfinite(x) & np.isfinite(y)
     return drawing.scatter(x[known], y[known], target, size=size, **kwargs)
 
 
-def in_key(style: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how points of a style look in a key, which has lines alone: a line of points."""
+def legend_style(style: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the legend style of points: a dotted line, as legends show lines only."""
     return {**style, "linestyle": "C2", "width": 4}
 
 
-def write_key(
+def add_legend(
     collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], n_columns: int = 1
 ) -> None:
-    """Write what the marks mean above the panels, which are in so many columns."""
-    in_line = -(-len(entries) // (1 + (len(entries) > LONGEST_KEY)))  # or in two lines
-    places: dict[str, dict[str, Any]] = {  # in the words of each backend
+    """Write a legend above the panels, which form `n_columns` columns."""
+    in_line = -(-len(entries) // (1 + (len(entries) > MAX_IN_LINE)))  # a long one in two lines
+    places: dict[str, dict[str, Any]] = {
         "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": in_line},
         "plotly": {
             "legend_orientation": "h",
@@ -149,7 +149,7 @@ def write_key(
             "legend_traceorder": "normal",
             "margin": {"t": 60, "b": 60, "r": 30},
         },
-        "bokeh": {  # above one panel alone, and no wider
+        "bokeh": {  # above the first panel, and no wider than it
             "side": "above",
             "border_line_alpha": 0.0,
             "margin": 0,
@@ -161,15 +161,16 @@ def write_key(
         "none": {},
     }
     drawing = import_module(f"arviz_plots.backend.{collection.backend}")
-    alpha = "opacity" if collection.backend == "plotly" else "alpha"  # not translated for legends
+    # arviz_plots does not translate "alpha" for legends.
+    alpha = "opacity" if collection.backend == "plotly" else "alpha"
     styles = [{alpha if k == "alpha" else k: v for k, v in s.items()} for s in entries.values()]
     drawing.legend(
         collection, styles, list(entries), update_visuals=False, **places[collection.backend]
     )
 
 
-def write_axes(collection: PlotCollection, time: xr.DataArray) -> None:
-    """Name what each panel shows, and time below the lowest ones, with its unit if it has one."""
+def label_axes(collection: PlotCollection, time: xr.DataArray) -> None:
+    """Label the y axis of each panel, and the time axis below the lowest panels."""
     collection.map(
         labelled_y, "y_label", ignore_aes="all", subset_info=True, labeller=NoVarLabeller()
     )
@@ -181,5 +182,5 @@ def write_axes(collection: PlotCollection, time: xr.DataArray) -> None:
 
 
 def time_label(time: xr.DataArray) -> str:
-    """Return the name of the axis of time, with its unit if xarray knows one."""
+    """Return the label of the time axis, with the unit from the attributes if there is one."""
     return f"time ({time.attrs['units']})" if "units" in time.attrs else "time"

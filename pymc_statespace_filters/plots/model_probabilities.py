@@ -1,4 +1,4 @@
-"""Probabilities of rival models, with what the errors of the evidences leave open."""
+"""Plot of model probabilities with their intervals."""
 
 from typing import Any
 
@@ -8,7 +8,12 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import canvas_of_rows, interval, note, written
+from pymc_statespace_filters.plots.canvas import (
+    annotate,
+    canvas_of_rows,
+    format_probability,
+    interval,
+)
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 
@@ -16,17 +21,17 @@ COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 def plot_model_probabilities(
     table: pd.DataFrame, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Draw the probabilities of rival models with their intervals.
+    """Plot model probabilities with their intervals.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Of `compare_evidence`. Models among which the errors do not decide have an open mark and
-        the word "undecided".
+        Result of `compare_evidence`. Undecided models have an open marker and the label
+        "undecided".
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -36,7 +41,7 @@ def plot_model_probabilities(
     Raises
     ------
     ModelError
-        If it is not such a table.
+        If `table` is no such table.
 
     Examples
     --------
@@ -66,11 +71,11 @@ def plot_model_probabilities(
         width=1.5,
     )
     texts = xr.apply_ufunc(_text, data["prob"], undecided, vectorize=True, output_dtypes=[object])
-    collection.map(note, "text", texts=texts, middle=0.5, color="B2")
+    collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
     collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
     collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the model")
     return collection
 
 
 def _text(prob: float, undecided: bool) -> str:
-    return written(prob) + (", undecided" if undecided else "")
+    return format_probability(prob) + (", undecided" if undecided else "")

@@ -1,4 +1,4 @@
-"""One quantity against another while time goes: phase portraits, loops of force (Figs. 24-28)."""
+"""Phase portraits and restoring-force loops (thesis, Figs. 24-28)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,18 +14,18 @@ from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
+    add_legend,
     over_draws,
     path_xy,
     points_xy,
-    some_draws,
-    write_key,
+    thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     are_paths,
-    chosen,
     group_of,
-    named,
+    rename_last_dims,
+    select_names,
     truth_of,
     variable_of,
 )
@@ -44,31 +44,30 @@ def plot_phase(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    """Draw one quantity against another while time goes: the phase portrait, the loop of a force.
+    """Plot one quantity against another over time: a phase portrait or a restoring-force loop.
 
-    The thin lines are draws, the thick line goes through the medians of both. Filtered states are
-    drawn at each time by itself, and between observations alone nothing is known: such draws are
-    points.
+    The thin lines are draws; the thick line connects the medians of x and y. Draws of filtered
+    states, and of states at observation times only, are independent over time and shown as points.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Of `filtered_states` or `smoothed_states`.
+        Result of `filtered_states` or `smoothed_states`.
     x, y : str or xarray.DataArray
-        Name of a state; or what was computed from the states, as a restoring force, with
-        dimensions (chain, draw, time), its name that of the axis.
+        Name of a state; or a quantity computed from the states, as a restoring force, with
+        dimensions (chain, draw, time), whose name labels the axis.
     group : {"smoothed_states", "filtered_states"}, optional
-        By default the smoothed states where there are any.
+        By default the smoothed states if there are any.
     var_name : str, optional
-        The StateSpace variable, where there are several.
+        Name of the StateSpace variable, if there are several.
     truth : xarray.DataArray, xarray.Dataset or pair of array_like, optional
-        What `simulate` returned (if x and y are names of states), or the true x and y over time.
+        The result of `simulate` (if x and y are names of states), or the true x and y over time.
     n_draws : int
-        So many draws beside the median.
+        Number of draws to show.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -78,7 +77,7 @@ def plot_phase(
     Raises
     ------
     ModelError
-        If there are no such states, or x, y or the truth does not fit.
+        If there are no such states, or x, y or the truth does not match them.
 
     Examples
     --------
@@ -104,7 +103,7 @@ def plot_phase(
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
-    states = named(results[f"{name}_states"], "time", "state")
+    states = rename_last_dims(results[f"{name}_states"], "time", "state")
     both = [_quantity("x", x, states), _quantity("y", y, states)]
     sizes = [dict(quantity.sizes) for quantity in both]
     if sizes[0] != sizes[1]:
@@ -113,12 +112,12 @@ def plot_phase(
     true = None if truth is None else _truth(truth, x, y, states)
 
     collection = canvas(data, backend=backend, pc_kwargs=pc_kwargs, aes={}, size=(6.0, 5.0))
-    key = {}
+    legend = {}
     if n_draws:
         mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
-        style = {**style, "alpha": 0.25}  # beside the thick line
-        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
-        key["draws"] = {**PATHS, "width": 1.5}
+        style = {**style, "alpha": 0.25}  # the median must stand out
+        collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
+        legend["draws"] = {**PATHS, "width": 1.5}
     median = over_draws(data).sel(quantile=0.5)
     lines = {"median": ({"color": "C0", "width": 2.5}, median)}
     if true is not None:
@@ -127,12 +126,12 @@ def plot_phase(
         collection.map(line_xy, label, data=line, **line_style)
     collection.map(labelled_x, "x_label", text=str(both[0].name))
     collection.map(labelled_y, "y_label", text=str(both[1].name))
-    write_key(collection, key | {label: style for label, (style, _) in lines.items()})
+    add_legend(collection, legend | {label: style for label, (style, _) in lines.items()})
     return collection
 
 
 def _on_axes(both: Sequence[xr.DataArray]) -> xr.DataArray:
-    """Lay x and y along the dimension "plot_axis", as arviz_plots has it."""
+    """Concatenate x and y along the dimension "plot_axis", the convention of arviz_plots."""
     aligned = xr.align(*both, join="exact")
     return xr.concat([a.rename("phase") for a in aligned], "plot_axis").assign_coords(
         plot_axis=["x", "y"]
@@ -140,7 +139,7 @@ def _on_axes(both: Sequence[xr.DataArray]) -> xr.DataArray:
 
 
 def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) -> xr.DataArray:
-    """Return a state or what the user computed, over (chain, draw, time), with its name."""
+    """Return a state or a computed quantity, over (chain, draw, time), with its name."""
     if isinstance(given, xr.DataArray):
         others = [dim for dim in given.dims if dim not in SAMPLE_DIMS]
         if set(given.dims) - set(others) != set(SAMPLE_DIMS) or len(others) != 1:
@@ -149,18 +148,18 @@ def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) ->
             )
         name = given.name or argument
         return given.rename({others[0]: "time"}).reset_coords(drop=True).rename(name)
-    (state,) = chosen(argument, [given], [str(state) for state in states["state"].values])
+    (state,) = select_names(argument, [given], [str(state) for state in states["state"].values])
     return states.sel(state=state, drop=True).rename(state)
 
 
 def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:
     if isinstance(truth, xr.Dataset | xr.DataArray):
         if not (isinstance(x, str) and isinstance(y, str)):
-            raise ModelError("truth must be a pair (x, y) where x or y is no name of a state")
+            raise ModelError("truth must be a pair (x, y) if x or y is not the name of a state")
         names = [str(state) for state in states["state"].values]
         known = truth_of(truth, "states", "state", names, states["time"].values)
         true_states = [str(state) for state in known["state"].values]
-        both = [known.sel(state=name) for name in chosen("truth", [x, y], true_states)]
+        both = [known.sel(state=name) for name in select_names("truth", [x, y], true_states)]
         return _on_axes([b.drop_vars("state") for b in both]).to_dataset(name="phase")
     pair = [np.asarray(values, dtype=float) for values in truth]
     if len(pair) != 2 or pair[0].ndim != 1 or pair[0].shape != pair[1].shape:

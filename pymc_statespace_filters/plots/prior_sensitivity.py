@@ -1,4 +1,4 @@
-"""Probabilities of rival models against what was assumed before the data."""
+"""Plot of model probabilities against the correction's exponent and the width of priors."""
 
 from typing import Any
 
@@ -21,18 +21,18 @@ LABELS = {
 def plot_prior_sensitivity(
     table: pd.DataFrame | xr.Dataset, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Draw how the probabilities of rival models depend on the prior.
+    """Plot the dependence of model probabilities on the prior.
 
     Parameters
     ----------
     table : pandas.DataFrame or xarray.Dataset
         The table of `compare_evidence`: one panel, the probabilities against the exponent of
-        `DimensionCorrection`, whatever exponent was in the table. Or the result of
+        `DimensionCorrection`, ignoring the correction in the table. Or the result of
         `prior_sensitivity`: a second panel, against the width of the priors, if it has one.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``.
+        Passed to ``arviz_plots.PlotCollection.wrap``.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def plot_prior_sensitivity(
     Raises
     ------
     ModelError
-        If it is neither.
+        If `table` is neither.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the plots of states read: groups of draws, one of their variables, the truth beside them."""
+"""Read and check the inputs of plots of states: groups, variables, observations, the truth."""
 
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ import xarray as xr
 from pymc_statespace_filters.errors import ModelError
 
 SAMPLE_DIMS = ("chain", "draw")
-CALLS = {  # by which groups are made
+CALLS = {  # that make the groups
     "smoothed_states": "psf.smoothed_states(idata, model)",
     "filtered_states": "psf.filtered_states(idata, model)",
     "predictions": "psf.forecast(idata, model, n_steps=...)",
@@ -18,7 +18,7 @@ CALLS = {  # by which groups are made
 
 
 def group_of(idata: Any, *groups: str) -> tuple[str, xr.Dataset]:
-    """Return the first group that there is, with its name, or say which call makes one."""
+    """Return name and contents of the first existing group, or raise with the call to make one."""
     if not isinstance(idata, xr.DataTree):
         raise ModelError(f"idata must be a DataTree of draws, got {type(idata).__name__}")
     for group in groups:
@@ -29,7 +29,7 @@ def group_of(idata: Any, *groups: str) -> tuple[str, xr.Dataset]:
 
 
 def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str = "") -> str:
-    """Return the name of the StateSpace variable whose results are in a group."""
+    """Return the name of the StateSpace variable in a group, given or the only one."""
     found = [str(name).removesuffix(suffix) for name in dataset if str(name).endswith(suffix)]
     if var_name is None and len(found) == 1:
         return found[0]
@@ -38,35 +38,35 @@ def variable_of(dataset: xr.Dataset, var_name: str | None, suffix: str = "") -> 
     return var_name
 
 
-def named(array: xr.DataArray, *names: str) -> xr.DataArray:
-    """Return `array` with these names for its last dimensions: a model may call them otherwise."""
+def rename_last_dims(array: xr.DataArray, *names: str) -> xr.DataArray:
+    """Rename the last dimensions of `array`, whose names depend on the model."""
     return array.rename(dict(zip(array.dims[-len(names) :], names, strict=True)))
 
 
 def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
-    """Return the record of a variable if idata has it, with dimensions "time" and "observable"."""
+    """Return the observations of a variable if idata has them, over "time" and "observable"."""
     if "observed_data" not in idata.children:
         return None
     record = idata["observed_data"].to_dataset().get(name)
-    return None if record is None else named(record, "time", "observable")
+    return None if record is None else rename_last_dims(record, "time", "observable")
 
 
 def are_paths(group: str, results: xr.Dataset) -> bool:
-    """Tell whether a draw may be joined to a line: it is one path, and known at every step."""
+    """Whether the draws are joint paths at every step, which may be drawn as lines."""
     return group != "filtered_states" and results.attrs.get("at") != "observations"
 
 
-def chosen(argument: str, names: Any, available: Sequence[str]) -> list[str]:
-    """Return `names`, all of them if None, checked against what there is."""
+def select_names(argument: str, names: Any, available: Sequence[str]) -> list[str]:
+    """Return `names` as a list, all available ones if None, checked to be available."""
     if names is None:
         return list(available)
     names = [names] if isinstance(names, str) else list(names)
-    known(argument, names, available)
+    check_names(argument, names, available)
     return names
 
 
-def known(argument: str, names: Iterable[str], available: Sequence[str]) -> None:
-    """Raise an error for names that there are not."""
+def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -> None:
+    """Raise a `ModelError` for names that are not available."""
     unknown = [name for name in names if name not in available]
     if unknown:
         raise ModelError(f"{argument} must be among {list(available)}, got {unknown}")
@@ -75,24 +75,24 @@ def known(argument: str, names: Iterable[str], available: Sequence[str]) -> None
 def truth_of(
     truth: Any, simulated: str, along: str, names: Sequence[str], times: np.ndarray
 ) -> xr.DataArray:
-    """Return what the user knows to be true, with dimensions "time" and `along`.
+    """Return the user's `truth` with dimensions "time" and `along`.
 
     Parameters
     ----------
     truth : xarray.Dataset, xarray.DataArray or array_like
-        Of `simulate`; with one dimension `along` and another whose coordinate is time; or of
-        shape (len(times), len(names)).
+        Result of `simulate`; array with the dimension `along` and another whose coordinate is time;
+        or array of shape (len(times), len(names)).
     simulated : str
-        Its variable in what `simulate` returns.
+        The variable of a result of `simulate`.
     along : {"state", "observable"}
     names : sequence of str
-        Those of the results, in order.
+        Names in the results, in order.
     times : numpy.ndarray
-        Of the rows of the results.
+        Times of the results.
     """
     if isinstance(truth, xr.Dataset):
         if simulated not in truth:
-            raise ModelError(f"truth must have the variable {simulated!r} of simulate, got {truth}")
+            raise ModelError(f"truth must have the variable {simulated!r}, got {truth}")
         truth = truth[simulated]
     if not isinstance(truth, xr.DataArray):
         return _rows(np.asarray(truth, dtype=float), along, names, times)
@@ -101,13 +101,13 @@ def truth_of(
     others = [dim for dim in truth.dims if dim != along]
     if along not in truth.coords or len(others) != 1:
         raise ModelError(
-            f"truth must have the dimension {along!r} with names and another one of time, got "
-            f"dimensions {truth.dims}"
+            f"truth must have the dimension {along!r} with names and one of time, got dimensions "
+            f"{truth.dims}"
         )
     shared = [name for name in names if name in truth[along].values]
     if not shared:
         raise ModelError(
-            f"truth must know some of {list(names)}, got {along}s {list(truth[along].values)}"
+            f"truth must have some of {list(names)}, got {along}s {list(truth[along].values)}"
         )
     return _with_times(truth.sel({along: shared}), others[0]).transpose("time", along)
 
@@ -118,14 +118,14 @@ def _rows(values: np.ndarray, along: str, names: Sequence[str], times: np.ndarra
     expected = (times.size, len(names))
     if values.shape != expected:
         raise ModelError(
-            f"truth must have shape {expected}, a row for each of the times drawn, got shape "
-            f"{values.shape}; a DataArray with times as coordinate may have other times"
+            f"truth must have shape {expected}, one row per plotted time, got shape "
+            f"{values.shape}: for other times give a DataArray with times as coordinate"
         )
     return xr.DataArray(values, coords=[("time", times), (along, list(names))])
 
 
 def _with_times(truth: xr.DataArray, dim: Hashable) -> xr.DataArray:
-    """Make time the coordinate of its only dimension besides the names."""
+    """Rename `dim` to "time", with the times as its only coordinate."""
     of_dim = [
         name
         for name, coordinate in truth.coords.items()

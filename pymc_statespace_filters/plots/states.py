@@ -1,4 +1,4 @@
-"""The state over time: what the record tells of it, the record, the truth (thesis, Fig. 12)."""
+"""Plot of states over time with observations and the truth (thesis, Fig. 12)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,22 +13,22 @@ from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
+    add_legend,
     draw_bands,
     draw_bars,
-    in_key,
+    label_axes,
+    legend_style,
     paths,
     points,
-    some_draws,
-    write_axes,
-    write_key,
+    thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
     are_paths,
-    chosen,
+    check_names,
     data_of,
     group_of,
-    known,
-    named,
+    rename_last_dims,
+    select_names,
     truth_of,
     variable_of,
 )
@@ -47,36 +47,36 @@ def plot_states(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    """Draw the state over time with its uncertainty, one panel for each of its components.
+    """Plot states over time with their uncertainty, one panel per state.
 
-    Bands hold 50 % and 90 % of the draws, which carry the uncertainty of the parameters too, and
-    the line is their median. States at observation times alone are bars instead: nothing is
-    claimed for the time between. Draws that failed do not count; where all did there is a gap.
+    Bands contain 50 % and 90 % of the draws, which include the uncertainty of the parameters; the
+    line is their median. States at observation times only are shown as bars. Failed draws are
+    ignored; where all failed there is a gap.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Of `filtered_states` or `smoothed_states`.
+        Result of `filtered_states` or `smoothed_states`.
     group : {"smoothed_states", "filtered_states"}, optional
-        By default the smoothed states where there are any.
+        By default the smoothed states if there are any.
     var_name : str, optional
-        The StateSpace variable, where there are several.
+        Name of the StateSpace variable, if there are several.
     states : str or sequence of str, optional
-        By default all.
+        Names of the states to show; all by default.
     observables : mapping of str to str, optional
-        By state the observable that measures it: the record is drawn in its panel, as points. By
-        default each observable that has the name of a state.
+        Maps a state to the observable that measures it; its observations are shown in the panel as
+        points. By default each observable with the name of a state.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
-        What `simulate` returned; a DataArray with a dimension ``state`` and another whose
-        coordinate is time; or an array of shape (number of times drawn, number of states). Drawn
-        from the first of these times to the last.
+        The result of `simulate`; a DataArray with a dimension ``state`` and another whose
+        coordinate is time; or an array of shape (number of times, number of states). It is shown
+        within the range of times of the states.
     n_draws : int
-        So many draws beside the bands: paths of smoothed states at every step; otherwise, and of
-        filtered states, which are drawn at each time by itself, points.
+        Number of draws to show beside the bands: as lines for smoothed states at every step, as
+        points for filtered states and for states at observation times only.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
-        By default that of ``arviz.rcParams["plot.backend"]``.
+        Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        For ``arviz_plots.PlotCollection.wrap``, as ``col_wrap=2`` for panels side by side.
+        Passed to ``arviz_plots.PlotCollection.wrap``, as ``col_wrap=2`` for two columns of panels.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def plot_states(
     Raises
     ------
     ModelError
-        If there are no such states, or a name or the truth does not fit them.
+        If there are no such states, or a name or the truth does not match them.
 
     Examples
     --------
@@ -108,9 +108,9 @@ def plot_states(
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
     name = variable_of(results, var_name, "_states")
-    draws = named(results[f"{name}_states"], "time", "state")
+    draws = rename_last_dims(results[f"{name}_states"], "time", "state")
     all_states = [str(state) for state in draws["state"].values]
-    shown = chosen("states", states, all_states)
+    shown = select_names("states", states, all_states)
     record = _record(idata, name, observables, all_states)
     if truth is not None:
         truth = truth_of(truth, "states", "state", all_states, draws["time"].values)
@@ -130,34 +130,36 @@ def plot_states(
     )
     if n_draws:
         mark, style = (paths, PATHS) if are_paths(group, results) else (points, DOTS)
-        collection.map(mark, "draws", data=some_draws(data, n_draws), **style)
-    key = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(collection, data)
+        collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
+    legend = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(
+        collection, data
+    )
     if truth is not None:
         true = truth.reindex(state=shown).to_dataset(name="truth")
         collection.map(curve, "truth", data=true, **TRUTH)
-        key["truth"] = TRUTH
+        legend["truth"] = TRUTH
     if record is not None and set(shown) & set(record["state"].values):
         seen = record.reindex(state=shown).to_dataset(name="data")
         collection.map(points, "data", data=seen, diameter=4, **DATA)
-        key["data"] = in_key(DATA)
-    write_axes(collection, draws["time"])
-    write_key(collection, key)
+        legend["data"] = legend_style(DATA)
+    label_axes(collection, draws["time"])
+    add_legend(collection, legend)
     return collection
 
 
 def _record(
     idata: xr.DataTree, name: str, observables: Mapping[str, str] | None, states: Sequence[str]
 ) -> xr.DataArray | None:
-    """Return what was observed of each state that is measured, with dimensions time and state."""
+    """Return the observations of each measured state, over time and state."""
     record = data_of(idata, name)
     if record is None:
         if observables:
-            raise ModelError(f"observables was given, but idata has no observed_data[{name!r}]")
+            raise ModelError(f"observables needs observed_data[{name!r}] in idata, got none")
         return None
     there = [str(observable) for observable in record["observable"].values]
     if observables is None:
         observables = {state: state for state in states if state in there}
-    known("observables: its states", observables, states)
-    known("observables: its values", observables.values(), there)
+    check_names("observables: its states", observables, states)
+    check_names("observables: its values", observables.values(), there)
     measured = record.sel(observable=list(observables.values()))
     return measured.rename(observable="state").assign_coords(state=list(observables))

@@ -1,4 +1,4 @@
-"""States of a system along its record and beyond it, draw by draw of the posterior."""
+"""Filtered and smoothed states, and forecasts, at draws of the posterior."""
 
 from pymc_statespace_filters.states.estimation import filtered_states, smoothed_states
 from pymc_statespace_filters.states.forecasting import forecast

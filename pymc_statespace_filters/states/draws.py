@@ -1,4 +1,4 @@
-"""Some draws of a posterior, and the noise that belongs to each."""
+"""Selected draws of a posterior with the noise seed of each."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +16,7 @@ SAMPLE_DIMS = ("chain", "draw")
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws with the dimensions chain and draw, and the statistics of their sampler.
+    """Draws with the dimensions chain and draw, and their sampler statistics.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class PosteriorDraws:
     stats : xarray.Dataset
         Empty if there are none.
     noise_moved : bool
-        Whether the chain moved its noise, so that no seed gives it again.
+        Whether the chain moved its noise (``correlation``), so that no seed reproduces it.
     """
 
     posterior: xr.Dataset
@@ -33,15 +33,15 @@ class PosteriorDraws:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of chains and draws."""
+        """Number of chains and number of draws per chain."""
         return self.posterior.sizes["chain"], self.posterior.sizes["draw"]
 
     def values(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """A free variable at every draw, (draws, *shape)."""
         if name not in self.posterior:
             raise ModelError(
-                f"idata has no draws of {name!r}, on which the variable depends; its posterior "
-                f"holds {sorted(map(str, self.posterior.data_vars))}"
+                f"idata has no draws of {name!r}, on which the variable depends, got a posterior "
+                f"with {sorted(map(str, self.posterior.data_vars))}"
             )
         values = self.posterior[name].transpose(*SAMPLE_DIMS, ...).values
         if values.shape[2:] != shape:
@@ -50,15 +50,15 @@ class PosteriorDraws:
             )
         return values.reshape(-1, *shape)
 
-    def own_seeds(self, name: str) -> NDArray[np.int64] | None:
-        """The noise seed behind the estimate of every draw; None if none was stored."""
+    def stored_seeds(self, name: str) -> NDArray[np.int64] | None:
+        """The noise seed of the likelihood estimate of every draw; None if none is stored."""
         stored = f"{name}_seed"
         if self.noise_moved or stored not in self.stats:
             return None
         return self.stats[stored].transpose(*SAMPLE_DIMS).values.ravel().astype(np.int64)
 
     def dataset(self, variables: dict[str, tuple], coords: dict[str, Any]) -> xr.Dataset:
-        """Arrays (draws, ...) by name, each with its further dimensions, as (chain, draw, ...)."""
+        """Reshape arrays (draws, ...) to (chain, draw, ...), given their further dimensions."""
         arrays = {
             name: ((*SAMPLE_DIMS, *dims), values.reshape(*self.shape, *values.shape[1:]))
             for name, (dims, values) in variables.items()
@@ -67,19 +67,19 @@ class PosteriorDraws:
         return xr.Dataset(arrays, coords={**of_draws, **coords})
 
 
-def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
-    """All draws, or about `n_draws` of them, evenly from every chain."""
+def select_draws(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
+    """Select all draws, or about `n_draws` of them, evenly from every chain."""
     posterior = posterior_group(idata).transpose(*SAMPLE_DIMS, ...)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
     n_chains, length = posterior.sizes["chain"], posterior.sizes["draw"]
     if not n_chains * length:
-        raise ModelError("the posterior of idata has no draws")
-    stats = _of_the_same_draws(stats, posterior)
+        raise ModelError("idata must have draws in its posterior, got none")
+    stats = _matching_stats(stats, posterior)
     if n_draws is not None:
         if not is_integer(n_draws) or not 1 <= n_draws <= n_chains * length:
             raise ModelError(
-                f"n_draws must be an integer from 1 to {n_chains * length}, the draws that there "
-                f"are, or None for all of them; got {n_draws!r}"
+                f"n_draws must be an integer from 1 to {n_chains * length}, the number of draws, "
+                f"or None for all of them, got {n_draws!r}"
             )
         each = max(1, n_draws // n_chains)
         kept = {"draw": np.linspace(0, length - 1, each).round().astype(int)}
@@ -87,14 +87,14 @@ def draws_of(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
     return PosteriorDraws(posterior, stats, noise_was_moved(idata))
 
 
-def _of_the_same_draws(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:
-    """The statistics of these draws, which may be some of those that there were."""
+def _matching_stats(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:
+    """The statistics of the draws of `posterior`, which may be a selection of all draws."""
     labels = {dim: posterior[dim].values for dim in SAMPLE_DIMS}
     if not set(SAMPLE_DIMS) <= set(stats.dims):
         return xr.Dataset()
     if not all(np.isin(values, stats[dim]).all() for dim, values in labels.items()):
         raise ModelError(
-            "the draws of the posterior are not among those of sample_stats: their noise seeds "
-            "cannot be told. Select from the whole of idata, or drop its group sample_stats"
+            "the draws of the posterior are not among those of sample_stats, so that their noise "
+            "seeds are unknown: select from all groups of idata alike, or drop sample_stats"
         )
     return stats.sel(labels)

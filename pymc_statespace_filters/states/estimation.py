@@ -1,4 +1,4 @@
-"""States along the record: given what came before, or given the whole record."""
+"""Filtered and smoothed states at draws of the posterior."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ import xarray as xr
 
 from pymc_statespace_filters.filters.outcomes import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, smoothing_method
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.groups import state_dims, with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed
 from pymc_statespace_filters.system.record import check_at, rows_at
 
@@ -32,38 +32,40 @@ def filtered_states(
     Parameters
     ----------
     idata : xarray.DataTree
-        Draws of the posterior, whoever made them.
+        Posterior draws from any sampler.
     model : pymc.Model, optional
-        The model of the draws, if not that of the context.
+        The model of the draws; by default that of the ``with`` block.
     var_name : str, optional
-        A StateSpace variable; all of them if not given.
+        Name of a StateSpace variable; all of them by default.
     filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter, optional
-        Another filter than the variable's own.
+        A filter to use instead of the variable's own.
     at : {"observations", "steps"}
-        Which times: those of the observations, or every step from 0 to the last observation.
+        Times of the states: those of the observations, or every step from 0 to the last
+        observation.
     n_draws : int, optional
-        How many draws, spread evenly over every chain; all if not given.
+        Number of draws, spread evenly over every chain; all by default.
     random_seed : None, int or numpy.random.Generator
+        Seed of the drawn states, and of the filter's noise where none is stored.
     extend_inferencedata : bool
-        Whether `idata` gets the new group; otherwise a new DataTree has it alone.
+        Whether to add the group to `idata`; otherwise it is returned in a new DataTree.
     progressbar : bool
-        Whether work of more than two seconds shows a bar.
+        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------
     xarray.DataTree
-        With the group ``filtered_states``. For a variable "d": ``d_mean`` and ``d_sd``, the
-        state's mean and standard deviation given the parameters of the draw; ``d_states``, one
-        state drawn from that law, so that all draws together have the posterior's law of the
-        state; dims (chain, draw, d_time, state). ``d_n_effective`` (chain, draw, d_time) is the
-        effective number of particles or members that carry an estimate, infinite for a
-        deterministic filter. Where the filter failed all are NaN. Over all draws the mean is that
-        of ``d_mean``, the variance the mean of ``d_sd**2`` plus the variance of ``d_mean``.
+        With the group ``filtered_states``. For a variable "d": ``d_mean`` and ``d_sd``, mean and
+        standard deviation of the state given the parameters of the draw; ``d_states``, one state
+        drawn from that distribution, so that all draws together follow the posterior distribution
+        of the state; dims (chain, draw, d_time, state). ``d_n_effective`` (chain, draw, d_time) is
+        the effective number of particles or members, infinite for a deterministic filter. All are
+        NaN where the filter failed. Over all draws, the posterior mean is the mean of ``d_mean``,
+        and the variance is the mean of ``d_sd**2`` plus the variance of ``d_mean``.
 
     Raises
     ------
     ModelError
-        If draws, model and settings do not fit together.
+        If draws, model and settings are inconsistent.
 
     Warns
     -----
@@ -72,8 +74,8 @@ def filtered_states(
 
     Notes
     -----
-    A filter with noise takes that of the draw's own estimate (``sample_stats["d_seed"]``), and
-    fresh noise where none is stored.
+    A noisy filter uses the noise of the draw's own likelihood estimate (``sample_stats["d_seed"]``)
+    if it is stored.
 
     Examples
     --------
@@ -113,22 +115,20 @@ def smoothed_states(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Estimate states given the whole record, at draws of the posterior.
+    """Estimate states given all observations, at draws of the posterior.
 
-    Parameters and errors are those of `filtered_states`, the result is the group
-    ``smoothed_states``.
+    Parameters, errors and warnings are those of `filtered_states`.
 
     Returns
     -------
     xarray.DataTree
-        With the group ``smoothed_states``, of the form that `filtered_states` describes. A row of
-        ``d_states`` is a path: the states of one draw belong together (along ancestries, as far
-        as their lag reaches). How the filter smooths is in the attribute ``smoothing`` of
-        ``d_states``.
+        With the group ``smoothed_states``, of the same form as `filtered_states`. The states of one
+        draw in ``d_states`` are a joint path (with an ancestral smoother, within its lag). The
+        attribute ``smoothing`` of ``d_states`` names the smoothing method of the filter.
 
     See Also
     --------
-    filtered_states : Given the observations so far alone.
+    filtered_states : States given the observations up to their own time.
 
     Examples
     --------
@@ -171,10 +171,10 @@ def _add_states(
     model = pm.modelcontext(model)
     check_at(at)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         rows = rows_at(at, at_draws.steps)
         states = at_draws.states(moment, rows, rng, progressbar=progressbar)
@@ -194,4 +194,4 @@ def _add_states(
             part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)
         warn_about(variable.filter, states.health, stacklevel=4)
-    return with_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)
+    return add_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

@@ -1,4 +1,4 @@
-"""What comes after the record: states and observations, at draws of the posterior."""
+"""Forecasts of states and observations at draws of the posterior."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import continuation
 from pymc_statespace_filters.filters.outcomes import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import draws_of
-from pymc_statespace_filters.states.groups import state_dims, with_group
-from pymc_statespace_filters.states.variable import VariableAtDraws, chosen_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
 from pymc_statespace_filters.system.record import (
     check_inputs,
@@ -40,40 +40,40 @@ def forecast(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Predict states and observations after the record, at draws of the posterior.
+    """Predict states and observations after the last observation, at draws of the posterior.
 
-    A state at the last observation is drawn for each draw, and goes on from there under the
-    equations, with noise of its own.
+    For each draw, a state at the last observation is drawn and simulated forward with fresh process
+    and observation noise.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Draws of the posterior, whoever made them.
+        Posterior draws from any sampler.
     model : pymc.Model, optional
-        The model of the draws, if not that of the context.
+        The model of the draws; by default that of the ``with`` block.
     n_steps : int, optional
-        The next so many steps after the last observation. Or give `steps`, or `times`.
+        Number of steps after the last observation. Give exactly one of `n_steps`, `steps`, `times`.
     steps : array_like of int, shape (R,), optional
         Steps after the last observation, increasing.
     times : array_like, shape (R,), optional
-        Their times, on the grid ``t0 + k * dt``.
+        Times after the last observation, on the grid ``t0 + k * dt``.
     inputs : array_like, shape (rows, n_inputs), optional
-        Of the record and of the future, row k during step k; needed if the model's own end before
-        the last step.
+        Inputs from step 0 on, past and future, row k during step k; required if those of the model
+        end before the last step.
     var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar
         As in `filtered_states`.
 
     Returns
     -------
     xarray.DataTree
-        With the group ``predictions``. For a variable "d": ``d`` (chain, draw, d_time, observable),
-        simulated observations, and ``d_states`` (chain, draw, d_time, state), the path behind them.
+        With the group ``predictions``. For a variable "d": simulated observations ``d`` (chain,
+        draw, d_time, observable), and the simulated path ``d_states`` (chain, draw, d_time, state).
         NaN for a draw at which the filter failed.
 
     Raises
     ------
     ModelError
-        If draws, model and settings do not fit together.
+        If draws, model and settings are inconsistent.
 
     Warns
     -----
@@ -102,23 +102,28 @@ def forecast(
     """
     model = pm.modelcontext(model)
     rng = check_random_seed(random_seed)
-    draws = draws_of(idata, n_draws)
+    draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))
     parts = []
-    for variable in chosen_variables(model, var_name, filter):
+    for variable in select_variables(model, var_name, filter):
         name, system, (time, observable) = variable.name, variable.system, variable.dims
         at_draws = VariableAtDraws(model, variable, draws)
         last = at_draws.steps[-1:]
-        future = _future(n_steps, steps, times, int(last[0]), at_draws)
+        future = _future_steps(n_steps, steps, times, int(last[0]), at_draws)
         if inputs is not None:
             rows = pt.as_tensor(check_inputs(inputs, system, future))
             at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
-        forces = _forces(at_draws, future)
-        begin = at_draws.states("filtered", last, rng, progressbar=progressbar)
-        paths, seen = _paths(at_draws, begin.drawn[:, 0], int(last[0]), future, forces, rng)
+        input_rows = _input_rows(at_draws, future)
+        initial = at_draws.states("filtered", last, rng, progressbar=progressbar)
+        paths, simulated = _simulate(
+            at_draws, initial.drawn[:, 0], int(last[0]), future, input_rows, rng
+        )
         parts.append(
             draws.dataset(
-                {name: ((time, observable), seen), f"{name}_states": ((time, dims[name]), paths)},
+                {
+                    name: ((time, observable), simulated),
+                    f"{name}_states": ((time, dims[name]), paths),
+                },
                 {
                     time: at_draws.times(future),
                     dims[name]: list(system.states),
@@ -126,11 +131,11 @@ def forecast(
                 },
             )
         )
-        warn_about(variable.filter, begin.health, stacklevel=3)
-    return with_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
+        warn_about(variable.filter, initial.health, stacklevel=3)
+    return add_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 
-def _future(
+def _future_steps(
     n_steps: int | None, steps: Any, times: Any, last: int, at_draws: VariableAtDraws
 ) -> NDArray[np.int64]:
     """The steps to predict."""
@@ -143,37 +148,37 @@ def _future(
     future = steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
     if future[0] <= last:
         raise ModelError(
-            f"a forecast begins after the last observation, at step {last}, but step {future[0]} "
-            f"is asked for; states up to there are those of filtered_states and smoothed_states"
+            f"steps must be after the last observation, at step {last}, got {future[0]}: for "
+            "earlier states use filtered_states or smoothed_states"
         )
     return future
 
 
-def _forces(at_draws: VariableAtDraws, future: NDArray[np.int64]) -> Array:
-    """The inputs (draws or 1, rows, n_inputs), which must reach into the future."""
+def _input_rows(at_draws: VariableAtDraws, future: NDArray[np.int64]) -> Array:
+    """The inputs (draws or 1, rows, n_inputs), checked to cover the future steps."""
     system, rows = at_draws.variable.system, at_draws.inputs()
     if len(rows[0]) < n_input_rows(system, future) and system.n_inputs:
         raise ModelError(
             f"the model's inputs end after {len(rows[0])} rows, and step {future[-1]} needs "
-            f"{n_input_rows(system, future)}: give inputs= of the record and of the future"
+            f"{n_input_rows(system, future)}: give inputs= for the past and the future"
         )
     return rows
 
 
-def _paths(
+def _simulate(
     at_draws: VariableAtDraws,
-    begin: Array,
+    initial: Array,
     first: int,
     future: NDArray[np.int64],
     rows: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """States (draws, R, n) and observations (draws, R, p) after the states `begin` (draws, n)."""
-    system = at_draws.variable.system
-    theta, go_on = at_draws.parameters(), continuation(system).function
-    paths = np.full((len(begin), future.size, system.n), np.nan)
-    seen = np.full((len(begin), future.size, system.p), np.nan)
-    for i in np.flatnonzero(np.isfinite(begin).all(axis=1)):
-        one = rows[i if len(rows) > 1 else 0]
-        paths[i], seen[i] = go_on(rng, theta[i], begin[i], first, future, one, at_draws.t0)
-    return paths, seen
+    """Simulate states (draws, R, n) and observations (draws, R, p) from states (draws, n)."""
+    system, t0 = at_draws.variable.system, at_draws.t0
+    theta, simulate = at_draws.parameters(), continuation(system).function
+    paths = np.full((len(initial), future.size, system.n), np.nan)
+    observed = np.full((len(initial), future.size, system.p), np.nan)
+    for i in np.flatnonzero(np.isfinite(initial).all(axis=1)):
+        inputs = rows[i if len(rows) > 1 else 0]
+        paths[i], observed[i] = simulate(rng, theta[i], initial[i], first, future, inputs, t0)
+    return paths, observed

@@ -1,4 +1,4 @@
-"""How states are laid into a DataTree."""
+"""Dimension names and DataTree groups of states."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,8 +9,8 @@ from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 
 
 def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
-    """By variable of a model, the name of its dimension of states: a name has one list of them."""
-    # Observables come first: their dimension may have that name in the model.
+    """Name of the state dimension of each variable; variables with the same states share one."""
+    # Observables take precedence: their dimension may be called "state" in the model.
     lists = [v.system.observables for v in variables if "state" in v.dims]
     lists += [v.system.states for v in variables]
     return {
@@ -18,10 +18,10 @@ def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     }
 
 
-def with_group(
+def add_group(
     idata: xr.DataTree, name: str, group: xr.Dataset, attrs: Mapping[str, Any], extend: bool
 ) -> xr.DataTree:
-    """Put a group into `idata`, in place of one of that name, or into a DataTree of its own."""
+    """Add a group to `idata`, replacing one of that name, or return it in a new DataTree."""
     group = group.assign_attrs(attrs)
     if not extend:
         return xr.DataTree.from_dict({name: group})

@@ -1,4 +1,4 @@
-"""A state-space variable at draws of the posterior: parameters, inputs, and states by a filter."""
+"""A state-space variable at draws of the posterior: parameters, inputs, and estimated states."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -27,9 +27,9 @@ Array = NDArray[np.float64]
 
 
 class States(NamedTuple):
-    """Of every draw: mean, sd and a draw of the state (draws, R, n), effective number (draws, R).
+    """Mean, sd and a draw of the state (draws, R, n), and effective sample size (draws, R).
 
-    ``health`` (draws, 3) is what the filter met.
+    ``health`` (draws, 3) are the outcomes of the filter.
     """
 
     mean: Array
@@ -40,7 +40,7 @@ class States(NamedTuple):
 
 
 class VariableAtDraws:
-    """The numbers of one variable at draws of its model's posterior.
+    """Evaluate graphs of one variable at draws of its model's posterior.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ class VariableAtDraws:
     ) -> None:
         self.variable = variable
         self._draws = draws
-        # What a free variable depends on in the prior is no longer asked for: it has its draws.
+        # Stop at variables of the model: free ones are replaced by their draws.
         known = set(ancestors([variable.theta, variable.inputs], blockers=model.basic_RVs))
         free = [rv for rv in model.free_RVs if rv in known]
         shapes = model.eval_rv_shapes()
         self._columns = [draws.values(rv.name, tuple(map(int, shapes[rv.name]))) for rv in free]
-        # Every number of a draw is handed over as float64.
+        # Draws are passed as float64, whatever the type of the variable.
         self._symbols = [pt.tensor(rv.name, dtype="float64", shape=rv.type.shape) for rv in free]
         self._replaced = {rv: model.rvs_to_values[rv] for rv in model.observed_RVs if rv in known}
         self._replaced |= {
@@ -75,15 +75,15 @@ class VariableAtDraws:
         self.steps, self.t0 = np.asarray(steps, dtype=np.int64), float(t0)
 
     def times(self, rows: NDArray[np.int64]) -> Array:
-        """The times of steps."""
+        """Times of the given steps."""
         return np.asarray(self.t0 + rows * self.variable.system.dt, dtype=np.float64)
 
     def parameters(self) -> Array:
-        """The flat parameters of every draw, (draws, k)."""
+        """Flat parameters at every draw, (draws, k)."""
         return self.evaluate([self.variable.theta], {})[0]
 
     def inputs(self) -> Array:
-        """The rows of inputs of every draw, (draws or 1, rows, n_inputs)."""
+        """Input rows at every draw, (draws or 1, rows, n_inputs)."""
         graph = self.variable.inputs
         if set(self._replaced) & set(ancestors([graph])):
             return self.evaluate([graph], {})[0]
@@ -92,14 +92,14 @@ class VariableAtDraws:
     def states(
         self, moment: str, rows: NDArray[np.int64], rng: np.random.Generator, *, progressbar: bool
     ) -> States:
-        """States at steps `rows` by the variable's filter, with the noise of each draw's estimate.
+        """States at steps `rows`, with the noise of each draw's likelihood estimate.
 
-        Where none is stored the noise is fresh.
+        Fresh noise is used where no seed is stored.
         """
         seed, draw_seed, row_steps = pt.lscalar("seed"), pt.lscalar("draw_seed"), pt.lvector("rows")
         graphs = states_of(self.variable._replace(seed=seed), moment, row_steps, draw_seed)
         n_draws = int(np.prod(self._draws.shape))
-        seeds = self._draws.own_seeds(self.variable.name) if self.variable.filter.noisy else None
+        seeds = self._draws.stored_seeds(self.variable.name) if self.variable.filter.noisy else None
         fresh = rng.integers(np.iinfo(np.int64).max, size=(2, n_draws))
         drawn = {seed: fresh[0] if seeds is None else seeds, draw_seed: fresh[1]}
         results = self.evaluate(graphs, drawn, {row_steps: rows}, progressbar=progressbar)
@@ -114,10 +114,10 @@ class VariableAtDraws:
         task: str = "states",
         progressbar: bool = False,
     ) -> list[Array]:
-        """Evaluate graphs at every draw; further inputs have a number a draw, or one for all."""
+        """Evaluate graphs at every draw; `drawn` inputs vary over draws, `constant` ones do not."""
         constant = constant or {}
         bound = clone_replace(list(graphs), self._replaced)
-        # Its number is a column of every draw, even of those that differ in nothing else.
+        # The index of the draw makes sure that there is at least one varying input.
         inputs = [pt.lscalar("number"), *self._symbols, *drawn, *constant]
         function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
         columns = [np.arange(np.prod(self._draws.shape)), *self._columns, *drawn.values()]
@@ -130,14 +130,14 @@ class VariableAtDraws:
         return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
 
 
-def chosen_variables(
+def select_variables(
     model: pm.Model, name: str | None, filter: Any = None
 ) -> list[StateSpaceVariable]:
-    """The observed variable of a name, or all of them; read by another filter if one is given."""
+    """The observed variable of a name, or all of them, optionally with another filter."""
     found = {variable.name: variable for variable in observed_variables(model)}
     if not found:
-        raise ModelError("the model has no observed StateSpace variable")
-    if name is not None and name not in list(found):  # a list cannot be looked up
+        raise ModelError("model must have an observed StateSpace variable, got none")
+    if name is not None and name not in list(found):  # `in found` fails for unhashable names
         raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
     chosen = list(found.values()) if name is None else [found[name]]
     return chosen if filter is None else [with_other_filter(v, filter) for v in chosen]

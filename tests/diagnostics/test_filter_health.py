@@ -68,7 +68,7 @@ def test_the_group_has_its_dimensions_and_gaps_of_the_record():
     assert list(found["observable"].values) == ["position", "speed"]
     np.testing.assert_array_equal(found["d_time"], STEPS)
     assert found["d_failed"] == found["d_collapsed"] == 0
-    assert "given the whole record" in found.attrs["predictions"]
+    assert "given all observations" in found.attrs["predictions"]
 
 
 def test_a_right_model_passes(long_record):

@@ -6,7 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics import cross_validation as module
-from pymc_statespace_filters.diagnostics.truncated_data import record_of, shortened
+from pymc_statespace_filters.diagnostics.truncated_data import observed_values, truncate_data
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.diagnostics.records import (
@@ -49,7 +49,7 @@ def refit():
     """Exact draws for the record that a model has seen, and how long those were."""
 
     def draws(model):
-        seen = np.flatnonzero(~np.isnan(record_of(model, "d")).any(axis=1))
+        seen = np.flatnonzero(~np.isnan(observed_values(model, "d")).any(axis=1))
         lengths.append(seen.size)
         np.testing.assert_array_equal(seen, np.delete(np.arange(STEPS.size), MISSING)[: seen.size])
         return posterior_draws(int(seen[-1]) + 1, np.random.default_rng(2))
@@ -120,7 +120,7 @@ def test_draws_of_an_unbiased_filter_for_a_shorter_record(noisy):
 
 def test_what_the_draws_cannot_tell_is_missing(exact):
     few = posterior_draws(STEPS.size, np.random.default_rng(1), (2, 50))
-    with pytest.warns(EvidenceWarning, match=r"cannot tell \d+ of the 21 scores") as caught:
+    with pytest.warns(EvidenceWarning, match=r"\d+ of the 21 scores are NaN") as caught:
         found = psf.leave_future_out(few, exact, min_observations=2)
     assert caught[0].filename == __file__
     unknown = found.pareto_k > found.good_k
@@ -128,7 +128,7 @@ def test_what_the_draws_cannot_tell_is_missing(exact):
     assert np.isnan(found.elpd)
     assert found.warning
     enough = 2 + int(np.flatnonzero(unknown)[-1]) + 1
-    assert f"take min_observations={enough}, or" in str(caught[0].message)
+    assert f"set min_observations={enough}, or" in str(caught[0].message)
     assert np.isfinite(psf.leave_future_out(few, exact, min_observations=enough).elpd)
 
 
@@ -153,10 +153,10 @@ def test_models_are_compared_by_arviz(exact, idata):
 
 
 def test_a_shortened_model_differs_by_its_record_alone(noisy):
-    short = shortened(noisy, "d", 10)
-    np.testing.assert_array_equal(record_of(short, "d")[:10, 0], record()[:10])
-    assert np.isnan(record_of(short, "d")[10:]).all()
-    np.testing.assert_array_equal(record_of(noisy, "d")[:, 0], record())
+    short = truncate_data(noisy, "d", 10)
+    np.testing.assert_array_equal(observed_values(short, "d")[:10, 0], record()[:10])
+    assert np.isnan(observed_values(short, "d")[10:]).all()
+    np.testing.assert_array_equal(observed_values(noisy, "d")[:, 0], record())
     assert short.coords == noisy.coords
     assert noise_seeds(short).keys() == {"d"}
     prior, point = short.compile_logp(vars=[short["phi"]]), {"phi": 0.5}

@@ -78,7 +78,7 @@ def test_they_have_the_dimensions_and_coordinates_of_the_draws_and_the_record(id
 def test_they_say_that_they_are_sequential(terms, tmp_path):
     text = terms["d"].attrs["terms"]
     assert "d_1 .. d_{j-1}" in text
-    assert "not leave-one-out" in text
+    assert "is invalid with such terms" in text
     terms.to_dataset().to_netcdf(tmp_path / "terms.nc")
 
 

@@ -12,7 +12,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior.draws import posterior_of
+from pymc_statespace_filters.evidence.posterior.draws import build_posterior
 from tests.evidence import double_well
 from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
@@ -64,7 +64,7 @@ class Sampled:
                 random_seed=run,
                 progressbar=False,
             )
-            self._posteriors[run] = posterior_of(idata, self._density)[0]
+            self._posteriors[run] = build_posterior(idata, self._density)[0]
         return self._posteriors[run]
 
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence, average_models, compare_evidence
-from pymc_statespace_filters.evidence.comparison.averaging import _counts
+from pymc_statespace_filters.evidence.comparison.averaging import _systematic_counts
 
 X = xr.DataArray([-1.0, 0.5, 2.0], dims="x", coords={"x": [-1.0, 0.5, 2.0]})
 
@@ -131,7 +131,7 @@ def test_same_seed_same_average():
 
 def test_numbers_of_draws_are_systematic():
     prob, rng = np.array([0.36, 0.29, 0.35]), np.random.default_rng(4)
-    counts = np.array([_counts(prob, 10, rng) for _ in range(2000)])
+    counts = np.array([_systematic_counts(prob, 10, rng) for _ in range(2000)])
     assert (counts.sum(axis=1) == 10).all()
     assert (np.abs(counts - 10 * prob) < 1).all()
     # On average as probable: standard deviations below 1/2, so that the errors are below 0.012.
@@ -192,17 +192,17 @@ def test_arviz_takes_it_and_it_can_be_stored(tmp_path):
     [
         ({"idatas": {}}, "idatas must be a mapping of model names to DataTree"),
         ({"idatas": {"a": 3}}, r"idatas\['a'\] must be a DataTree with a group 'posterior'"),
-        ({"weights": {"a": 1}}, r"exactly the models \['a', 'b'\], got those of \['a'\]"),
-        ({"weights": {"a": 1, "b": 1, "c": 1}}, r"got those of \['a', 'b', 'c'\]"),
+        ({"weights": {"a": 1}}, r"exactly the models \['a', 'b'\], got \['a'\]"),
+        ({"weights": {"a": 1, "b": 1, "c": 1}}, r"got \['a', 'b', 'c'\]"),
         ({"weights": {"a": 1, "b": -1}}, "weights must be finite and >= 0.*'b': "),
         ({"weights": {"a": 0, "b": 0}}, "one of them > 0"),
         ({"weights": [1, 1]}, "weights must be the table of compare_evidence or a mapping"),
         (
             {"weights": compare_evidence({"a": evidence(-9, np.nan), "b": evidence(-8, 0.1)})},
-            "no standard error for 'a': pass dict",
+            "standard error for every model, got NaN for 'a': pass dict",
         ),
         ({"function": {"a": slope}}, r"function must be given for exactly the models"),
-        ({"function": lambda posterior: 3.0}, "must return a DataArray.*'a' it returned 3.0"),
+        ({"function": lambda posterior: 3.0}, "must return a DataArray.* got 3.0 for model 'a'"),
         ({"function": lambda posterior: posterior["k"].mean("chain")}, "'chain' and 'draw'"),
         ({"function": lambda posterior: posterior["k"].expand_dims(model=1)}, "without 'model'"),
         ({"function": {"a": slope, "b": line}}, "for 'a' and 'b' arrays of different dims"),
@@ -233,8 +233,8 @@ def test_an_error_inside_the_function_names_the_model():
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("k", "function must be callable, for model 'a' it is 'k'"),
-        (lambda post: post["k"].isel(draw=slice(0)), "returned no draws for model 'a'"),
+        ("k", "function must be callable, got 'k' for model 'a'"),
+        (lambda post: post["k"].isel(draw=slice(0)), "must return draws, got none for model 'a'"),
         (lambda post: post["k"].assign_coords(model="mine"), "without 'model'"),
     ],
 )

@@ -11,7 +11,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.checks import discretisation, doubts_of_steps
+from pymc_statespace_filters.evidence.checks import discretisation
+from pymc_statespace_filters.evidence.checks.discretisation import check_discretisation
 from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps
@@ -47,7 +48,7 @@ def near(*modes, sd=0.1):
 
 
 def doubts(model, idata):
-    return list(doubts_of_steps(model, idata, unconstrained_draws(idata, model)))
+    return list(check_discretisation(model, idata, unconstrained_draws(idata, model)))
 
 
 @pytest.mark.parametrize(("substeps", "mirror"), [(1, -19.0), (2, -39.0)])
@@ -70,7 +71,7 @@ def test_other_filters_are_judged_by_the_ekf():
 
 def test_all_draws_may_lie_there():
     (doubt,) = doubts(linear_model(linear()), near(-19.0))
-    assert doubt.startswith("100% of the draws owe")
+    assert doubt.startswith("100% of the draws have a likelihood due")
 
 
 @pytest.mark.parametrize(("a", "n", "size"), [(-1.0, 10, 100), (-6.0, 1, 100), (-9.0, 1, 2000)])

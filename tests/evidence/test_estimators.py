@@ -6,11 +6,15 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
+from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.agreement import agreement_of
+from pymc_statespace_filters.evidence.agreement import assess_agreement
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS, EvidenceEstimates
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
 from tests.evidence.test_models import REGRESSION, exact_draws
 
 ALL = tuple(ESTIMATORS)
@@ -67,10 +71,55 @@ def test_a_single_name_will_do(idata, model):
     assert name == "chib_jeliazkov"
 
 
-@pytest.mark.parametrize("names", [[], ["bridge", "harmonic_mean"]])
-def test_unknown_names(idata, model, names):
-    with pytest.raises(ModelError, match=r"estimators must name at least one of \['chib_j"):
-        psf.estimate_evidence(idata, model, estimators=names)
+@pytest.mark.parametrize(
+    ("estimators", "message"),
+    [
+        ([], r"estimators must have at least one of \['chib_j.*got \[\]"),
+        (["bridge", "harmonic_mean"], r"names among \['chib_j.* objects, got 'harmonic_mean'"),
+        (["bridge", 3], "or Estimator objects, got 3"),
+        (["bridge", Bridge()], "must have different names, got 'bridge' more than once"),
+    ],
+)
+def test_unknown_estimators(idata, model, estimators, message):
+    with pytest.raises(ModelError, match=message):
+        psf.estimate_evidence(idata, model, estimators=estimators)
+
+
+class LaplaceFromDraws:
+    """An estimator outside the package: a Gaussian with the moments of the draws."""
+
+    name = "laplace_from_draws"
+
+    def n_evaluations(self, posterior):
+        return 1
+
+    def estimate(self, posterior, *, rng):
+        draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
+        normal = multivariate_normal(draws.mean(axis=0), np.cov(draws.T))
+        (at_mean,) = posterior.evaluate(normal.mean[np.newaxis], rng)
+        log_evidence = at_mean - normal.logpdf(normal.mean)
+        return Estimate(float(log_evidence), 0.1, {"n_draws": len(draws)}, ("a rough check",))
+
+
+def test_an_estimator_from_outside(idata, model):
+    idata = xr.DataTree.from_dict({"posterior": idata["posterior"].to_dataset()})
+    with pytest.warns(EvidenceWarning, match="a rough check"):
+        found = psf.estimate_evidence(
+            idata, model, estimators=["bridge", LaplaceFromDraws()], random_seed=5
+        )
+    assert list(found) == ["bridge", "laplace_from_draws"]
+    evidence = found["laplace_from_draws"]
+    assert evidence.log_evidence == pytest.approx(REGRESSION.log_evidence, abs=0.1)
+    assert evidence.doubts == "a rough check"
+    assert idata["evidence"]["n_draws"].sel(estimator="laplace_from_draws") == 4000
+    alone = psf.estimate_evidence(
+        idata, model, estimators=Bridge(), random_seed=5, extend_inferencedata=False
+    )
+    assert alone["bridge"] == found["bridge"]
+
+
+def test_every_built_in_estimator_satisfies_the_protocol():
+    assert all(isinstance(estimator, Estimator) for estimator in ESTIMATORS.values())
 
 
 def test_a_missing_mode_is_found_by_whoever_needs_no_draws():
@@ -101,43 +150,43 @@ def estimates(**values):
 
 class TestAgreement:
     def test_chi_square_by_hand(self):
-        found = agreement_of(estimates(bridge=(-10.0, 0.3), importance=(-10.8, 0.4)))
+        found = assess_agreement(estimates(bridge=(-10.0, 0.3), importance=(-10.8, 0.4)))
         assert found.p_value == pytest.approx(0.10960, abs=1e-5)  # z = 0.8 / 0.5 = 1.6
         assert found.difference == pytest.approx(0.8)
         assert found
 
     def test_what_no_choice_depends_on_is_agreement(self):
-        assert agreement_of(estimates(bridge=(-10.0, 0.001), importance=(-10.04, 0.001)))
+        assert assess_agreement(estimates(bridge=(-10.0, 0.001), importance=(-10.04, 0.001)))
 
     def test_estimates_without_errors_take_no_part(self):
         found = estimates(bridge=(-10.0, 0.01), laplace=(-12.0, np.nan))
         assert found.agreement
-        assert "nothing to compare it with" in repr(found)
+        assert "agreement not tested" in repr(found)
 
     def test_an_error_of_zero(self):
-        assert agreement_of(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
+        assert assess_agreement(estimates(bridge=(-10.0, 0.0), importance=(-10.0, 0.0)))
 
     def test_of_three_the_pair_furthest_apart_in_its_errors_is_named(self):
         found = estimates(bridge=(-10.0, 0.01), importance=(-10.5, 0.01), tempered_smc=(-9.0, 1.0))
-        assert found.agreement.reading.startswith("bridge is 0.50 above importance; ")
+        assert found.agreement.diagnosis.startswith("bridge is 0.50 above importance; ")
 
     @pytest.mark.parametrize(
-        ("values", "reading"),
+        ("values", "diagnosis"),
         [
             ({"bridge": (-10.0, 0.01), "tempered_smc": (-9.0, 0.1)}, "not visited all"),
             ({"bridge": (-10.0, 0.01), "tempered_smc": (-11.0, 0.1)}, "missed a narrow peak"),
             ({"bridge": (-10.0, 0.01), "importance": (-11.0, 0.1)}, "draws are too few"),
             (
                 {"prior_monte_carlo": (-10.0, 0.01), "tempered_smc": (-11.0, 0.1)},
-                "too narrow in its prior",
+                "too narrow relative to the prior",
             ),
         ],
     )
-    def test_readings(self, values, reading):
+    def test_diagnoses(self, values, diagnosis):
         found = estimates(**values)
         assert not found.agreement
-        assert reading in found.agreement.reading
-        assert reading in repr(found)
+        assert diagnosis in found.agreement.diagnosis
+        assert diagnosis in repr(found)
 
 
 def test_a_long_doubt_does_not_hide_the_errors():

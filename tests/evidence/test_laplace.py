@@ -92,7 +92,7 @@ def test_a_rugged_log_density_is_a_doubt():
 
 def test_a_noisy_likelihood_has_no_mode():
     posterior = gaussian(2, (2, 500), np.random.default_rng(36), noise_sd=0.1)
-    with pytest.raises(ModelError, match="neither mode nor curvature; use chib_jeliazkov"):
+    with pytest.raises(ModelError, match=r"deterministic log-density.*use chib_jeliazkov"):
         laplace(posterior)
 
 
@@ -110,7 +110,7 @@ def test_a_climb_without_end(slope):
 
     draws = np.random.default_rng(38).standard_normal((2, 500, 1))
     posterior = Posterior(draws, log_density(draws), lambda x, rng: log_density(x))
-    with pytest.raises(ModelError, match="goes on growing, or levels off"):
+    with pytest.raises(ModelError, match="increases or levels off"):
         laplace(posterior)
 
 
@@ -123,7 +123,7 @@ def test_a_cusp_is_no_mode():
     rng = np.random.default_rng(41)
     draws = rng.exponential(1 / 3, (2, 500, 1)) - rng.exponential(1, (2, 500, 1))
     posterior = Posterior(draws, log_density(draws), lambda x, rng: log_density(x))
-    with pytest.raises(ModelError, match=r"curvature is \d.* and the gradient"):
+    with pytest.raises(ModelError, match=r"curvature is \d.* and the largest gradient"):
         laplace(posterior)
 
 

@@ -88,7 +88,9 @@ def test_var_names():
     both = {"m1": idata(a=LEVELS, b=LEVELS), "m2": idata(a=LEVELS, c=LEVELS)}
     assert list(marginal_modes(both, var_names="b").columns) == ["b"]
     assert set(marginal_modes(both, var_names=["c", "a"]).columns) == {"a", "c"}
-    with pytest.raises(ModelError, match=r"var_names has \['d'\], .* they hold \['a', 'b', 'c'\]"):
+    with pytest.raises(
+        ModelError, match=r"var_names must be among \['a', 'b', 'c'\], .*got \['d'\]"
+    ):
         marginal_modes(both, var_names=["a", "d"])
 
 

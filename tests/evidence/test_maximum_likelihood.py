@@ -11,7 +11,7 @@ from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_VALUING,
     max_log_likelihood,
 )
-from pymc_statespace_filters.evidence.estimators.newton import climb
+from pymc_statespace_filters.evidence.estimators.newton import newton_maximize
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.targets import (
     Banana,
@@ -52,7 +52,7 @@ def test_hundreds_of_parameters_need_no_hessian():
         largest_call = max(largest_call, len(x))
         return regression.log_likelihood(x)
 
-    found = climb(log_likelihood, np.zeros(200))
+    found = newton_maximize(log_likelihood, np.zeros(200))
     assert largest_call == 400
     np.testing.assert_allclose(found.point, point, atol=1e-4)
     assert found.value == pytest.approx(value, abs=1e-6)

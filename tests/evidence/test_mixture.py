@@ -10,10 +10,10 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
-    _maximised,
+    _m_step,
     choose_mixture,
-    fitted_mixture,
-    scattered,
+    fit_mixture,
+    place_components,
 )
 from tests.evidence.analytic import gaussian
 from tests.evidence.targets import Banana, TwoModes
@@ -49,7 +49,7 @@ def test_an_affine_map_changes_the_density_by_its_determinant():
     mixture, rng = some_mixture(), np.random.default_rng(43)
     mean, chol = rng.standard_normal(4), np.diag([1e-6, 1.0, 3.0, 1e6]) + np.tril(np.ones(4), -1)
     x = rng.standard_normal((20, 4))
-    moved = mixture.mapped(mean, chol).log_density(mean + x @ chol.T)
+    moved = mixture.affine(mean, chol).log_density(mean + x @ chol.T)
     expected = mixture.log_density(x) - np.log(np.diag(chol)).sum()
     np.testing.assert_allclose(moved, expected, rtol=1e-6)
 
@@ -58,12 +58,12 @@ def test_steps_of_em_never_lower_the_density_of_the_draws():
     """But for what the components borrow, nothing beside so many draws."""
     rng = np.random.default_rng(44)
     x = some_mixture().sample(4000, rng)
-    mixture, reached = scattered(x, 3, rng), []
+    mixture, reached = place_components(x, 3, rng), []
     for _ in range(30):
         log_joint = mixture.log_joint(x)
         log_density = np.logaddexp.reduce(log_joint)
         reached.append(log_density.mean())
-        mixture = _maximised(mixture, x, np.exp(log_joint - log_density))
+        mixture = _m_step(mixture, x, np.exp(log_joint - log_density))
     assert np.min(np.diff(reached)) > -1e-3
     assert reached[-1] > reached[0] + 0.3
 
@@ -72,7 +72,7 @@ def test_the_law_that_made_the_draws_is_where_em_stays():
     """Its 44 parameters follow 4000 draws by 44 / 8000 nats, give or take."""
     mixture = some_mixture()
     x = mixture.sample(4000, np.random.default_rng(44))
-    gain = fitted_mixture(x, mixture).log_density(x).mean() - mixture.log_density(x).mean()
+    gain = fit_mixture(x, mixture).log_density(x).mean() - mixture.log_density(x).mean()
     assert 0 < gain < 0.015
 
 

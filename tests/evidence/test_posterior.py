@@ -8,9 +8,9 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence import chib_jeliazkov
-from pymc_statespace_filters.evidence.checks import doubts_of_draws
+from pymc_statespace_filters.evidence.checks.convergence import check_convergence
 from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, posterior_of
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, build_posterior
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
@@ -65,7 +65,7 @@ def test_unconstrained_draws_follow_the_transforms(idata, model):
 
 
 def test_log_density_is_that_of_the_model_with_jacobians(idata, model, density):
-    posterior, noise = posterior_of(idata, density)
+    posterior, noise = build_posterior(idata, density)
     names = [model.rvs_to_values[rv].name for rv in model.free_RVs]
     x = posterior.draws[1, 7]
     parts = np.split(x, np.cumsum([1, 1, 1, 2]))
@@ -122,7 +122,7 @@ def test_discrete_variables_are_refused():
     with pm.Model() as model:
         count = pm.Poisson("count", 3)
         pm.Normal("y", count, 1, observed=DATA)
-    with pytest.raises(ModelError, match=r"\['count'\] are discrete"):
+    with pytest.raises(ModelError, match=r"got discrete \['count'\]"):
         ModelDensity(model)
 
 
@@ -133,20 +133,20 @@ class TestStoredLogDensity:
 
     @pytest.mark.parametrize("name", ["lp", "logp"])
     def test_is_used(self, idata, density, name):
-        log_density = posterior_of(idata, density)[0].log_density
+        log_density = build_posterior(idata, density)[0].log_density
         marked = log_density + 1e-6
-        found, _ = posterior_of(self.stored(idata, marked, name), density)
+        found, _ = build_posterior(self.stored(idata, marked, name), density)
         np.testing.assert_array_equal(found.log_density, marked)
 
     def test_of_other_data_is_an_error(self, idata, density):
-        log_density = posterior_of(idata, density)[0].log_density
+        log_density = build_posterior(idata, density)[0].log_density
         with pytest.raises(DataMismatchError, match="another model, other data"):
-            posterior_of(self.stored(idata, log_density + 0.1), density)
+            build_posterior(self.stored(idata, log_density + 0.1), density)
 
     def test_of_several_step_methods_is_recomputed(self, idata, density):
-        log_density = posterior_of(idata, density)[0].log_density
+        log_density = build_posterior(idata, density)[0].log_density
         columns = np.stack([log_density - 1, log_density - 2], axis=-1)
-        found, _ = posterior_of(self.stored(idata, columns), density)
+        found, _ = build_posterior(self.stored(idata, columns), density)
         np.testing.assert_array_equal(found.log_density, log_density)
 
 
@@ -167,17 +167,17 @@ def test_what_is_no_idata_is_said(idata, model, wrong, message):
 
 
 def test_zeros_that_several_step_methods_leave_are_no_log_density(idata, model, density):
-    expected = posterior_of(idata, density)[0].log_density
+    expected = build_posterior(idata, density)[0].log_density
     idata["sample_stats"] = xr.DataTree(xr.Dataset({"lp": (("chain", "draw"), np.zeros((2, 30)))}))
-    np.testing.assert_array_equal(posterior_of(idata, density)[0].log_density, expected)
+    np.testing.assert_array_equal(build_posterior(idata, density)[0].log_density, expected)
     moved = ModelDensity(model, moved=True)
     with pytest.raises(DataMismatchError, match="all variables by one DRAM step"):
-        posterior_of(idata, moved)
+        build_posterior(idata, moved)
 
 
 def test_a_parameter_that_does_not_vary_hides_no_disagreement():
     values = np.random.default_rng(1).standard_normal((2, 100, 2))
     values[..., 0] = 1.0
     values[1, :, 1] += 10
-    (doubt,) = doubts_of_draws(Posterior(values, values[..., 1], lambda x, rng: x[:, 1]))
+    (doubt,) = check_convergence(Posterior(values, values[..., 1], lambda x, rng: x[:, 1]))
     assert "the chains disagree" in doubt

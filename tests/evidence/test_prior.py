@@ -90,14 +90,14 @@ def test_the_generator_decides_the_draws(model):
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (lambda: pm.Flat("free"), "the prior of free is improper and cannot be drawn from"),
+        (lambda: pm.Flat("free"), "the prior of free is improper and cannot be sampled"),
         (
             lambda: pm.Normal("free", shape=2, transform=ordered, initval=[0, 1]),
-            "the prior of free cannot be drawn from: its transform leaves out a part",
+            "the prior of free cannot be sampled: its transform excludes a part",
         ),
         (
             lambda: pm.CustomDist("free", 1.0, logp=lambda value, mu: -((value - mu) ** 2)),
-            "the prior cannot be drawn from: .*_free'",
+            "the prior cannot be sampled: .*_free'",
         ),
         (
             lambda: pm.Beta("free", 1e-3, 1e-3),

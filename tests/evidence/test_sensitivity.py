@@ -17,7 +17,7 @@ from pymc_statespace_filters import (
     prior_sensitivity,
 )
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.comparison.scaled_prior import StretchedPrior
+from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.evidence.analytic import Regression
 
@@ -123,7 +123,7 @@ class TestWidths:
         for name, own in (("line", 0.01), ("plane", 0.02)):
             rival = rivals[name]
             draws = rival.idata["posterior"].to_dataset()
-            of_width = StretchedPrior(rival.model, ["w"]).reweighted(draws, 0.5)
+            of_width = ScaledPrior(rival.model, ["w"]).reweighted(draws, 0.5)
             assert of_width.error > own / 2
             assert se.sel(model=name, width=0.5) == pytest.approx(np.hypot(own, of_width.error))
         weights = curves["width_log_evidence"] + np.log([[1], [2]])
@@ -176,7 +176,7 @@ class TestWhatIsRefused:
     @pytest.mark.parametrize("name", ["exponents", "widths"])
     @pytest.mark.parametrize("given", [[], 3, [[1, 2]], [1, math.nan], "abc", [1, "x"]])
     def test_grids(self, name, given):
-        with pytest.raises(ModelError, match=rf"{name} must be finite numbers in one dimension"):
+        with pytest.raises(ModelError, match=rf"{name} must be one-dimensional finite numbers"):
             curves_of({"line": Rival(2, 1)}, **{name: given})
 
     def test_widths_that_are_not_positive(self):
@@ -185,26 +185,24 @@ class TestWhatIsRefused:
 
     def test_widths_without_models(self):
         for keywords in ({"widths": [1, 2]}, {"var_names": "w"}):
-            with pytest.raises(ModelError, match="widths and var_names need models"):
+            with pytest.raises(ModelError, match="models must be given with widths or var_names"):
                 prior_sensitivity(RIVALS, **keywords)
 
     def test_widths_without_draws(self):
         models = {"small": pm.Model(), "large": pm.Model()}
         for given in (RIVALS, compare_evidence(RIVALS)):
-            with pytest.raises(ModelError, match=r"evidences must be DataTrees .* not so \['"):
+            with pytest.raises(ModelError, match=r"evidences must be DataTrees .* got none of \['"):
                 prior_sensitivity(given, models=models)
 
     def test_models_of_other_names(self):
         rival = Rival(2, 1)
-        with pytest.raises(
-            ModelError, match=r"models must give a pm.Model to exactly .*\['line'\]"
-        ):
+        with pytest.raises(ModelError, match=r"models must map exactly .*\['line'\] to pm.Model"):
             prior_sensitivity({"line": rival.idata}, models={"lime": rival.model})
-        with pytest.raises(ModelError, match=r"models must give a pm.Model to exactly"):
+        with pytest.raises(ModelError, match=r"models must map exactly the names"):
             prior_sensitivity({"line": rival.idata}, models={"line": 3})
 
     def test_unknown_variables(self):
-        with pytest.raises(ModelError, match=r"var_names has \['v'\], free variables of no model"):
+        with pytest.raises(ModelError, match=r"var_names must be free variables .*got \['v'\]"):
             curves_of({"line": Rival(2, 1)}, var_names=["w", "v"])
 
     def test_a_model_of_other_draws(self):
@@ -214,9 +212,9 @@ class TestWhatIsRefused:
 
     def test_a_table_of_something_else(self):
         table = compare_evidence(RIVALS)
-        with pytest.raises(ModelError, match=r"columns \['se', 'prior'\] are missing"):
+        with pytest.raises(ModelError, match=r"without the columns \['se', 'prior'\]"):
             prior_sensitivity(table.drop(columns=["se", "prior"]))
-        with pytest.raises(ModelError, match="estimator was chosen when the table was made"):
+        with pytest.raises(ModelError, match="estimator must not be given with a table"):
             prior_sensitivity(table, estimator="bridge")
 
     def test_arguments_of_compare_evidence(self):

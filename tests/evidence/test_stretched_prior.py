@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import halfnorm, multivariate_normal, norm, uniform
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.comparison.scaled_prior import StretchedPrior, reweigh
+from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior, average_ratios
 from tests.evidence.analytic import Regression, autoregressive
 
 SHAPE = (4, 1000)
@@ -51,14 +51,14 @@ def test_errors_are_honest_on_a_regression():
     target = Regression(3, 8, rng, sd=2.0)
     with pm.Model() as model:
         pm.Normal("w", 0, target.scale, shape=3)
-    prior = StretchedPrior(model, ["w"])
+    prior = ScaledPrior(model, ["w"])
     widths = [0.3, 0.7, 1.4, 3.0]
     exact = [exact_log_evidence(target, width) - target.log_evidence for width in widths]
     z = []
     for _ in range(60):
         draws = posterior(w=target.posterior((4, 500), rng, correlation=0.5).draws)
         found = [prior.reweighted(draws, width) for width in widths]
-        assert all(one.is_known and one.beyond == 0 for one in found)
+        assert all(one.is_reliable and one.beyond == 0 for one in found)
         z.append([(one.log_ratio - e) / one.error for one, e in zip(found, exact, strict=True)])
     squares = np.square(z).mean(axis=0)
     assert (np.abs(squares - 1) < 4 * np.sqrt(2 / 60)).all(), squares
@@ -71,10 +71,10 @@ def exact_log_evidence(target, width):
 
 
 def check(target, model, stretched, width):
-    found = StretchedPrior(model, ["x"]).reweighted(
+    found = ScaledPrior(model, ["x"]).reweighted(
         posterior(x=target.draws(np.random.default_rng(2))), width
     )
-    assert found.is_known, found
+    assert found.is_reliable, found
     unseen = 1 / 4000  # what no draw has met is in no error
     assert abs(found.log_ratio - target.log_ratio(stretched)) < 4 * found.error + unseen
     return found
@@ -128,26 +128,26 @@ def test_what_lies_beyond_the_bounds_is_not_guessed():
     with pm.Model() as model:
         pm.Uniform("x", 0, 1.3)
     draws = posterior(x=target.draws(np.random.default_rng(2)))
-    prior = StretchedPrior(model, ["x"])
+    prior = ScaledPrior(model, ["x"])
     wide = prior.reweighted(draws, 1.5)
     assert wide.beyond > 0.31 / 0.69
-    assert not wide.is_known
+    assert not wide.is_reliable
     with pm.Model() as mirrored:
         pm.Uniform("x", -1.3, 0)
-    mirror_image = StretchedPrior(mirrored, ["x"]).reweighted(-draws, 1.5)
+    mirror_image = ScaledPrior(mirrored, ["x"]).reweighted(-draws, 1.5)
     assert mirror_image.beyond == pytest.approx(wide.beyond)
     check(target, model, uniform(0, 0.65 * 1.6), 0.8)  # narrower is known
     # None of the draws is left.
     nothing = prior.reweighted(draws, 0.01)
     assert nothing.log_ratio == -np.inf
-    assert not nothing.is_known
+    assert not nothing.is_reliable
 
 
 def test_truncated_priors_are_stretched_from_their_only_end():
     with pm.Model() as model:
         pm.TruncatedNormal("x", 1.0, 0.7, lower=0.5)
     x = np.random.default_rng(3).uniform(0.6, 1.4, SHAPE)
-    found = StretchedPrior(model, ["x"]).reweighted(posterior(x=x), 2.0)
+    found = ScaledPrior(model, ["x"]).reweighted(posterior(x=x), 2.0)
     ratio = norm.pdf(0.5 + (x - 0.5) / 2, 1, 0.7) / 2 / norm.pdf(x, 1, 0.7)
     assert found.log_ratio == pytest.approx(np.log(ratio.mean()), abs=1e-12)
     assert found.beyond == 0
@@ -169,7 +169,7 @@ def test_dependent_priors_are_stretched_given_what_they_depend_on():
         (["mu"], 1.3, 4 * 1.69 + 1 + 1),
         (["mu", "theta"], 0.5, 1 + 0.25 + 1),
     ]:
-        found = StretchedPrior(model, names).reweighted(given, width)
+        found = ScaledPrior(model, names).reweighted(given, width)
         exact = norm.logpdf(y, 0, variance**0.5) - actual
         assert abs(found.log_ratio - exact) < 4 * found.error < 0.1, (names, width)
 
@@ -184,7 +184,7 @@ def test_vectors_of_every_shape():
         pm.Uniform("u", [0.0, -1.0], [4.0, 5.0], dims="place")
     v, m = rng.standard_normal((*SHAPE, 2)), rng.standard_normal((*SHAPE, 2, 3))
     u = np.full((*SHAPE, 2), 2.0)
-    found = StretchedPrior(model, ["v", "m", "u"]).reweighted(posterior(v=v, m=m, u=u), 0.8)
+    found = ScaledPrior(model, ["v", "m", "u"]).reweighted(posterior(v=v, m=m, u=u), 0.8)
     wide, actual = (multivariate_normal([1, 2], f * cov).logpdf(v) for f in (0.64, 1))
     centres = np.array([[0.0], [1.0]])
     wide_m, actual_m = (norm.logpdf(m, centres, s).sum((-1, -2)) for s in (1.6, 2.0))
@@ -195,37 +195,37 @@ def test_vectors_of_every_shape():
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (lambda: pm.Flat("x"), "improper and has no width"),
-        (lambda: pm.HalfFlat("x"), "improper and has no width"),
-        (lambda: pm.Beta("x", 2, 2), "cannot be stretched"),
-        (lambda: pm.Dirichlet("x", np.ones(3)), "cannot be stretched"),
-        (lambda: pm.VonMises("x", 0, 1), "cannot be stretched"),
-        (lambda: pm.LKJCorr("x", n=3, eta=2), "cannot be stretched"),
-        (lambda: pm.ZeroSumNormal("x", shape=3), "cannot be stretched"),
+        (lambda: pm.Flat("x"), "improper and cannot be scaled"),
+        (lambda: pm.HalfFlat("x"), "improper and cannot be scaled"),
+        (lambda: pm.Beta("x", 2, 2), "cannot be scaled"),
+        (lambda: pm.Dirichlet("x", np.ones(3)), "cannot be scaled"),
+        (lambda: pm.VonMises("x", 0, 1), "cannot be scaled"),
+        (lambda: pm.LKJCorr("x", n=3, eta=2), "cannot be scaled"),
+        (lambda: pm.ZeroSumNormal("x", shape=3), "cannot be scaled"),
     ],
 )
 def test_priors_without_a_width(law, message):
     with pm.Model() as model:
         law()
     with pytest.raises(ModelError, match=rf"the prior of 'x' .*{message}"):
-        StretchedPrior(model, ["x"])
+        ScaledPrior(model, ["x"])
 
 
 def test_heavy_tails_are_seen():
     """Draws of the prior itself: at four times its width the weights have Pareto's k 0.94."""
     z = np.random.default_rng(6).standard_normal(SHAPE)
-    heavy = reweigh(z**2 / 2 * (1 - 1 / 16), np.zeros(SHAPE))
+    heavy = average_ratios(z**2 / 2 * (1 - 1 / 16), np.zeros(SHAPE))
     assert heavy.pareto_k > 0.5
-    assert not heavy.is_known
-    light = reweigh(z**2 / 2 * (1 - 1 / 1.05), np.zeros(SHAPE))
+    assert not heavy.is_reliable
+    light = average_ratios(z**2 / 2 * (1 - 1 / 1.05), np.zeros(SHAPE))
     assert light.pareto_k < 0.3
-    assert light.is_known
+    assert light.is_reliable
 
 
 def test_what_lies_beyond_is_weighed_as_the_draws_are():
     """Half the draws weigh three times as much as the others, and only they are at the edge."""
     heavy = np.arange(4000).reshape(SHAPE) % 2
-    found = reweigh(np.log(1.0 + 2 * heavy), np.where(heavy, 0.4, 0.0))
+    found = average_ratios(np.log(1.0 + 2 * heavy), np.where(heavy, 0.4, 0.0))
     assert found.beyond == pytest.approx(0.3)
     assert found.log_ratio == pytest.approx(np.log(2))
 
@@ -234,14 +234,14 @@ def test_autocorrelated_draws_are_worth_less():
     log_ratio = 0.3 * autoregressive((4, 4000, 1), 0.9, np.random.default_rng(7))[..., 0]
     # The terms themselves have the correlation 0.9 nearly: 19 of them are worth one.
     alone = np.exp(0.3**2) - 1
-    assert reweigh(log_ratio, np.zeros((4, 4000))).error ** 2 * 16_000 / alone == pytest.approx(
-        19, rel=0.25
-    )
+    assert average_ratios(
+        log_ratio, np.zeros((4, 4000))
+    ).error ** 2 * 16_000 / alone == pytest.approx(19, rel=0.25)
 
 
 def test_few_effective_draws_are_not_enough():
     log_ratio = np.where(np.arange(4000).reshape(SHAPE) % 100 == 0, 0.0, -np.inf)  # 40 of 4000
-    few = reweigh(log_ratio, np.zeros(SHAPE))
+    few = average_ratios(log_ratio, np.zeros(SHAPE))
     assert few.log_ratio == pytest.approx(np.log(0.01))
     assert few.n_effective < 100
-    assert not few.is_known
+    assert not few.is_reliable

@@ -23,7 +23,7 @@ def test_volumes_of_scalars_vectors_and_dependent_bounds():
     assert support.log_volume == pytest.approx(np.log(200 * 1 * 2 * 5**3), rel=1e-14)
     assert support.uniform == "a, b, c"
     assert support.improper == ""
-    assert not list(support.doubts())
+    assert not list(support.check())
 
 
 def test_densities_without_an_integral_or_with_another_one():
@@ -44,5 +44,5 @@ def test_densities_without_an_integral_or_with_another_one():
         pm.LKJCholeskyCov("chol", n=2, eta=1, sd_dist=pm.HalfNormal.dist(1), compute_corr=False)
     support = Support.of(model)
     assert support.improper == "flat, half, walk, field, sorted, positive"
-    (doubt,) = support.doubts()
-    assert "depends on the unit of each: give it a proper prior" in doubt
+    (doubt,) = support.check()
+    assert "depends on the units of the parameters: give them proper priors" in doubt

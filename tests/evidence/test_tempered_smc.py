@@ -10,12 +10,12 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators import tempered_smc
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.smc_moves import (
-    learnt_from,
-    metropolis,
-    particles_of_prior,
-    resampled,
+    cross_fit,
+    metropolis_step,
+    resample_systematic,
+    sample_prior_particles,
 )
-from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, raised_from
+from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, next_temperature
 from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     REAL,
@@ -174,21 +174,21 @@ class TestParts:
     def test_temperatures_leave_a_share_of_the_effective_number(self, spread):
         log_likelihood = -spread * np.random.default_rng(86).chisquare(3, 1000)
         log_likelihood[::3] = -np.inf
-        raised = raised_from(0.0, log_likelihood)
+        raised = next_temperature(0.0, log_likelihood)
         weights = np.exp(raised * log_likelihood)
         alive = np.isfinite(log_likelihood).sum()
         effective = weights.sum() ** 2 / (weights**2).sum()
         assert 0 < raised < 1
-        assert effective / alive == pytest.approx(tempered_smc.SHARE, rel=1e-4)
+        assert effective / alive == pytest.approx(tempered_smc.ESS_SHARE, rel=1e-4)
 
     def test_the_last_temperature_is_one(self):
-        assert raised_from(0.3, np.array([-1.0, -1.01, -1.02])) == 1.0
+        assert next_temperature(0.3, np.array([-1.0, -1.01, -1.02])) == 1.0
 
     def test_resampling_copies_by_weight_within_each_run(self):
         rng = np.random.default_rng(87)
         log_weights = np.log(rng.exponential(size=(3, 500)))
         log_weights[1] -= 5000
-        index = resampled(log_weights, rng)
+        index = resample_systematic(log_weights, rng)
         copies = np.bincount(index, minlength=1500).reshape(3, 500)
         weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
         expected = 500 * weights / weights.sum(axis=1, keepdims=True)
@@ -198,17 +198,17 @@ class TestParts:
     def test_a_run_without_a_living_particle_stays_as_it_is(self):
         log_weights = np.zeros((2, 50))
         log_weights[1] = -np.inf
-        index = resampled(log_weights, np.random.default_rng(88))
+        index = resample_systematic(log_weights, np.random.default_rng(88))
         np.testing.assert_array_equal(np.sort(index), np.arange(100))
 
     def test_no_run_is_moved_by_what_it_has_taught(self):
         x = np.random.default_rng(92).standard_normal((100, 3))
         changed = x.copy()
         changed[:50] *= 2
-        one, other = (learnt_from(points).whitened(np.ones((100, 3))) for points in (x, changed))
+        one, other = (cross_fit(points).whitened(np.ones((100, 3))) for points in (x, changed))
         np.testing.assert_array_equal(one[:50], other[:50])
         assert not np.isclose(one[50:], other[50:]).any()
-        np.testing.assert_allclose(learnt_from(x).unconstrained(one), 1.0)
+        np.testing.assert_allclose(cross_fit(x).unconstrained(one), 1.0)
 
     @pytest.mark.parametrize("noise_sd", [0.0, 1.0])
     def test_moves_keep_the_tempered_law(self, noise_sd):
@@ -221,7 +221,7 @@ class TestParts:
         mean = np.linalg.solve(precision, temperature * regression.x.T @ regression.y)
         chol = np.linalg.cholesky(np.linalg.inv(precision))
 
-        particles = particles_of_prior(posterior, 40_000, rng)
+        particles = sample_prior_particles(posterior, 40_000, rng)
         x = mean + rng.standard_normal((40_000, 2)) @ chol.T
         # The noise of the tempered law is tilted by the exponential of b times itself.
         noise = rng.normal((temperature - 0.5) * noise_sd**2, noise_sd, 40_000)
@@ -230,9 +230,9 @@ class TestParts:
             log_prior=regression.prior.log_density(x),
             log_likelihood=regression.log_likelihood(x) + noise,
         )
-        coordinates = learnt_from(1.5 * particles.x - 1)  # not that of the target
+        coordinates = cross_fit(1.5 * particles.x - 1)  # not that of the target
         for _ in range(5):
-            particles, walks, jumps = metropolis(
+            particles, walks, jumps = metropolis_step(
                 particles, temperature, coordinates, 1.0, posterior, rng
             )
             assert walks > 0.1
@@ -259,12 +259,12 @@ def test_few_particles_in_many_dimensions_are_a_doubt():
 
 def test_a_very_noisy_likelihood_is_a_doubt():
     found = smc(draws_of(Banana(3), noise_sd=5.0), n_particles=100)
-    assert any("moves are hardly accepted" in doubt for doubt in found.doubts)
+    assert any("moves are rarely accepted" in doubt for doubt in found.doubts)
 
 
 def test_a_prior_that_meets_nothing():
     posterior = replace(draws_of(bounded()), evaluate=lambda x, rng: np.full(len(x), -np.inf))
-    with pytest.raises(ModelError, match="0 of 4000 draws of the prior have a likelihood"):
+    with pytest.raises(ModelError, match="positive at 0 of 4000 draws of the prior"):
         smc(posterior)
 
 

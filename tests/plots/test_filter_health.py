@@ -107,7 +107,7 @@ def test_names_of_axes_and_panels(diagnostics):
     assert found[:3] == [
         ("position", "time", "standardised residual"),
         ("position", "lag (observations)", "autocorrelation"),
-        ("position", "PIT", "ECDF less uniform"),
+        ("position", "PIT", "ECDF minus uniform"),
     ]
     assert found[3][1:] == ("time", "effective number")
 

@@ -68,5 +68,5 @@ def test_what_is_refused(table):
     for given in (xr.Dataset(), None):
         with pytest.raises(ModelError, match="table must be one of compare_evidence or a result"):
             plot_prior_sensitivity(given)
-    with pytest.raises(ModelError, match="table of compare_evidence; its columns"):
+    with pytest.raises(ModelError, match="table of compare_evidence, got one without the columns"):
         plot_prior_sensitivity(table[["prob"]])

@@ -153,5 +153,5 @@ def test_what_is_refused(states):
     with pytest.raises(ModelError, match=r"truth must have shape \(41, 2\).* got shape \(41,\)"):
         plot_states(states, truth=SINE)
     other = xr.DataArray(SINE[:, None], coords=[("time", TIMES), ("state", ["x0"])])
-    with pytest.raises(ModelError, match=r"truth must know some of \['position', 'speed'\]"):
+    with pytest.raises(ModelError, match=r"truth must have some of \['position', 'speed'\]"):
         plot_states(states, truth=other)

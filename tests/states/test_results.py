@@ -218,12 +218,12 @@ REFUSED = {
         {},
         "dimensions chain and draw",
     ),
-    "no variable": (GOOD, no_variable, {}, "no observed StateSpace variable"),
-    "no data": (GOOD, unobserved, {}, "no observed StateSpace variable"),
+    "no variable": (GOOD, no_variable, {}, "must have an observed StateSpace variable"),
+    "no data": (GOOD, unobserved, {}, "must have an observed StateSpace variable"),
     "another variable": (GOOD, pair_model, {"var_name": "e"}, r"one of \['d'\], got 'e'"),
     "many variables": (GOOD, pair_model, {"var_name": ["d"]}, r"one of \['d'\], got \['d'\]"),
     "shape": (GOOD, wrong_shape, {}, r"'a' has shape \(3,\) in the model, \(\) in idata"),
-    "parameter": (GOOD, other_name, {}, r"no draws of 'alpha'.*holds \['a'\]"),
+    "parameter": (GOOD, other_name, {}, r"no draws of 'alpha'.*with \['a'\]"),
     "filter": (GOOD, pair_model, {"filter": "ekf"}, "filter must be a filter .* got 'ekf'"),
     "filter of one state": (GOOD, pair_model, {"filter": psf.GridFilter()}, "one state"),
     "no draws": (GOOD, pair_model, {"n_draws": 0}, "integer from 1 to 6,.*got 0"),
@@ -231,7 +231,7 @@ REFUSED = {
     "half a draw": (GOOD, pair_model, {"n_draws": 2.5}, "integer from 1 to 6,.*got 2.5"),
     "true draws": (GOOD, pair_model, {"n_draws": True}, "integer from 1 to 6,.*got True"),
     "seed": (GOOD, pair_model, {"random_seed": -1}, "random_seed must be None, an int.* got -1"),
-    "empty": (GOOD.isel(draw=slice(0)), pair_model, {}, "has no draws"),
+    "empty": (GOOD.isel(draw=slice(0)), pair_model, {}, "must have draws"),
 }
 
 

@@ -17,7 +17,7 @@ from pymc_statespace_filters import progress
 from pymc_statespace_filters.compiler.native import parallel_map as many_calls
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import draws_of
+from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 from tests.states.models import EKF, pair_model, posterior
@@ -110,7 +110,7 @@ def at_draws_of(function, n_draws):
     with pm.Model() as model:
         a = wrap_py([pt.dscalar], [pt.dscalar])(function)(pm.Normal("a"))
         psf.StateSpace("d", PAIR, EKF, params={"a": a}, steps=STEPS, observed=PAIR_DATA)
-    draws = draws_of(posterior(a=np.linspace(0.0, 1.0, n_draws)[None]), None)
+    draws = select_draws(posterior(a=np.linspace(0.0, 1.0, n_draws)[None]), None)
     return VariableAtDraws(model, observed_variables(model)[0], draws)
 
 

@@ -1,18 +1,18 @@
-"""What can be doubtful about an evidence before any estimator has begun."""
+"""Convergence of the chains, on which every estimate from their draws relies."""
 
 from collections.abc import Iterator
 
 import arviz as az
 import numpy as np
 
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MAX_RHAT = 1.05
 
 
-def doubts_of_draws(posterior: Posterior) -> Iterator[str]:
-    """Reasons why no estimate from these draws should be trusted: chains that disagree."""
-    with np.errstate(invalid="ignore"):  # no R-hat of a parameter that does not vary
+def check_convergence(posterior: Posterior) -> Iterator[str]:
+    """Yield a reason to distrust every estimate if the chains disagree."""
+    with np.errstate(invalid="ignore"):  # R-hat of a constant parameter is 0 / 0
         rhats = [float(az.rhat(values)) for values in np.moveaxis(posterior.draws, -1, 0)]
     rhat = max((one for one in rhats if not np.isnan(one)), default=1.0)
     if rhat > MAX_RHAT:

@@ -1,19 +1,19 @@
 """Whether a posterior reaches the stability limit of the integrator.
 
-An integrator says itself whether its steps are stable (`Integrator.is_stable_at`).
+An integrator states whether its steps are stable (`Integrator.is_stable_at`).
 
-An Euler-Maruyama step multiplies a small deviation by 1 + a h, where the equation multiplies it by
-exp(a h). Where -2 < a h < -1 the step overshoots: the path oscillates from step to step as no path
-of the equation does, and it grows without bound from there on. This leaves two marks on a posterior
-under a wide prior, and both vanish with steps half as long:
+An Euler-Maruyama step multiplies a small deviation by 1 + a h, where the exact solution multiplies
+it by exp(a h). For -2 < a h < -1 the step overshoots: the path oscillates from step to step, unlike
+any exact path; for a h < -2 it diverges. Under a wide prior this has two effects on a posterior,
+and both vanish with steps half as long:
 
-* Draws that owe their likelihood to the overshooting. Seen every n steps such a path looks as if
-  it were correlated by (1 + a h)^n, so that with an even n there is a mirror mode at -2 / h - a.
-* An end of the posterior where the steps become unstable. Points beyond the draws have a
-  likelihood with steps half as long, and none, or a far smaller one, as it is.
+* Draws whose likelihood is due to overshooting. Observed every n steps, such a path has the
+  autocorrelation (1 + a h)^n, so that an even n gives a mirror mode at -2 / h - a.
+* A posterior that ends where the steps become unstable. Points beyond the draws have a likelihood
+  with steps half as long, and none or a far smaller one with the steps of the model.
 
-Points whose steps do not overshoot are left alone, however much their likelihood depends on the
-length of the step: that is the accuracy of the discretisation, and another question.
+Points whose steps do not overshoot are not examined, however much their likelihood depends on the
+step length: that is the accuracy of the discretisation, a different question.
 """
 
 from collections.abc import Iterator
@@ -25,27 +25,27 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
-from pymc_statespace_filters.evidence.posterior import RowFunction
+from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.observed_data import scalar_count
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_stability
 
 N_DRAWS = 100
-MIN_DRAWS = 2  # one may be chance
-LOSS = 5.0  # nats, of a point
-# Nats. A linear state loses less if its steps do not overshoot: 0.12 if 1 + a h = 0, at the worst.
+MIN_DRAWS = 2  # affected; a single one may be chance
+LOSS = 5.0  # nats per point, by halving the steps
+# Nats per observed scalar. A linear state without overshooting loses at most 0.12, at 1 + a h = 0.
 LOSS_OF_A_SCALAR = 0.15
-BEYOND = 1.5  # by which the draws are spread out, to look where they end
+BEYOND = 1.5  # factor by which the draws are spread about their mean, to probe beyond them
 MIN_SHARE = 0.05
-MIN_SEPARATION = 0.9  # share of pairs that a parameter must put in order
+MIN_SEPARATION = 0.9  # share of pairs that a parameter must order alike to be named
 
 Array = NDArray[np.float64]
 
 
-def doubts_of_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
-    """Say if draws (chain, draw, k) owe their likelihood to overshooting, or end at its limit.
+def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
+    """Yield a reason if draws (chain, draw, k) overshoot, or end at the stability limit.
 
-    Nothing is said of models without an integrator, or with a system that no deterministic filter
-    can treat.
+    Models without an integrator, and systems that no deterministic filter can treat, are not
+    checked.
     """
     is_stable = step_stability(model)
     if is_stable is None:
@@ -54,26 +54,27 @@ def doubts_of_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterat
     chosen = np.linspace(0, len(flat) - 1, min(N_DRAWS, len(flat))).astype(int)
     x = flat[chosen]
     beyond = flat.mean(axis=0) + BEYOND * (x - flat.mean(axis=0))
-    # This takes a moment, the rest must compile two filters: most models need not go on.
+    # The eigenvalues are cheap; what follows compiles two filters, which few models need.
     overshoots = ~is_stable(np.concatenate([x, beyond]))
     if overshoots.sum() < MIN_DRAWS or (densities := densities_by_steps(model)) is None:
         return
     coarse, fine = (RowFunction(model, density).evaluate for density in densities)
     limit = max(LOSS, LOSS_OF_A_SCALAR * scalar_count(model))
     coarse_x, fine_beyond = coarse(x), fine(beyond)
-    with np.errstate(invalid="ignore"):  # of two densities of zero
+    with np.errstate(invalid="ignore"):  # -inf minus -inf
         lost = coarse_x - fine(x)
         gained = fine_beyond - coarse(beyond)
 
-    guilty = overshoots[: len(x)] & (lost > limit)
-    if guilty.sum() >= MIN_DRAWS:
+    affected = overshoots[: len(x)] & (lost > limit)
+    if affected.sum() >= MIN_DRAWS:
         yield (
-            f"{guilty.mean():.0%} of the draws{_separating(model, idata, chosen, guilty)} owe "
-            "their likelihood to integration steps that overshoot: with steps half as long they "
-            f"lose {_range(lost[guilty])} nats. They lie at the limit of stability and say nothing "
-            "of the equation: raise substeps, or give a prior that excludes them"
+            f"{affected.mean():.0%} of the draws{_separating(model, idata, chosen, affected)} have "
+            "a likelihood due to integration steps that overshoot: with steps half as long they "
+            f"lose {_range(lost[affected])} nats. They lie near the stability limit of the "
+            "integrator and are no solutions of the equation: raise substeps, or give a prior that "
+            "excludes them"
         )
-    # The draws' density is coarse(x), so that these weigh the points as steps half as long would.
+    # The draws have density coarse(x): these weights turn them to the posterior of half the step.
     usable = np.isfinite(coarse_x)
     share = (
         softmax((fine_beyond - coarse_x)[usable])
@@ -82,30 +83,30 @@ def doubts_of_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterat
     if share > MIN_SHARE:
         yield (
             "the posterior ends where the integration steps become unstable: with steps half as "
-            f"long it would go on (some {share:.0%} of it lie beyond): raise substeps, or give a "
-            "narrower prior"
+            f"long about {share:.0%} of it would lie beyond; raise substeps, or give a narrower "
+            "prior"
         )
 
 
 def _separating(
-    model: pm.Model, idata: xr.DataTree, chosen: NDArray[np.int64], guilty: NDArray[np.bool_]
+    model: pm.Model, idata: xr.DataTree, chosen: NDArray[np.int64], affected: NDArray[np.bool_]
 ) -> str:
-    """Name and range of the parameter that tells the guilty draws from the others, if one does."""
-    if guilty.all():
+    """Name and range of the parameter that separates the affected draws from the others, if any."""
+    if affected.all():
         return ""
     columns = dict(_scalars(model, idata, chosen))
-    separation = {name: _separation(values, guilty) for name, values in columns.items()}
+    separation = {name: _separation(values, affected) for name, values in columns.items()}
     best = max(separation, key=lambda name: separation[name])
     if separation[best] < MIN_SEPARATION:
         return ""
     values = columns[best]
-    return f" ({best} in {_range(values[guilty])}, the others in {_range(values[~guilty])})"
+    return f" ({best} in {_range(values[affected])}, the others in {_range(values[~affected])})"
 
 
 def _scalars(
     model: pm.Model, idata: xr.DataTree, chosen: NDArray[np.int64]
 ) -> Iterator[tuple[str, Array]]:
-    """The chosen draws of every scalar of the free variables, by its name."""
+    """Name and chosen draws of every scalar of the free variables."""
     for rv in model.free_RVs:
         values = idata["posterior"][rv.name].transpose("chain", "draw", ...).values
         values = values.reshape(-1, *values.shape[2:])[chosen]
@@ -114,10 +115,10 @@ def _scalars(
             yield f"{rv.name}{label}", values[(slice(None), *index)]
 
 
-def _separation(values: Array, guilty: NDArray[np.bool_]) -> float:
-    """Share of the pairs, one guilty and one not, that the values put in one order."""
-    n, m = guilty.sum(), (~guilty).sum()
-    share = (rankdata(values)[guilty].sum() - n * (n + 1) / 2) / (n * m)
+def _separation(values: Array, affected: NDArray[np.bool_]) -> float:
+    """Share of pairs, one affected and one not, that are ordered alike by the values (AUC)."""
+    n, m = affected.sum(), (~affected).sum()
+    share = (rankdata(values)[affected].sum() - n * (n + 1) / 2) / (n * m)
     return float(max(share, 1 - share))
 
 

@@ -1,4 +1,4 @@
-"""From the evidences of rival models to their probabilities, and to averages over them."""
+"""Model probabilities from evidences, their prior sensitivity, and model averages."""
 
 from pymc_statespace_filters.evidence.comparison.averaging import average_models
 from pymc_statespace_filters.evidence.comparison.compare import (

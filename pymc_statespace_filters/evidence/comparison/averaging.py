@@ -1,4 +1,4 @@
-"""What all models say together: a mixture of their draws by probability (thesis, Eq. 3.8)."""
+"""Bayesian model averaging: a mixture of draws by model probability (thesis, Eq. 3.8)."""
 
 from collections.abc import Callable, Mapping
 
@@ -26,51 +26,51 @@ def average_models(
     n_draws: int = 4000,
     random_seed: int | np.random.Generator | None = None,
 ) -> xr.DataTree:
-    """Average a quantity over rival models, each with its probability (thesis, Eq. 3.8).
+    """Average a quantity over models, weighted by their probabilities (thesis, Eq. 3.8).
 
-    The average is a mixture of draws, not a weighted mean of curves: it keeps the spread within the
-    models and that between them.
+    The average is a mixture of draws, not a weighted mean of curves: it includes the spread within
+    the models and between them.
 
     Parameters
     ----------
     idatas : mapping of str to xarray.DataTree
-        Draws of the rival models, in their groups ``posterior``.
+        Posterior draws of each model, in the group ``posterior``.
     weights : pandas.DataFrame or mapping of str to float
         The table of `compare_evidence`, or one weight >= 0 for each model (normalised here). With
-        the table, the errors of the log-evidences count too: a draw comes from a model with the
-        probability averaged over them.
+        the table, the probabilities are averaged over the errors of the log-evidences.
     function : callable, or mapping of str to callable
-        Takes the posterior of a model and gives the quantity, dims ``chain``, ``draw`` and others,
-        the same for all models; one for each model if their parameters differ. It may return
-        other draws than those of the posterior: states or forecasts of some of them.
+        Maps the posterior of a model to the quantity, with dims ``chain``, ``draw`` and others that
+        are the same for all models; one function per model if their parameters differ. It may
+        return fewer draws than the posterior has, as states or forecasts of some of them.
     n_draws : int
-        Draws of the mixture.
+        Number of draws of the mixture.
     random_seed : None, int or numpy.random.Generator
+        Seed.
 
     Returns
     -------
     xarray.DataTree
         ``posterior``
-            The mixture, named as the arrays are, or else as the function is (``average`` if both
-            have no name). Dims chain (1), draw (`n_draws`) and the function's own; coordinate
-            ``model`` (chain, draw): where a draw is from.
+            The mixture, named like the arrays, else like the function, else ``average``. Dims chain
+            (1), draw (`n_draws`) and those of the quantity; coordinate ``model`` (chain, draw): the
+            model of each draw.
         ``members``
-            The same under each model alone. Dims model, chain (1), draw (as many for each, none
-            twice, `n_draws` at most) and the function's own; coordinate ``prob`` (model): the share
-            of the mixture that was aimed at.
+            The quantity under each model alone. Dims model, chain (1), draw (the same number for
+            each, without repetition, at most `n_draws`) and those of the quantity; coordinate
+            ``prob`` (model): the probability used in the mixture.
 
     Raises
     ------
     ModelError
-        If an argument is wrong; if an evidence in the table has no error; or if the models' arrays
-        disagree in dims, shape or coordinates. What `function` itself raises is passed on, with a
-        note that names the model.
+        If an argument is invalid, an evidence in the table has no standard error, or the arrays of
+        the models disagree in dims, shape or coordinates. An exception of `function` is passed on
+        with a note that names the model.
 
     Notes
     -----
-    Numbers of draws by model, and the draws within a model, are chosen systematically, evenly
-    along the chains, and shuffled then. Their order has therefore lost the autocorrelation of the
-    chains: judge convergence by the chains themselves.
+    The numbers of draws per model, and the draws within a model, are chosen systematically, evenly
+    along the chains, and then shuffled. The order of the result has no autocorrelation: judge
+    convergence by the original chains.
 
     Examples
     --------
@@ -97,28 +97,30 @@ def average_models(
     check_count("n_draws", n_draws, 1)
     rng = np.random.default_rng(random_seed)
     prob = _probabilities(weights, names, rng)
-    arrays = _arrays(idatas, function)
+    arrays = _evaluate(idatas, function)
     samples = {name: _flat(array) for name, array in arrays.items()}
 
-    counts = _counts(prob, n_draws, rng)
+    counts = _systematic_counts(prob, n_draws, rng)
     chosen = [
-        sample[_spread(len(sample), count, rng)]
+        sample[_systematic_indices(len(sample), count, rng)]
         for sample, count in zip(samples.values(), counts, strict=True)
     ]
     origin = np.repeat(names, counts)
     order = rng.permutation(n_draws)
     n_alone = min(n_draws, *(len(sample) for sample in samples.values()))
-    alone = np.stack([sample[_spread(len(sample), n_alone, rng)] for sample in samples.values()])
+    alone = np.stack(
+        [sample[_systematic_indices(len(sample), n_alone, rng)] for sample in samples.values()]
+    )
 
     label = _label(arrays, function)
-    own = _without_samples(next(iter(arrays.values())))
+    quantity = _without_samples(next(iter(arrays.values())))
     posterior = xr.Dataset(
-        {label: ((*SAMPLE_DIMS, *own.dims), np.concatenate(chosen)[order][None])},
-        coords={"chain": [0], "draw": np.arange(n_draws), **own.coords},
+        {label: ((*SAMPLE_DIMS, *quantity.dims), np.concatenate(chosen)[order][None])},
+        coords={"chain": [0], "draw": np.arange(n_draws), **quantity.coords},
     ).assign_coords(model=(SAMPLE_DIMS, origin[order][None]))
     members = xr.Dataset(
-        {label: (("model", *SAMPLE_DIMS, *own.dims), alone[:, None])},
-        coords={"model": names, "chain": [0], "draw": np.arange(n_alone), **own.coords},
+        {label: (("model", *SAMPLE_DIMS, *quantity.dims), alone[:, None])},
+        coords={"model": names, "chain": [0], "draw": np.arange(n_alone), **quantity.coords},
     ).assign_coords(prob=("model", prob))
     return xr.DataTree.from_dict({"posterior": posterior, "members": members})
 
@@ -140,7 +142,7 @@ def _names(idatas: Mapping[str, xr.DataTree]) -> list[str]:
 def _probabilities(
     weights: pd.DataFrame | Mapping[str, float], names: list[str], rng: np.random.Generator
 ) -> Array:
-    """Probabilities of the models; from a table, their mean over errors of the log-evidences."""
+    """Probabilities of the models; from a table, averaged over errors of the log-evidences."""
     if isinstance(weights, pd.DataFrame):
         if not {"prob", "se"} <= set(weights.columns):
             raise ModelError(
@@ -150,8 +152,8 @@ def _probabilities(
         given, se = _matched(weights["prob"], names), _matched(weights["se"], names)
         if np.isnan(se).any():
             raise ModelError(
-                f"weights has no standard error for {names[int(np.isnan(se).argmax())]!r}: pass "
-                "dict(table['prob']) to average with the probabilities as they are"
+                "weights must have a standard error for every model, got NaN for "
+                f"{names[int(np.isnan(se).argmax())]!r}: pass dict(table['prob']) to ignore errors"
             )
     elif isinstance(weights, Mapping):
         given, se = _matched(weights, names), np.zeros(len(names))
@@ -174,14 +176,14 @@ def _probabilities(
 def _matched(weights: pd.Series | Mapping[str, float], names: list[str]) -> Array:
     models = list(weights.keys())
     if len(models) != len(names) or set(models) != set(names):
-        raise ModelError(f"weights must be of exactly the models {names}, got those of {models}")
+        raise ModelError(f"weights must be given for exactly the models {names}, got {models}")
     return np.array([weights[name] for name in names], dtype=np.float64)
 
 
-def _arrays(
+def _evaluate(
     idatas: Mapping[str, xr.DataTree], function: Function | Mapping[str, Function]
 ) -> dict[str, xr.DataArray]:
-    """Compute the quantity under every model, and see that all are of one form."""
+    """Compute the quantity under every model and check that dims and coordinates agree."""
     if isinstance(function, Mapping) and set(function) != set(idatas):
         raise ModelError(
             f"function must be given for exactly the models {list(idatas)}, got {list(function)}"
@@ -190,7 +192,7 @@ def _arrays(
     for name, idata in idatas.items():
         of_model = function[name] if isinstance(function, Mapping) else function
         if not callable(of_model):
-            raise ModelError(f"function must be callable, for model {name!r} it is {of_model!r}")
+            raise ModelError(f"function must be callable, got {of_model!r} for model {name!r}")
         try:
             array = of_model(idata["posterior"].to_dataset())
         except Exception as error:
@@ -203,22 +205,26 @@ def _arrays(
         ):
             raise ModelError(
                 "function must return a DataArray with dims 'chain' and 'draw' and without 'model',"
-                f" for model {name!r} it returned {array!r}"
+                f" got {array!r} for model {name!r}"
             )
         if not array.sizes["chain"] * array.sizes["draw"]:
-            raise ModelError(f"function returned no draws for model {name!r}")
+            raise ModelError(f"function must return draws, got none for model {name!r}")
         arrays[name] = array
 
     first, reference = next(iter(arrays.items()))
     for name, array in arrays.items():
         difference = _difference(_without_samples(reference), _without_samples(array))
         if difference:
-            raise ModelError(f"function returned for {first!r} and {name!r} {difference}")
-    return {name: array.transpose(*SAMPLE_DIMS, *_own(reference)) for name, array in arrays.items()}
+            raise ModelError(
+                "function must return arrays of the same form for all models, got for "
+                f"{first!r} and {name!r} {difference}"
+            )
+    dims = [dim for dim in reference.dims if dim not in SAMPLE_DIMS]
+    return {name: array.transpose(*SAMPLE_DIMS, *dims) for name, array in arrays.items()}
 
 
 def _difference(one: xr.DataArray, other: xr.DataArray) -> str:
-    """Say in what two arrays differ besides their values; nothing if they do not."""
+    """Describe a difference of dims, sizes or coordinates; empty if there is none."""
     if set(one.dims) != set(other.dims):
         return f"arrays of different dims, {one.dims} and {other.dims}"
     for dim in one.dims:
@@ -230,19 +236,15 @@ def _difference(one: xr.DataArray, other: xr.DataArray) -> str:
 
 
 def _label(arrays: Mapping[str, xr.DataArray], function: Function | Mapping[str, Function]) -> str:
-    """Name the average as its arrays are named, or else as the function is."""
-    own = {array.name for array in arrays.values()}
+    """Name of the average: that of the arrays, else that of the function."""
+    names = {array.name for array in arrays.values()}
     of_function = getattr(function, "__name__", "<mapping>")
     first = next(iter(arrays.values()))
     taken = {*first.coords, *first.dims, "model", "prob"}
-    for label in (own.pop() if len(own) == 1 else None, of_function):
+    for label in (names.pop() if len(names) == 1 else None, of_function):
         if label and label not in taken and not str(label).startswith("<"):
             return str(label)
     return "average"
-
-
-def _own(array: xr.DataArray) -> tuple:
-    return tuple(dim for dim in array.dims if dim not in SAMPLE_DIMS)
 
 
 def _without_samples(array: xr.DataArray) -> xr.DataArray:
@@ -251,17 +253,19 @@ def _without_samples(array: xr.DataArray) -> xr.DataArray:
 
 
 def _flat(array: xr.DataArray) -> NDArray:
-    """Return the draws of all chains one after the other."""
+    """Concatenate the draws of all chains."""
     return array.values.reshape(-1, *array.shape[2:])
 
 
-def _counts(prob: Array, n_draws: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Share out the draws systematically: less than one away from n_draws times the probability."""
+def _systematic_counts(prob: Array, n_draws: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Number of draws per model: within one of n_draws times the probability."""
     edges = np.concatenate([[0.0], np.cumsum(prob)])
     return np.diff(np.floor(n_draws * edges / edges[-1] + rng.random())).astype(np.int64)
 
 
-def _spread(n_available: int, n_wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Choose draws evenly along the chains, with numbers of copies that differ by one at most."""
+def _systematic_indices(
+    n_available: int, n_wanted: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Choose draws evenly along the chains; the numbers of copies differ by one at most."""
     places = (np.arange(n_wanted) + rng.random()) * (n_available / max(n_wanted, 1))
     return np.minimum(places.astype(np.int64), n_available - 1)

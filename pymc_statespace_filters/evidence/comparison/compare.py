@@ -12,14 +12,15 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.probabilities import (
+    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
+    select_evidences,
 )
-from pymc_statespace_filters.evidence.comparison.rivals import Given, evidences_of_rivals
 from pymc_statespace_filters.evidence.evidence import Evidence
 
-# Kass and Raftery (1995), 3.2: twice the log Bayes factor at which each word begins.
+# Kass and Raftery (1995), section 3.2: lower limits of twice the log Bayes factor.
 STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.0: "very strong"}
 
 Array = NDArray[np.float64]
@@ -29,14 +30,14 @@ Array = NDArray[np.float64]
 class DimensionCorrection:
     """The thesis's correction for the number of parameters, c = J^(k alpha / 2) (after Eq. 3.7).
 
-    It is a prior over models, P(M) proportional to J^(-k alpha / 2), and no constant of nature: k
-    is the number of free scalar variables, J the model's own number of observations.
+    It amounts to a prior over models, P(M) proportional to J^(-k alpha / 2), where k is the number
+    of free scalar variables of the model and J its number of observations.
 
     Parameters
     ----------
     exponent : float
-        alpha. The thesis used 3; 1 is the penalty of the Bayesian information criterion, for flat
-        priors.
+        alpha. The thesis used 3; under flat priors, 1 is the penalty of the Bayesian information
+        criterion.
 
     Raises
     ------
@@ -58,38 +59,38 @@ class DimensionCorrection:
             raise ModelError(f"exponent must be a finite number, got {self.exponent!r}")
 
     def log_prior(self, evidence: Evidence) -> float:
-        """Return -ln c, what is added to the log-evidence."""
+        """Return -ln c, the term added to the log-evidence."""
         if evidence.n_observations < 1:
             raise ModelError(
-                "correction needs models with observed variables, "
+                "correction needs a model with observed variables, "
                 f"got n_observations={evidence.n_observations}"
             )
         return -0.5 * evidence.n_parameters * self.exponent * math.log(evidence.n_observations)
 
 
 def compare_evidence(
-    evidences: Mapping[str, Given],
+    evidences: Mapping[str, EvidenceLike],
     *,
     prior: Mapping[str, float] | None = None,
     correction: DimensionCorrection | None = None,
     ci_prob: float = 0.95,
     estimator: str | None = None,
 ) -> pd.DataFrame:
-    """Turn evidences into model probabilities, with what their errors leave open (Eq. 3.3).
+    """Compare models by their evidences: probabilities, Bayes factors and criteria (Eq. 3.3).
 
     Parameters
     ----------
     evidences : mapping of str to Evidence, xarray.DataTree, or mapping of str to Evidence
-        Rival models of one record. A DataTree gives its group ``evidence``; the third is what
-        `estimate_evidence` returns.
+        One entry per model, all of the same data: an `Evidence`, a DataTree with the group
+        ``evidence``, or the result of `estimate_evidence`.
     prior : mapping of str to float, optional
         Positive prior weight of every model, normalised here; equal by default.
     correction : DimensionCorrection, optional
-        A further factor of the prior, reported as its own column.
+        A further factor of the prior, reported in its own column.
     ci_prob : float
         Probability of the intervals.
     estimator : str, optional
-        Whose evidences to compare, as ``"bridge"``, where the models have several.
+        Estimator whose evidences are compared, as ``"bridge"``, if the models have several.
 
     Returns
     -------
@@ -99,52 +100,52 @@ def compare_evidence(
         ``log_evidence``, ``se``
             As estimated, without prior and correction.
         ``correction``
-            What it adds to the log-evidence.
+            The term that the correction adds to the log-evidence.
         ``prob``, ``prob_low``, ``prob_high``
-            With the central interval over normal errors of the log-evidences (50 000 fixed draws,
-            so that the same evidences give the same table).
+            Probability, and its central interval under normal errors of the log-evidences (from
+            50 000 fixed draws, so that the same evidences give the same table).
         ``log_bayes_factor``
-            Log-evidence less that of the first row.
+            Log-evidence minus that of the first row.
         ``n_parameters``, ``n_observations``
             k and J.
         ``bic``
             -2 max ln p(D|phi) + k ln J; missing if J = 0.
         ``undecided``
-            The errors leave it open, at level `ci_prob`, whether this row or the first is more
-            probable (for the first row: whether any other is).
+            Whether the errors leave open, at level `ci_prob`, which of this row and the first is
+            more probable (for the first row: whether any other is more probable).
         ``aic``
             -2 max ln p(D|phi) + 2 k.
         ``log_evidence_flat``
-            What the log-evidence would be if each Uniform prior had the density one on the same
-            support: the thesis's number (Eq. 3.7). It changes with the units of the parameters.
+            The log-evidence with the density of each Uniform prior replaced by one on the same
+            support: the thesis's number (Eq. 3.7). It depends on the units of the parameters.
         ``prior``
-            Weight of the model before correction; ``prob`` is in proportion to it.
+            Prior weight of the model without correction; ``prob`` is proportional to it.
         ``strength``
-            Kass and Raftery's word for the evidence of the first row against this one: "barely
-            worth mentioning", "positive", "strong" or "very strong" as twice the log Bayes factor
-            passes 2, 6 and 10. The factor is taken at the weaker end of its interval, but not
-            below 1, so that the word holds in spite of the errors. "negative" if the evidence
-            favours this row, and only prior or correction put it below the first. Empty for the
-            first row.
+            Kass and Raftery's category of the evidence for the first row against this one: "barely
+            worth mentioning", "positive", "strong" or "very strong", with limits at 2, 6 and 10 of
+            twice the log Bayes factor. The factor is taken at the weaker end of its interval, but
+            not below 1, so that the category is conservative. "negative" if the evidence favours
+            this row, and only prior or correction place it below the first. Empty for the first
+            row.
         ``warning``
-            The number came with doubts, without an error, from an improper prior, or from chains
-            that held a noise seed, whose own error ``se`` lacks.
+            Whether the evidence has doubts, no standard error, an improper prior, or chains that
+            held a noise seed, whose error ``se`` excludes.
 
-        Where an estimator has no error (``se`` is NaN, as Laplace's), the probabilities are still
-        those of the estimates; but all intervals are NaN, since each holds every evidence, what
-        is compared with that model is undecided, and its ``strength`` that of the bare estimate.
+        If an evidence has no standard error (``se`` is NaN, as Laplace's), the probabilities are
+        those of the estimates, and all intervals are NaN, because each depends on every evidence.
+        Comparisons with that model are undecided, and its ``strength`` ignores errors.
 
     Raises
     ------
     ModelError
-        If an argument is wrong, or a model has several evidences and none is chosen.
+        If an argument is invalid, or a model has several evidences and no estimator is chosen.
     DataMismatchError
-        If the models were given different data.
+        If the models belong to different data.
 
     Warns
     -----
     EvidenceWarning
-        If priors are improper: the probabilities then depend on the units of the parameters.
+        If priors are improper, so that the probabilities depend on the units of the parameters.
 
     References
     ----------
@@ -162,17 +163,17 @@ def compare_evidence(
     >>> table.loc["linear", "strength"]
     'positive'
     """
-    found = evidences_of_rivals(evidences, estimator)
+    found = select_evidences(evidences, estimator)
     check_ci_prob(ci_prob)
     if not (correction is None or isinstance(correction, DimensionCorrection)):
         raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")
-    names, rivals = list(found), list(found.values())
+    names, models = list(found), list(found.values())
     weights = prior_weights(prior, names)
     _warn_of_improper(found)
 
-    log_evidence = np.array([rival.log_evidence for rival in rivals])
-    se = np.array([rival.se for rival in rivals])
-    added = np.array([correction.log_prior(rival) if correction else 0.0 for rival in rivals])
+    log_evidence = np.array([one.log_evidence for one in models])
+    se = np.array([one.se for one in models])
+    added = np.array([correction.log_prior(one) if correction else 0.0 for one in models])
     log_weight = log_evidence + added + np.log(weights)
     probs = probabilities(log_weight, se, ci_prob)
     best = int(np.argmax(log_weight))
@@ -187,23 +188,26 @@ def compare_evidence(
             "prob_low": probs.low,
             "prob_high": probs.high,
             "log_bayes_factor": log_bayes_factor,
-            "n_parameters": [rival.n_parameters for rival in rivals],
-            "n_observations": [rival.n_observations for rival in rivals],
-            "bic": [_bic(rival) for rival in rivals],
+            "n_parameters": [one.n_parameters for one in models],
+            "n_observations": [one.n_observations for one in models],
+            "bic": [_bic(one) for one in models],
             "undecided": _undecided(log_weight[best] - log_weight, error, best),
-            "aic": [2 * (rival.n_parameters - rival.max_log_likelihood) for rival in rivals],
-            "log_evidence_flat": [rival.log_evidence + rival.log_volume for rival in rivals],
+            "aic": [2 * (one.n_parameters - one.max_log_likelihood) for one in models],
+            "log_evidence_flat": [one.log_evidence + one.log_volume for one in models],
             "prior": weights,
             "strength": _strength(-log_bayes_factor, error, best),
-            "warning": [
-                bool(rival.doubts or rival.improper or math.isnan(rival.se))
-                or rival.noise == "held"
-                for rival in rivals
-            ],
+            "warning": [_needs_warning(one) for one in models],
         },
         index=pd.Index(names, name="model"),
     )
     return table.iloc[np.argsort(-log_weight, kind="stable")]
+
+
+def _needs_warning(evidence: Evidence) -> bool:
+    """Whether the evidence is less reliable than its standard error suggests."""
+    return bool(
+        evidence.doubts or evidence.improper or math.isnan(evidence.se) or evidence.noise == "held"
+    )
 
 
 def _warn_of_improper(found: Mapping[str, Evidence]) -> None:
@@ -226,10 +230,10 @@ def _undecided(behind: Array, error: Array, best: int) -> NDArray[np.bool_]:
 
 
 def _strength(log_bayes_factor: Array, error: Array, best: int) -> list[str]:
-    """Words for the evidence of the best model against each."""
-    surely = np.maximum(log_bayes_factor - np.nan_to_num(error), 0)
-    begun = np.searchsorted(list(STRENGTHS), 2 * surely, side="right") - 1
-    words = [list(STRENGTHS.values())[i] for i in begun]
+    """Category of the evidence for the best model against each."""
+    weaker_end = np.maximum(log_bayes_factor - np.nan_to_num(error), 0)
+    category = np.searchsorted(list(STRENGTHS), 2 * weaker_end, side="right") - 1
+    words = [list(STRENGTHS.values())[i] for i in category]
     return [
         "" if i == best else "negative" if log_bayes_factor[i] < 0 else word
         for i, word in enumerate(words)
@@ -237,7 +241,7 @@ def _strength(log_bayes_factor: Array, error: Array, best: int) -> list[str]:
 
 
 def _bic(evidence: Evidence) -> float:
-    """Schwarz's criterion; Eq. 3.2 of the thesis prints its penalty twice as large."""
+    """Schwarz's criterion; in Eq. 3.2 of the thesis the penalty is twice as large."""
     if evidence.n_observations < 1:
         return math.nan
     penalty = evidence.n_parameters * math.log(evidence.n_observations)

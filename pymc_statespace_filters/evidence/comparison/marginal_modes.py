@@ -1,4 +1,4 @@
-"""The most probable value of each parameter by itself (thesis, Tables 4, 9 and 14)."""
+"""Modes of the marginal posterior densities (thesis, Tables 4, 9 and 14)."""
 
 from collections.abc import Hashable, Iterable, Mapping
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
 
-MIN_INDEPENDENT = 100  # of fewer draws even a bandwidth is a guess
+MIN_INDEPENDENT = 100  # draws for a bandwidth
 
 Array = NDArray[np.float64]
 
@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 def marginal_modes(
     idatas: xr.DataTree | Mapping[str, xr.DataTree], *, var_names: str | Iterable[str] | None = None
 ) -> pd.DataFrame:
-    """Find the mode of each marginal posterior density, one row for a model.
+    """Find the mode of each marginal posterior density, one row per model.
 
     These are the "MAP of the marginal distribution" of the thesis. They differ from the mode of the
-    joint density, and unlike it they move with a nonlinear change of a parameter's scale.
+    joint density, and depend on the scale on which a parameter is expressed.
 
     Parameters
     ----------
@@ -35,21 +35,21 @@ def marginal_modes(
     Returns
     -------
     pandas.DataFrame
-        Index ``model`` (of a lone DataTree: ``posterior``), a column for each scalar, labelled as
-        by ArviZ: ``theta[0]``. NaN where a model lacks the parameter, or a draw is not finite.
+        Index ``model`` (``posterior`` for a single DataTree), one column per scalar, labelled as
+        by ArviZ: ``theta[0]``. NaN if a model lacks the parameter or a draw is not finite.
 
     Raises
     ------
     ModelError
-        If there is no group ``posterior``, or nobody has one of `var_names`.
+        If there is no group ``posterior``, or no model has one of `var_names`.
 
     Notes
     -----
-    The density is ArviZ's kernel estimate, mirrored at the smallest and the largest draw, with the
-    bandwidth that ArviZ finds for as many draws as are independent: chains that reject, and so
-    repeat themselves, would otherwise get too small a one. From draws worth 1000 independent ones
-    a mode is known to some 15 per cent of a standard deviation; near the end of a support, as of a
-    scale that may be zero, this says that it is near and no more.
+    The density is ArviZ's kernel estimate, mirrored at the smallest and the largest draw, with
+    ArviZ's bandwidth for the effective number of draws: the repeated values of rejecting chains
+    would otherwise give too small a bandwidth. With 1000 effective draws the standard error of a
+    mode is about 15 per cent of a standard deviation; a mode at the end of a support, as of a scale
+    that may be zero, is only found to be near it.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def marginal_modes(
     held = dict.fromkeys(name for posterior in posteriors.values() for name in posterior.data_vars)
     if unknown := [name for name in names if name not in held]:
         raise ModelError(
-            f"var_names has {unknown}, which no posterior holds; they hold {list(held)}"
+            f"var_names must be among {list(held)}, the variables of the posteriors, got {unknown}"
         )
     rows = [_modes(posterior, names or held) for posterior in posteriors.values()]
     return pd.DataFrame(rows, index=pd.Index(posteriors, name="model"))
@@ -85,7 +85,9 @@ def marginal_modes(
 
 def _posterior(name: str, idata: xr.DataTree) -> xr.Dataset:
     if not isinstance(idata, xr.DataTree) or "posterior" not in idata.children:
-        raise ModelError(f"idatas[{name!r}] must be a DataTree with a group 'posterior'")
+        raise ModelError(
+            f"idatas[{name!r}] must be a DataTree with a group 'posterior', got {idata!r}"
+        )
     return idata["posterior"].to_dataset()
 
 
@@ -99,14 +101,14 @@ def _modes(posterior: xr.Dataset, names: Iterable[Hashable]) -> dict[str, float]
 
 
 def _mode(draws: Array) -> float:
-    """Place of the highest density of draws (chain, draw)."""
+    """Mode of draws (chain, draw)."""
     if not np.isfinite(draws).all():
         return np.nan
     if np.ptp(draws) == 0:
         return float(draws.flat[0])
-    # Rules for the bandwidth take every draw for an independent one.
-    worth = max(MIN_INDEPENDENT, float(az.ess(draws))) if draws.size > MIN_INDEPENDENT else np.inf
-    with np.errstate(divide="ignore"):  # a flat density has no curvature to go by
-        _, _, bandwidth = az.kde(draws.ravel()[:: max(1, int(draws.size // worth))])
+    # Bandwidth rules assume independent draws.
+    n_eff = max(MIN_INDEPENDENT, float(az.ess(draws))) if draws.size > MIN_INDEPENDENT else np.inf
+    with np.errstate(divide="ignore"):  # a flat density has no curvature
+        _, _, bandwidth = az.kde(draws.ravel()[:: max(1, int(draws.size // n_eff))])
     grid, density, _ = az.kde(draws.ravel(), bw=float(bandwidth))
     return float(grid[np.argmax(density)])

@@ -1,7 +1,7 @@
-"""How model probabilities depend on what was put in: the correction's exponent, the priors' width.
+"""Sensitivity of model probabilities to the correction's exponent and the priors' width.
 
-The thesis's certainty came in good part from its correction for the number of parameters (after
-Eq. 3.7); the rest depends on the priors. These curves show both.
+The model probabilities of the thesis depend strongly on its correction for the number of parameters
+(after Eq. 3.7), and on the priors. These curves show both.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,27 +19,27 @@ from pymc_statespace_filters.evidence.comparison.compare import (
     compare_evidence,
 )
 from pymc_statespace_filters.evidence.comparison.probabilities import (
+    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
 )
-from pymc_statespace_filters.evidence.comparison.rivals import Given
 from pymc_statespace_filters.evidence.comparison.scaled_prior import (
     UNCHANGED,
-    Reweighted,
-    StretchedPrior,
+    ReweightedEvidence,
+    ScaledPrior,
 )
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 EXPONENTS = np.linspace(0, 4, 41)
 WIDTHS = np.geomspace(0.25, 4, 17)
-NEEDED = ("log_evidence", "se", "n_parameters", "n_observations", "prior")
+REQUIRED_COLUMNS = ("log_evidence", "se", "n_parameters", "n_observations", "prior")
 
 Array = NDArray[np.float64]
 
 
 def prior_sensitivity(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     *,
     exponents: ArrayLike | None = None,
     models: Mapping[str, pm.Model] | None = None,
@@ -49,57 +49,57 @@ def prior_sensitivity(
     ci_prob: float = 0.95,
     estimator: str | None = None,
 ) -> xr.Dataset:
-    r"""Curves of the model probabilities over the correction's exponent and the priors' width.
+    r"""Compute model probabilities as functions of the correction's exponent and the priors' width.
 
-    The width of priors is varied by reweighting the draws, without new likelihoods. With the factor
-    w a prior p becomes :math:`p_w(\phi) = p(c + (\phi - c)/w)/w`, and the evidence
-    :math:`Z_w = Z\, E[p_w(\phi)/p(\phi)]`, the mean being over the posterior. The centre c is zero
-    where the support begins or ends at zero (scales, most Uniform priors of a stiffness), the end
-    of any other half-line, and PyMC's support point (the mean or the like) of the rest. A prior
-    that depends on other variables is stretched given them.
+    The width of priors is varied by reweighting the draws, without new likelihood evaluations. A
+    prior p scaled by the factor w becomes :math:`p_w(\phi) = p(c + (\phi - c)/w)/w`, and the
+    evidence :math:`Z_w = Z\, E[p_w(\phi)/p(\phi)]`, where the mean is over the posterior. The
+    centre c is zero if the support begins or ends at zero (scales, most Uniform priors of a
+    stiffness), the end of any other half-line, and otherwise PyMC's support point (usually the
+    mean). A prior that depends on other variables is scaled conditionally on them.
 
     Parameters
     ----------
     evidences : mapping as for `compare_evidence`, or its table
-        For widths a mapping of DataTrees that hold the posterior draws beside the group
-        ``evidence``. From a table only its evidences and its column ``prior`` are used, not its
-        correction.
+        For widths, a mapping of DataTrees with the posterior draws and the group ``evidence``. Of a
+        table, the evidences and the column ``prior`` are used, not the correction.
     exponents : array_like of float, optional
-        alpha of `DimensionCorrection`, in one dimension; 0, no correction, to 4 by default.
+        Values of alpha in `DimensionCorrection`, one-dimensional; 0 (no correction) to 4 by
+        default.
     models : mapping of str to pymc.Model, optional
-        The model of each DataTree, if the width is to be varied.
+        The model of each DataTree, required to vary the width.
     widths : array_like of float, optional
-        Positive factors w, in one dimension; a quarter to 4 by default.
+        Positive factors w, one-dimensional; 0.25 to 4 by default.
     var_names : str or iterable of str, optional
-        The free variables whose priors are stretched, in the models that have them; all by default.
+        The free variables whose priors are scaled, in the models that have them; all by default.
     prior, ci_prob, estimator
         As for `compare_evidence`.
 
     Returns
     -------
     xarray.Dataset
-        ``prob``, ``prob_low`` and ``prob_high``, dims (model, exponent). With `models` also, of
-        dims (model, width) and without a correction, ``width_prob``, ``width_prob_low``,
-        ``width_prob_high``; ``width_log_evidence`` and its error ``width_se``, which adds that of
-        the reweighting to that of the evidence; and, as reasons, ``width_n_effective`` (what the
-        draws are worth there, in independent terms of relative variance one), ``width_pareto_k``
-        (of the weights' tail) and ``width_beyond`` (below).
+        ``prob``, ``prob_low`` and ``prob_high``, dims (model, exponent). With `models` also, with
+        dims (model, width) and without correction: ``width_prob``, ``width_prob_low``,
+        ``width_prob_high``; ``width_log_evidence`` and its standard error ``width_se``, which
+        includes that of the reweighting; and the diagnostics ``width_n_effective`` (effective
+        number of draws after reweighting), ``width_pareto_k`` (tail of the weights) and
+        ``width_beyond`` (below).
 
-        NaN, and no guess, is what stands where the draws do not know the answer: if they are worth
-        less than 100, if Pareto's k is above 0.5 (the posterior is nearly as wide as the prior, and
-        a mean of such weights has no standard error), or if more than 2 per cent of the evidence
-        may lie beyond the bounds of an actual prior, where there are no draws. Of that share
-        ``width_beyond`` is an upper bound, from the draws in the outermost 5 per cent of a bounded
-        support, if likelihood and prior do not rise outwards from there. The probabilities of all
-        models are NaN where the evidence of one is.
+        Values are NaN where the reweighting is unreliable: if the effective number of draws is
+        below 100, if the Pareto shape k is above 0.5 (the posterior is nearly as wide as the prior,
+        and the mean of the weights has no standard error), or if more than 2 per cent of the
+        evidence may lie outside the bounds of the original prior, where there are no draws.
+        ``width_beyond`` is an upper bound of that share, from the draws in the outermost 5 per cent
+        of a bounded support, provided that likelihood and prior do not increase outwards from
+        there. Where one evidence is NaN, the probabilities of all models are.
 
     Raises
     ------
     ModelError
-        If an argument is wrong; if a prior has no width that could be changed: it is improper, or
-        of a probability, an angle, a simplex or a covariance.
+        If an argument is invalid, or a prior cannot be scaled: it is improper, or the variable is
+        a probability, an angle, a simplex or a covariance.
     DataMismatchError
-        If the models were given different data, or the draws belong to another model.
+        If the models belong to different data, or the draws to another model.
 
     Examples
     --------
@@ -110,7 +110,7 @@ def prior_sensitivity(
     >>> curves["prob"].sel(model="cubic").values.round(3)
     array([0.881, 0.425, 0.007])
 
-    One mean, whose prior is stretched to twice its width; the exact log-evidence then is -5.27:
+    One mean, with the prior scaled to twice its width; the exact log-evidence is then -5.27:
 
     >>> import arviz as az
     >>> import numpy as np
@@ -131,7 +131,9 @@ def prior_sensitivity(
     if not (factors > 0).all():
         raise ModelError(f"widths must be positive, got {widths!r}")
     if models is None and not (widths is None and var_names is None):
-        raise ModelError("widths and var_names need models, the pm.Model of each DataTree")
+        raise ModelError(
+            "models must be given with widths or var_names: the pm.Model of each idata"
+        )
     drawn = None if models is None else _drawn(evidences, models, list(table.index), var_names)
     found = _over_exponents(table, alphas, ci_prob)
     if drawn is not None:
@@ -151,7 +153,7 @@ def _over_widths(
     table: pd.DataFrame, drawn: Mapping[str, "_Drawn"], widths: Array, ci_prob: float
 ) -> xr.Dataset:
     found = [[drawn[name].reweighted(width) for width in widths.tolist()] for name in table.index]
-    known = np.array([[one.is_known for one in of_model] for of_model in found])
+    known = np.array([[one.is_reliable for one in of_model] for of_model in found])
     ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
     log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
     se = np.where(known, np.hypot(table["se"].to_numpy()[:, np.newaxis], error), np.nan)
@@ -170,7 +172,7 @@ def _over_widths(
 def _curves(
     dim: str, points: Array, table: pd.DataFrame, log_evidence: Array, se: Array, ci_prob: float
 ) -> xr.Dataset:
-    """Probabilities where the log-evidences, and their errors, are as given: (model, point)."""
+    """Probabilities and intervals for log-evidences and errors (model, point)."""
     log_weight = log_evidence + np.log(table["prior"].to_numpy())[:, np.newaxis]
     of_points = [
         probabilities(weights, errors, ci_prob)
@@ -192,24 +194,24 @@ def _grid(name: str, given: ArrayLike | None, default: Array) -> Array:
     except (TypeError, ValueError):
         grid = np.empty(0)
     if grid.ndim != 1 or grid.size == 0 or not np.isfinite(grid).all():
-        raise ModelError(f"{name} must be finite numbers in one dimension, got {given!r}")
+        raise ModelError(f"{name} must be one-dimensional finite numbers, got {given!r}")
     return grid
 
 
 def _table(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     prior: Mapping[str, float] | None,
     estimator: str | None,
 ) -> pd.DataFrame:
-    """The table of `compare_evidence`, with the models in the order in which they were given."""
+    """The table of `compare_evidence`, with the models in the given order."""
     if not isinstance(evidences, pd.DataFrame):
         return compare_evidence(evidences, prior=prior, estimator=estimator).loc[list(evidences)]
-    if missing := [column for column in NEEDED if column not in evidences]:
+    if missing := [column for column in REQUIRED_COLUMNS if column not in evidences]:
         raise ModelError(
-            f"evidences must be the table of compare_evidence; its columns {missing} are missing"
+            f"evidences must be a table of compare_evidence, got one without the columns {missing}"
         )
     if estimator is not None:
-        raise ModelError(f"estimator was chosen when the table was made, got {estimator!r}")
+        raise ModelError(f"estimator must not be given with a table, got {estimator!r}")
     if prior is None:
         return evidences
     return evidences.assign(prior=prior_weights(prior, list(evidences.index)))
@@ -217,19 +219,19 @@ def _table(
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Draws of a model, and its priors to be stretched (None: it has none of them)."""
+    """Draws of a model, and its priors to be scaled (None if it has none of them)."""
 
     posterior: xr.Dataset
-    priors: StretchedPrior | None
+    priors: ScaledPrior | None
 
-    def reweighted(self, width: float) -> Reweighted:
+    def reweighted(self, width: float) -> ReweightedEvidence:
         if self.priors is None:
             return UNCHANGED
         return self.priors.reweighted(self.posterior, width)
 
 
 def _drawn(
-    evidences: Mapping[str, Given] | pd.DataFrame,
+    evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     models: Mapping[str, pm.Model],
     names: list[str],
     var_names: str | Iterable[str] | None,
@@ -239,21 +241,21 @@ def _drawn(
         and set(models) == set(names)
         and all(isinstance(model, pm.Model) for model in models.values())
     ):
-        raise ModelError(
-            f"models must give a pm.Model to exactly the models {names}, got {models!r}"
-        )
+        raise ModelError(f"models must map exactly the names {names} to pm.Model, got {models!r}")
     given = {} if isinstance(evidences, pd.DataFrame) else evidences
     idatas = {name: one for name, one in given.items() if isinstance(one, xr.DataTree)}
     if without := [name for name in names if name not in idatas]:
-        raise ModelError(f"evidences must be DataTrees with draws for widths; not so {without}")
+        raise ModelError(
+            f"evidences must be DataTrees with draws to vary widths, got none of {without}"
+        )
     free = {name: [rv.name for rv in models[name].free_RVs] for name in names}
     chosen = [var_names] if isinstance(var_names, str) else list(var_names or [])
     if unknown := [one for one in chosen if not any(one in held for held in free.values())]:
-        raise ModelError(f"var_names has {unknown}, free variables of no model; they have {free}")
+        raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
     found = {}
     for name in names:
-        unconstrained_draws(idatas[name], models[name])  # raises what is wrong with them
-        stretched = [one for one in free[name] if not chosen or one in chosen]
-        priors = StretchedPrior(models[name], stretched) if stretched else None
+        unconstrained_draws(idatas[name], models[name])  # checks that draws and model match
+        scaled = [one for one in free[name] if not chosen or one in chosen]
+        priors = ScaledPrior(models[name], scaled) if scaled else None
         found[name] = _Drawn(idatas[name]["posterior"].to_dataset(), priors)
     return found

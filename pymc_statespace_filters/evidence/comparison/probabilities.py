@@ -1,21 +1,24 @@
-"""Probabilities of models from log weights that carry errors (thesis, Eq. 3.3)."""
+"""Select one evidence per model; model probabilities from log weights with errors (Eq. 3.3)."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.evidence.evidence import Evidence, stored_evidences
 
 N_NORMALS = 50_000
 
 Array = NDArray[np.float64]
+EvidenceLike = Evidence | Mapping[str, Evidence] | xr.DataTree
 
 
 class Probabilities(NamedTuple):
-    """Of m models, with the ends of their central intervals; each of shape (m,)."""
+    """Probabilities of m models and the ends of their central intervals, each of shape (m,)."""
 
     prob: Array
     low: Array
@@ -25,9 +28,9 @@ class Probabilities(NamedTuple):
 def probabilities(log_weight: Array, se: Array, ci_prob: float) -> Probabilities:
     """Normalise weights, with intervals under independent normal errors of their logarithms.
 
-    The normals are always the same ones: equal evidences give equal intervals, and along a curve
-    of weights the intervals are smooth. An unknown error leaves every interval unknown, because
-    every probability contains it.
+    The normal draws are fixed: equal evidences give equal intervals, and along a curve of weights
+    the intervals are smooth. One unknown error makes all intervals unknown, because every
+    probability depends on it.
     """
     prob = np.exp(log_softmax(log_weight))
     if not np.isfinite(log_weight + se).all():
@@ -49,7 +52,7 @@ def prior_weights(prior: Mapping[str, float] | None, names: list[str]) -> Array:
         weights = np.array([prior[name] for name in names], dtype=np.float64)
     except (TypeError, ValueError):
         weights = np.array(np.nan)
-    # Their sum may overflow, and beside the largest the smallest vanish.
+    # Divide by the largest first: the sum may overflow. Shares may still underflow to zero.
     share = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
     if not (np.isfinite(weights).all() and (share > 0).all()):
         raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
@@ -60,3 +63,69 @@ def check_ci_prob(ci_prob: float) -> None:
     """Raise a `ModelError` unless it is a probability."""
     if not (isinstance(ci_prob, int | float) and 0 < ci_prob < 1):
         raise ModelError(f"ci_prob must be a number between 0 and 1, got {ci_prob!r}")
+
+
+def select_evidences(
+    given: Mapping[str, EvidenceLike], estimator: str | None = None
+) -> dict[str, Evidence]:
+    """Select one evidence for each model, and check that all belong to the same data.
+
+    Parameters
+    ----------
+    given : mapping of str to Evidence, mapping of estimators to Evidence, or xarray.DataTree
+        By model.
+    estimator : str, optional
+        Name of the estimator; may be omitted if a model has only one evidence.
+
+    Returns
+    -------
+    dict of str to Evidence
+
+    Raises
+    ------
+    ModelError
+        If an entry is of another type, or the estimator is ambiguous or missing.
+    DataMismatchError
+        If the models belong to different data.
+    """
+    if not isinstance(given, Mapping) or not given:
+        raise ModelError(
+            "evidences must be a mapping of model names to Evidence or DataTree with at least one "
+            f"entry, got {given!r}"
+        )
+    found = {
+        name: _chosen(name, _by_estimator(name, one), estimator) for name, one in given.items()
+    }
+    by_data: dict[str, list[str]] = {}
+    for name, evidence in found.items():
+        by_data.setdefault(evidence.data_fingerprint, []).append(name)
+    if len(by_data) > 1:
+        groups = " | ".join(", ".join(map(repr, names)) for names in by_data.values())
+        raise DataMismatchError(
+            f"evidences must belong to the same data, got models grouped by their data: {groups}"
+        )
+    return found
+
+
+def _by_estimator(name: str, given: EvidenceLike) -> Mapping[str, Evidence]:
+    if isinstance(given, xr.DataTree):
+        return stored_evidences(given, name)
+    found: object = {given.estimator: given} if isinstance(given, Evidence) else given
+    if isinstance(found, Mapping) and all(isinstance(one, Evidence) for one in found.values()):
+        return found
+    raise ModelError(f"evidences[{name!r}] must be an Evidence or a DataTree, got {given!r}")
+
+
+def _chosen(name: str, found: Mapping[str, Evidence], estimator: str | None) -> Evidence:
+    if estimator is None and len(found) == 1:
+        return next(iter(found.values()))
+    if estimator is None:
+        raise ModelError(
+            f"estimator must be given, because {name!r} has evidences by several: choose one of "
+            f"{list(found)}"
+        )
+    if estimator not in found:
+        raise ModelError(
+            f"estimator must be one of {list(found)}, those of {name!r}, got {estimator!r}"
+        )
+    return found[estimator]

@@ -1,13 +1,13 @@
-"""A model's priors made wider or narrower, and what that does to each draw's prior density.
+"""Evidence under wider or narrower priors, by reweighting the posterior draws.
 
-A prior p stretched by the factor w about c is p_w(phi) = p(c + (phi - c) / w) / w. The draws under
-p tell its evidence, without new likelihoods:
+A prior p scaled by the factor w about c is p_w(phi) = p(c + (phi - c) / w) / w. The draws under p
+give its evidence, without new likelihood evaluations:
 
     Z_w / Z = E[p_w(phi) / p(phi)],   phi from the posterior under p.
 
-The centre c is the end of a support that has one end, or an end at zero, so that a wider prior of a
-positive quantity is one of a positive quantity; elsewhere it is PyMC's support point. A prior that
-depends on other variables is stretched given them.
+The centre c is the end of a half-line, or an end at zero, so that the scaled prior of a positive
+quantity has the same support; otherwise it is PyMC's support point. A prior that depends on other
+variables is scaled conditionally on them.
 """
 
 from collections.abc import Iterable
@@ -32,29 +32,29 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.posterior.support import has_law
+from pymc_statespace_filters.evidence.posterior.support import can_sample
 
-EDGE = 0.05  # of the length of a bounded support, at each end
-# Past these the draws do not know the evidence under the other priors.
-MAX_PARETO_K = 0.5  # from there on the weights have no variance, and their mean no standard error
+EDGE = 0.05  # share of a bounded support, at each end
+# Limits beyond which the reweighted evidence is unreliable.
+MAX_PARETO_K = 0.5  # above, the weights have no variance and their mean no standard error
 MAX_BEYOND = 0.02
 
 Array = NDArray[np.float64]
 
 
-class Reweighted(NamedTuple):
-    """What an evidence becomes under other priors, as far as the draws know.
+class ReweightedEvidence(NamedTuple):
+    """The evidence under scaled priors relative to that under the original ones.
 
     Attributes
     ----------
     log_ratio, error : float
         ln Z_w - ln Z and its standard error.
     n_effective : float
-        What the draws are worth there, in independent terms of relative variance one.
+        Effective number of draws: of independent terms of relative variance one.
     pareto_k : float
         Shape of the upper tail of the weights.
     beyond : float
-        Upper bound of the share of Z_w that lies where the actual prior is zero.
+        Upper bound of the share of Z_w where the original prior is zero.
     """
 
     log_ratio: float
@@ -64,8 +64,8 @@ class Reweighted(NamedTuple):
     beyond: float
 
     @property
-    def is_known(self) -> bool:
-        """Whether the draws are enough, and reach far enough."""
+    def is_reliable(self) -> bool:
+        """Whether there are enough effective draws and they cover the scaled prior."""
         return (
             self.n_effective >= MIN_EFFECTIVE
             and self.pareto_k <= MAX_PARETO_K
@@ -73,11 +73,11 @@ class Reweighted(NamedTuple):
         )
 
 
-UNCHANGED = Reweighted(0.0, 0.0, np.inf, -np.inf, 0.0)
+UNCHANGED = ReweightedEvidence(0.0, 0.0, np.inf, -np.inf, 0.0)
 
 
-class StretchedPrior:
-    """The priors of some free variables of a model, to be stretched together.
+class ScaledPrior:
+    """The priors of some free variables of a model, scaled by a common factor.
 
     Parameters
     ----------
@@ -88,24 +88,24 @@ class StretchedPrior:
     Raises
     ------
     ModelError
-        If a prior has no width: it is improper, or its support cannot be stretched.
+        If a prior is improper or its support cannot be scaled.
     """
 
     def __init__(self, model: pm.Model, names: Iterable[str]) -> None:
-        stretched = [model[name] for name in names]
-        for rv in stretched:
-            _check_stretchable(rv, model)
+        scaled = [model[name] for name in names]
+        for rv in scaled:
+            _check_scalable(rv, model)
         width = pt.dscalar("width")
         values = {rv: rv.type(name=rv.name) for rv in model.free_RVs}
         sizes = {name: int(np.prod(shape)) for name, shape in model.eval_rv_shapes().items()}
-        terms = [_reweighted(rv, values[rv], width, sizes[rv.name]) for rv in stretched]
+        terms = [_log_ratio(rv, values[rv], width, sizes[rv.name]) for rv in scaled]
         outputs = [pt.sum(pt.stack(of_each)) for of_each in zip(*terms, strict=True)]
         rows = {
             value: pt.tensor(value.name, dtype=value.dtype, shape=(None, *value.type.shape))
             for value in values.values()
         }
         self._types = {value.name: value.dtype for value in rows}
-        # One call for all draws: not worth machine code.
+        # One call handles all draws, which is not worth machine code.
         self._function = compile_pymc(
             [width, *rows.values()],
             vectorize_graph(clone_replace(outputs, values), rows),
@@ -113,8 +113,8 @@ class StretchedPrior:
             mode="FAST_COMPILE",
         )
 
-    def reweighted(self, posterior: xr.Dataset, width: float) -> Reweighted:
-        """Find the evidence under stretched priors.
+    def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
+        """Compute the evidence under the scaled priors.
 
         Parameters
         ----------
@@ -128,57 +128,59 @@ class StretchedPrior:
             np.concatenate(posterior[name].transpose("chain", "draw", ...).values).astype(dtype)
             for name, dtype in self._types.items()
         ]
-        with np.errstate(all="ignore"):  # a narrow prior may be zero, its logarithm infinite
+        with np.errstate(all="ignore"):  # a narrow prior may be zero at a draw
             log_ratio, beyond = self._function(width, *rows)
-        return reweigh(log_ratio.reshape(shape), np.broadcast_to(beyond, log_ratio.shape))
+        return average_ratios(log_ratio.reshape(shape), np.broadcast_to(beyond, log_ratio.shape))
 
 
-def reweigh(log_ratio: Array, beyond: Array) -> Reweighted:
-    """Average the ratios p_w / p of draws (chain, draw), and judge the average.
+def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
+    """Average the ratios p_w / p of draws (chain, draw), with diagnostics.
 
     Parameters
     ----------
     log_ratio : ndarray (chain, draw)
     beyond : ndarray
-        As many; see `_beyond`.
+        As many values of `_beyond`.
     """
     peak = log_ratio.max()
     if np.isneginf(peak):
-        return Reweighted(-np.inf, np.inf, 0.0, np.inf, 0.0)
+        return ReweightedEvidence(-np.inf, np.inf, 0.0, np.inf, 0.0)
     beyond_share = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
-    if np.ptp(log_ratio) < SAME:  # a Uniform prior made wider: all draws weigh the same
-        return Reweighted(float(peak), 0.0, np.inf, -np.inf, beyond_share)
+    if np.ptp(log_ratio) < SAME:  # a wider Uniform prior: all weights are equal
+        return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, beyond_share)
     mean = log_mean_of_chains(log_ratio)
-    return Reweighted(mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share)
+    return ReweightedEvidence(
+        mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share
+    )
 
 
-def _check_stretchable(rv: TensorVariable, model: pm.Model) -> None:
-    law = rv.owner.op
-    if not has_law(rv, model):
-        raise ModelError(f"the prior of {rv.name!r} is improper and has no width to change")
-    support = _default_transform(law, rv)
-    if law.ndim_supp > 1 or not isinstance(support, IntervalTransform | LogTransform | None):
+def _check_scalable(rv: TensorVariable, model: pm.Model) -> None:
+    op = rv.owner.op
+    if not can_sample(rv, model):
+        raise ModelError(f"the prior of {rv.name!r} is improper and cannot be scaled")
+    support = _default_transform(op, rv)
+    if op.ndim_supp > 1 or not isinstance(support, IntervalTransform | LogTransform | None):
         raise ModelError(
-            f"the prior of {rv.name!r} has a support that cannot be stretched (as that of a "
-            "probability, a simplex, an angle or a covariance): leave it out of var_names"
+            f"the prior of {rv.name!r} has a support that cannot be scaled (a probability, a "
+            "simplex, an angle or a covariance): leave it out of var_names"
         )
 
 
-def _reweighted(
+def _log_ratio(
     rv: TensorVariable, value: TensorVariable, width: TensorVariable, size: int
 ) -> tuple[TensorVariable, TensorVariable]:
-    """Log-ratio of the densities, and what may lie beyond the bounds, of one variable."""
+    """Log-ratio of the scaled and original density of one variable, and `_beyond`."""
     lower, upper = _bounds(rv)
     on_left = pt.eq(lower, 0) | (pt.isfinite(lower) & pt.isinf(upper))
     on_right = pt.eq(upper, 0) | (pt.isfinite(upper) & pt.isinf(lower))
     centre = pt.switch(on_left, lower, pt.switch(on_right, upper, support_point(rv)))
-    stretched = pm.logp(rv, centre + (value - centre) / width).sum() - size * pt.log(width)
+    scaled = pm.logp(rv, centre + (value - centre) / width).sum() - size * pt.log(width)
     beyond = _beyond(value, lower, upper, centre, width)
-    return stretched - pm.logp(rv, value).sum(), beyond
+    return scaled - pm.logp(rv, value).sum(), beyond
 
 
 def _bounds(rv: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
-    """Ends of the support, infinite where it has none."""
+    """Ends of the support, which may be infinite."""
     support = _default_transform(rv.owner.op, rv)
     ends: tuple[TensorVariable | None, TensorVariable | None] = (None, None)
     if isinstance(support, LogTransform):
@@ -199,10 +201,10 @@ def _beyond(
     centre: TensorVariable,
     width: TensorVariable,
 ) -> TensorVariable:
-    """Bound what a wider prior adds beyond a bounded support, where there are no draws.
+    """Bound the share that a wider prior adds outside a bounded support, where there are no draws.
 
-    If neither the likelihood nor the prior rises outwards from the `EDGE` of the support, what lies
-    beyond is at most the share of the draws in that edge, times how many edges would fit there.
+    If neither the likelihood nor the prior increases outwards from the `EDGE` of the support, the
+    share is at most that of the draws in the edge, times the number of edges that fit outside.
     """
     length = upper - lower
     n_edges = pt.maximum(width - 1, 0) / EDGE

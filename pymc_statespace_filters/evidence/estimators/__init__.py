@@ -1,10 +1,9 @@
-"""Estimators of the evidence: one algorithm a file, on a posterior of which they know no model."""
+"""Evidence estimators, one algorithm per file; they see a `Posterior`, not the model."""
 
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
-from pymc_statespace_filters.evidence.estimators.maximum_likelihood import max_log_likelihood
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
@@ -18,5 +17,4 @@ __all__ = [
     "Laplace",
     "PriorMonteCarlo",
     "TemperedSMC",
-    "max_log_likelihood",
 ]

@@ -1,28 +1,30 @@
-r"""Chib and Jeliazkov's ordinate block by block (Chib and Jeliazkov 2001, section 2.2).
+r"""Chib and Jeliazkov's posterior ordinate, block by block (their section 2.2).
 
-The parameters fall into blocks, and the ordinate of the posterior at x* into conditional ones,
+The parameters are divided into blocks, and the ordinate of the posterior at x* is a product of
+conditional ordinates,
 
 .. math::
 
     p(x^*|D) = \prod_b p(x_b^* | x_{<b}^*, D), \qquad p(x_b^* | x_{<b}^*, D) =
         \frac{E_b[\alpha(x, x')\, q(x_b, x_b^*)]}{E_{b+1}[\alpha(x', x)]}.
 
-E_b is the mean over draws x of the conditional posterior of the blocks from b on, the earlier ones
-fixed at x*; x' is x with its block b put to x_b*. In E_{b+1} x' is such a draw of the blocks after
-b, and x is x' with a block b from q(x_b*, .). Draws of run 1 are those of the posterior; the later,
-reduced runs are this file's own. The last one has nothing left to move and is the point x*.
+E_b is the mean over draws x of the conditional posterior of the blocks from b on, with the earlier
+blocks fixed at x*; x' is x with block b replaced by x_b*. In E_{b+1}, x' is such a draw of the
+blocks after b, and x is x' with block b drawn from q(x_b*, .). The draws of run 1 are those of the
+posterior; the later, reduced runs are made here. The last one has no free block and is the point
+x*.
 
-Blocks are of whitened coordinates y, x = x* + L y with L L^T the covariance of the draws: there a
-Gaussian posterior has independent blocks of unit variance, for which q = N(0, I) serves as it is.
-The ordinate in x is that in y over det L.
+Blocks are of whitened coordinates y, x = x* + L y, where L L^T is the covariance of the draws. A
+Gaussian posterior has independent blocks of unit variance there, so that q = N(0, I) needs no
+scale. The ordinate in x is that in y divided by det L.
 
 Each run serves two means, the denominator of one block and the numerator of the next: the error is
 that of the difference of the two terms, draw by draw.
 
-With a noisy likelihood a draw keeps the estimate by which its chain accepted, and a point that is
-proposed, x' in the numerators and x in the denominators, gets a fresh one. On (x, noise) the
-proposal is q times the law of the noise, and both sides of detailed balance, integrated over
-everything, are
+With a noisy likelihood a draw keeps the estimate by which its chain accepted it, and a proposed
+point (x' in the numerators, x in the denominators) gets a fresh one. On (x, noise) the proposal is
+q times the distribution of the noise, and both sides of detailed balance, integrated over all
+variables, are
 
 .. math::
 
@@ -44,13 +46,13 @@ from scipy.special import softmax
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
-from pymc_statespace_filters.evidence.estimators.whitening import Whitened
-from pymc_statespace_filters.evidence.log_mean import error_of_chains, error_of_walkers, log_mean
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening
+from pymc_statespace_filters.evidence.log_mean import log_mean, mcse_of_chains, mcse_of_walkers
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 N_WALKERS = 64
 N_WARMUP = 30
-START_SCALE = 0.7  # narrower than the draws, so that no draw of the tails starts many walkers
+START_SCALE = 0.7  # below one, so that no draw in the tails starts many walkers
 
 Array = NDArray[np.float64]
 Target = Callable[[Array], Array]  # log-densities (m,) of whitened points (m, k)
@@ -58,14 +60,14 @@ Target = Callable[[Array], Array]  # log-densities (m,) of whitened points (m, k
 
 @dataclass(frozen=True)
 class Run:
-    """Draws in whitened coordinates, y (chain, draw, k), with the estimates that they keep."""
+    """Draws in whitened coordinates, y (chain, draw, k), with their stored estimates."""
 
     y: Array
     log_density: Array  # (chain, draw)
     n_moves: float = math.inf  # accepted by a walker on average
 
-    def moved_to(self, values: Array | float, block: slice) -> Array:
-        """The draws with other values in one block, flat (m, k)."""
+    def with_block(self, values: Array | float, block: slice) -> Array:
+        """The draws with `values` in one block, flat (m, k)."""
         moved = self.y.copy()
         moved[..., block] = values
         return moved.reshape(-1, moved.shape[-1])
@@ -73,7 +75,7 @@ class Run:
 
 @dataclass(frozen=True)
 class BlockEstimate:
-    """A log-evidence and how far its means can be trusted."""
+    """A log-evidence with its error and diagnostics."""
 
     log_evidence: float
     se: float
@@ -96,7 +98,7 @@ def estimate_in_blocks(
     proposal : Proposal
         Fitted to other draws than those of `posterior`.
     n_blocks : int
-        Of neighbouring coordinates, as equal in size as can be; at most k.
+        Blocks of neighbouring coordinates, of nearly equal size; at most k.
     n_proposals : int
         Draws of every run, and fresh evaluations in every mean over one.
     """
@@ -107,40 +109,34 @@ def estimate_in_blocks(
         return posterior.evaluate(point + y @ chol.T, rng)
 
     run = _thinned(proposal, posterior, n_proposals)
-    centre = run.y.mean(axis=(0, 1))
+    center = run.y.mean(axis=(0, 1))
     log_ordinate = -float(np.log(np.diag(chol)).sum())
-    leaving: Array | float = 0.0
+    denominator_terms: Array | float = 0.0
     errors, n_moves = [], []
     ends = np.linspace(0, k, n_blocks + 1).round().astype(int)
     for start, stop in pairwise(ends):
         block, is_last = slice(start, stop), stop == k
+        at_center = run.with_block(0.0, block)
+        fresh = np.full(len(at_center), proposal.log_density) if is_last else target(at_center)
+        log_to_center = _log_alpha_q_to_center(run, fresh, block)
+        numerator, numerator_terms = _normalised(log_to_center, "draws moved to the central point")
+        # Both terms come from one run, so that the error is that of their difference.
+        terms = numerator_terms - denominator_terms
+        errors.append(mcse_of_chains(terms) if start == 0 else mcse_of_walkers(terms))
 
-        # Numerator: from the draws of this run to x_b*.
-        moved = run.moved_to(0.0, block)
-        fresh = np.full(len(moved), proposal.log_density) if is_last else target(moved)
-        gain = fresh.reshape(run.log_density.shape) - run.log_density
-        log_arriving = np.minimum(0.0, gain) + _log_normal(run.y[..., block])
-        numerator, arriving = _relative(log_arriving, "draws moved to the central point")
-        terms = arriving - leaving
-        errors.append(error_of_chains(terms) if start == 0 else error_of_walkers(terms))
-
-        # Denominator: away from x_b*, the later blocks from the next run.
         if is_last:
             constant = np.full((1, n_proposals), proposal.log_density)
             run = Run(np.zeros((1, n_proposals, k)), constant)
         else:
-            log_weights = (gain + _log_normal(run.y[..., block] / START_SCALE)).ravel()
-            chosen = rng.choice(len(moved), size=N_WALKERS, p=softmax(log_weights))
+            chosen = _choose_walkers(run, fresh, block, rng)
             free = slice(stop, k)
-            run = _walk(target, moved[chosen], fresh[chosen], centre, free, n_proposals, rng)
+            run = _walk(target, at_center[chosen], fresh[chosen], center, free, n_proposals, rng)
             n_moves.append(run.n_moves)
-        steps = rng.standard_normal(run.y[..., block].shape)
-        proposed = target(run.moved_to(steps, block)).reshape(run.log_density.shape)
-        log_leaving = np.minimum(0.0, proposed - run.log_density)
-        denominator, leaving = _relative(log_leaving, "proposals around the draws")
+        log_from_center = _log_alpha_from_center(target, run, block, rng)
+        denominator, denominator_terms = _normalised(log_from_center, "proposals around the draws")
         log_ordinate += numerator - denominator
 
-    errors.append(float(np.std(leaving)) / n_proposals**0.5)
+    errors.append(float(np.std(denominator_terms)) / n_proposals**0.5)
     return BlockEstimate(
         log_evidence=proposal.log_density - log_ordinate,
         se=math.hypot(*errors),
@@ -149,11 +145,35 @@ def estimate_in_blocks(
     )
 
 
+def _log_alpha_q_to_center(run: Run, fresh: Array, block: slice) -> Array:
+    """Numerator terms: log of alpha(x, x') q(x_b, x_b*), with `fresh` the log-densities of x'."""
+    gain = fresh.reshape(run.log_density.shape) - run.log_density
+    return np.minimum(0.0, gain) + _log_normal(run.y[..., block])
+
+
+def _log_alpha_from_center(
+    target: Target, run: Run, block: slice, rng: np.random.Generator
+) -> Array:
+    """Denominator terms: log of alpha(x', x), with the block of x drawn from q(x_b*, .)."""
+    steps = rng.standard_normal(run.y[..., block].shape)
+    proposed = target(run.with_block(steps, block)).reshape(run.log_density.shape)
+    return np.minimum(0.0, proposed - run.log_density)
+
+
+def _choose_walkers(
+    run: Run, fresh: Array, block: slice, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Resample draws, moved to x_b*, as starting points of the walkers of the next run."""
+    gain = fresh.reshape(run.log_density.shape) - run.log_density
+    log_weights = (gain + _log_normal(run.y[..., block] / START_SCALE)).ravel()
+    return rng.choice(len(fresh), size=N_WALKERS, p=softmax(log_weights))
+
+
 def _thinned(proposal: Proposal, posterior: Posterior, most: int) -> Run:
-    """The draws of the posterior, evenly thinned to about `most`, in whitened coordinates."""
+    """Draws of the posterior, thinned evenly to about `most`, in whitened coordinates."""
     thinned = posterior.thinned(most)
     flat = thinned.draws.reshape(-1, len(proposal.point))
-    y = Whitened(proposal.point, proposal.chol).whitened(flat)
+    y = Whitening(proposal.point, proposal.chol).whitened(flat)
     return Run(y.reshape(thinned.draws.shape), thinned.log_density)
 
 
@@ -166,17 +186,16 @@ def _walk(
     n_draws: int,
     rng: np.random.Generator,
 ) -> Run:
-    """Draw the free coordinates given the others by Metropolis walkers side by side.
+    """Sample the free coordinates given the others, by independent Metropolis walkers.
 
-    A proposal turns a walker by a random angle towards a new normal draw around `centre`, which
-    leaves N(centre, I) as it is: far turns suit a posterior that is nearly Gaussian, small ones any
-    other.
+    A proposal rotates a walker by a random angle towards a new draw of N(centre, I), which leaves
+    N(centre, I) invariant: large angles suit a nearly Gaussian posterior, small ones any other.
 
     Parameters
     ----------
     target : callable
     y, log_density : ndarray (walker, k), (walker,)
-        Starts and their kept estimates, nearly draws already: those of the run before, resampled.
+        Starting points with their stored estimates, resampled from the previous run.
     """
     n_kept = -(-n_draws // len(y))
     kept_y, kept_log_density, n_moves = [], [], 0.0
@@ -204,12 +223,12 @@ def _log_normal(y: Array) -> Array:
     return -0.5 * (y**2).sum(axis=-1) - 0.5 * y.shape[-1] * np.log(2 * np.pi)
 
 
-def _relative(log_terms: Array, what: str) -> tuple[float, Array]:
-    """Log of the mean of positive terms, and the terms over their mean."""
+def _normalised(log_terms: Array, what: str) -> tuple[float, Array]:
+    """Log of the mean of positive terms, and the terms divided by their mean."""
     value = log_mean(log_terms)
     if np.isneginf(value):
         raise DataMismatchError(
-            f"none of {log_terms.size} {what} has a density: idata belongs to another model or to "
-            "other data, or n_blocks=1 suits it better"
+            f"all {log_terms.size} {what} have zero density: idata belongs to another model or to "
+            "other data, or needs n_blocks=1"
         )
     return value, np.exp(log_terms - value)

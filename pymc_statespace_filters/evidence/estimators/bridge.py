@@ -1,4 +1,4 @@
-r"""Bridge sampling between the posterior and a normal law (Meng and Wong 1996), warped or not.
+r"""Bridge sampling to a normal distribution (Meng and Wong 1996), optionally warped.
 
 With f = log prior + log likelihood, a normalised density q and any function h,
 
@@ -6,35 +6,36 @@ With f = log prior + log likelihood, a normalised density q and any function h,
 
     p(D) = \frac{E_{x \sim q}[e^{f(x)} h(x)]}{E_{x \sim p(x|D)}[q(x) h(x)]},
 
-and the error is smallest for h = 1 / (n_1 e^f / p(D) + n_2 q), where n_1 draws of the posterior
-and n_2 of q are independent (their Eq. 3.3). In logs, with l = f - ln q, the p(D) that agrees with
-the h it implies is where
+and the error is smallest for h = 1 / (n_1 e^f / p(D) + n_2 q), if n_1 draws of the posterior and
+n_2 of q are independent (their Eq. 3.3). In logs, with l = f - ln q, the fixed point p(D) solves
 
 .. math::
 
     \ln E_q[\sigma(u)] - \ln E_{p(x|D)}[\sigma(-u)] = \ln (n_1 / n_2),
     \qquad u = l - \ln p(D) + \ln (n_1 / n_2), \quad \sigma(u) = 1 / (1 + e^{-u}).
 
-Autocorrelated draws count in n_1 by their effective number. The variance is that of the two means
-under this h (Fruehwirth-Schnatter 2004): any h gives the same p(D), so that what is uncertain in h
-does not matter to first order. The terms are bounded, so that no tail of q makes it infinite.
+The effective sample size of autocorrelated draws replaces n_1. The variance is that of the two
+means under this h (Fruehwirth-Schnatter 2004): any h gives the same p(D), so that the uncertainty
+of h does not matter to first order. The terms are bounded, so that the variance is finite whatever
+the tails of q.
 
 Warp-III (Meng and Schilling 2002) brings the posterior nearer to q: it is standardised by the mean
 m and covariance of the draws and reflected at random about m, so that its kernel becomes the
-average of the two mirror images, [e^f(x) + e^f(2m - x)] / 2. That is symmetric as q is, and has the
-same integral; the price is an evaluation at the mirror image of every draw and of every proposal.
+average of the two mirror images, [e^f(x) + e^f(2m - x)] / 2. The average is symmetric like q and
+has the same integral; it costs an evaluation at the mirror image of every draw and proposal.
 
-Differences from the sources. The fixed point is bracketed instead of iterated to: the equation is
-monotone in ln p(D), and iteration crawls where the two laws hardly overlap. Each half of the chains
-is averaged under the q that the other half fitted, and the two estimates are averaged: fitted to
-the very draws that it averages, q would overlap with them too well. The two are not independent: if
-the halves differ, each sees the other's q displaced by the same. That part of their errors is
-measured by the change of the terms under a q fitted to all draws, and counted as common to both.
+Differences from the sources. The fixed point is bracketed instead of iterated: the equation is
+monotone in ln p(D), and the iteration is slow if the two distributions hardly overlap. The
+estimator is cross-fitted: q fitted to one half of every chain is used with the draws of the other
+half, and the two estimates are averaged, because q overlaps too well with the draws to which it was
+fitted. The two estimates are not independent: if the halves differ, each sees the other's q
+displaced by the same amount. This part of their errors is measured by the change of the terms under
+a q fitted to all draws, and counted as common to both.
 
-With a noisy likelihood, f of a draw is the estimate that the chain stored and f of any new point is
-a fresh one: draws and proposals are then points of the space of x and noise, in which the identity
-is the same, q with the noise's own law in place of q. The reflection of warp-III swaps the
-noises of a point and its image there: a draw has the noise of the chain, its image a fresh one.
+With a noisy likelihood, f of a draw is the estimate stored by the chain, and f of a new point is a
+fresh estimate. The identity then holds on the space of x and noise, with q times the distribution
+of the noise in place of q. The reflection of warp-III swaps the noises of a point and its image: a
+draw has the noise of the chain, its image fresh noise.
 """
 
 import math
@@ -58,10 +59,10 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
-FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, of both halves
-MAX_ERROR = MIN_EFFECTIVE**-0.5  # and so it is with fewer effective terms
+FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, in both halves
+MAX_ERROR = MIN_EFFECTIVE**-0.5  # the error of `MIN_EFFECTIVE` terms of relative variance one
 MAX_GAP = 4.0
 
 Array = NDArray[np.float64]
@@ -69,16 +70,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bridge:
-    """Bridge sampling to a normal law fitted to the draws (Meng and Wong 1996).
+    """Bridge sampling to a normal distribution fitted to the draws (Meng and Wong 1996).
 
-    As many proposals as there are draws, at least 1000 and at most 10 000: beyond that the draws
-    are seldom worth more than the proposals.
+    The number of proposals is that of the draws, within 1000 to 10 000: beyond that the error of
+    the draws usually dominates.
 
     Parameters
     ----------
     warped : bool
-        Reflect the posterior about its mean at random (warp-III, Meng and Schilling 2002). That
-        serves skewed posteriors, and takes three times as many evaluations.
+        Whether to reflect the posterior about its mean at random (warp-III, Meng and Schilling
+        2002). This suits skewed posteriors and takes three times as many evaluations.
 
     Examples
     --------
@@ -89,12 +90,17 @@ class Bridge:
 
     warped: bool = False
 
+    @property
+    def name(self) -> str:
+        """``"bridge"`` or ``"warp_bridge"``."""
+        return "warp_bridge" if self.warped else "bridge"
+
     def n_evaluations(self, posterior: Posterior) -> int:
-        """One for each proposal; warped, also one for each mirror image."""
+        """One per proposal; warped, also one per mirror image."""
         return _n_terms(posterior) * (3 if self.warped else 1)
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
-        """Estimate the log-evidence from draws and a log-density that can be evaluated."""
+        """Estimate the log-evidence from the draws and further log-density evaluations."""
         n_proposals = _n_terms(posterior) // 2
         pooled = moments(posterior.draws)
         first, second = posterior.halves()
@@ -119,7 +125,7 @@ class Bridge:
                 "se_proposals": se_proposals,
                 "zero_density": float(np.mean([fold.zero_density for fold in folds])),
             },
-            doubts=tuple(_doubts(n_effective, se_draws, se_proposals, gap)),
+            doubts=tuple(_check(n_effective, se_draws, se_proposals, gap)),
         )
 
     def _estimate_fold(
@@ -131,7 +137,7 @@ class Bridge:
         *,
         rng: np.random.Generator,
     ) -> "_Fold":
-        """Bridge from the averaged draws to the normal law of the fitted ones."""
+        """Bridge from the averaged draws to the normal distribution fitted to the other half."""
         mean, chol = moments(fitted.draws)
         q = _normal(mean, chol)
         proposals = q.rvs(n_proposals, random_state=rng).reshape(n_proposals, -1)
@@ -142,7 +148,7 @@ class Bridge:
         at_proposals = self._warp(averaged, proposals, at_proposals, mean, rng)
         if np.isneginf(at_proposals).all():
             raise DataMismatchError(
-                f"none of {n_proposals} proposals around the draws has a density: idata belongs "
+                f"all {n_proposals} proposals around the draws have zero density: idata belongs "
                 "to another model or to other data"
             )
         draws = averaged.draws.reshape(-1, len(mean))
@@ -162,7 +168,7 @@ class Bridge:
         mean: Array,
         rng: np.random.Generator,
     ) -> Array:
-        """Average the density of x (m, k) with that of its mirror image, if so set."""
+        """Average the density of x (m, k) with that of its mirror image, if warped."""
         if not self.warped:
             return log_density
         return np.logaddexp(log_density, posterior.evaluate(2 * mean - x, rng)) - math.log(2)
@@ -175,8 +181,8 @@ class _Fold:
     log_evidence: float
     draws: LogMean
     proposals: LogMean
-    common: float  # part of the draws' error that the other half has too
-    n_effective: float  # draws, by their autocorrelation
+    common: float  # part of the draws' error that the two halves share
+    n_effective: float  # effective number of draws
     zero_density: float  # share of the proposals
 
 
@@ -187,7 +193,7 @@ def _bridge(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
     """
     log_odds = math.log(at_draws.size / at_proposals.size)
     shift = log_odds - _fixed_point(at_draws, at_proposals, log_odds)
-    # What the draws are worth depends on the terms, and those but little on what they are worth.
+    # One fixed-point step suffices: the effective sample size depends only weakly on itself.
     n_effective = float(az.ess(expit(-at_draws - shift), method="mean"))
     log_odds = math.log(n_effective / at_proposals.size)
     log_evidence = _fixed_point(at_draws, at_proposals, log_odds)
@@ -207,7 +213,7 @@ def _bridge(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
 
 
 def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float:
-    """The log-evidence that agrees with the optimal h it implies, of which there is one."""
+    """The unique log-evidence that is consistent with the optimal h which it implies."""
 
     def excess(log_evidence: float) -> float:
         shift = log_odds - log_evidence
@@ -215,7 +221,7 @@ def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float
         lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
         return float(upper - lower - log_odds)
 
-    # The evidence lies among the ratios; proposals without density lower it by no more than this.
+    # The evidence lies within the ratios, lowered at most by the share of zero-density proposals.
     possible = at_proposals[~np.isneginf(at_proposals)]
     share = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
     least = min(at_draws.min(), possible.min()) + share - 1
@@ -231,8 +237,8 @@ def _n_terms(posterior: Posterior) -> int:
     return min(max(posterior.log_density.size, FEWEST_TERMS), MOST_TERMS)
 
 
-def _doubts(n_effective: float, se_draws: float, se_proposals: float, gap: float) -> Iterator[str]:
-    """Reasons for doubt, from what the draws are worth, both errors and the gap between halves."""
+def _check(n_effective: float, se_draws: float, se_proposals: float, gap: float) -> Iterator[str]:
+    """Check the effective sample size, both errors and the gap between the halves."""
     if n_effective < MIN_EFFECTIVE:
         yield (
             f"the draws are worth {n_effective:.0f} independent ones, fewer than "
@@ -240,9 +246,9 @@ def _doubts(n_effective: float, se_draws: float, se_proposals: float, gap: float
         )
     if max(se_draws, se_proposals) > MAX_ERROR:
         yield (
-            f"few draws lie where the proposals do (errors of {se_draws:.2f} nats from the draws, "
-            f"{se_proposals:.2f} from the proposals): draw more, or give the parameters a scale "
-            "on which their posterior is nearer to a Gaussian"
+            f"draws and proposals hardly overlap (errors of {se_draws:.2f} nats from the draws, "
+            f"{se_proposals:.2f} from the proposals): draw more, or reparametrise towards a "
+            "Gaussian posterior"
         )
     if gap > MAX_GAP:
-        yield f"the halves of the draws differ by {gap:.1f} of their standard errors: draw more"
+        yield f"the halves of the draws differ by {gap:.1f} standard errors: draw more"

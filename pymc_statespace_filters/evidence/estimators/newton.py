@@ -1,6 +1,7 @@
-"""The largest value of a smooth function near the draws: Newton's method on differences.
+"""Maximise a smooth function by a trust-region Newton method with finite differences.
 
-Of more than fifty parameters the Hessian is not made, only its products with directions.
+The coordinates are scaled such that the posterior draws have unit variance. Above fifty parameters
+the Hessian is not formed; only its products with directions are computed.
 """
 
 from collections.abc import Callable
@@ -13,42 +14,42 @@ from scipy.optimize import minimize
 STEP = 0.01  # of the differences, in standard deviations of the draws
 MAX_GRADIENT = 1e-4  # nats per standard deviation
 MAX_ITERATIONS = 100
-MANY = 50  # parameters whose Hessian is too large: products with it take its place
-# Steps in a row that gain next to nothing end a climb: on a ridge the gradient may never vanish.
+MAX_DENSE = 50  # parameters; above, Hessian-vector products replace the Hessian
+# Stop after MAX_IDLE steps in a row that gain less: on a ridge the gradient may never vanish.
 MIN_GAIN, MAX_IDLE = 1e-7, 5
 
 Array = NDArray[np.float64]
-Rows = Callable[[Array], Array]
+BatchFunction = Callable[[Array], Array]
 
 
-class Top(NamedTuple):
-    """Where a climb ended."""
+class Maximum(NamedTuple):
+    """The best point that was evaluated."""
 
     point: Array  # (k,)
     value: float
-    at_edge: bool  # one difference step further there is no value
+    at_edge: bool  # the function is -inf within one difference step
 
 
 class EdgeError(Exception):
-    """The function is minus infinity within one step of a point."""
+    """The function is -inf within one difference step of a point."""
 
 
 def best_of_chains(values: Array, n_best: int) -> NDArray[np.int64]:
-    """Flat indices of the best draw of each chain, the best `n_best` of them, best first."""
+    """Flat indices of the largest value in each chain, best first, at most `n_best`."""
     flat = values.argmax(axis=1) + np.arange(len(values)) * values.shape[1]
     return flat[np.argsort(-values.ravel()[flat], kind="stable")][:n_best]
 
 
-def derivatives(function: Rows, point: Array, step: float) -> tuple[Array, Array]:
+def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Array, Array]:
     """Gradient (k,) and Hessian (k, k) by central differences; k (k + 1) + 1 points in one call.
 
-    The mixed ones need the two diagonal neighbours alone, f(x + h e_i + h e_j) and f(x - h e_i - h
-    e_j), because the neighbours along the axes are there already.
+    A mixed derivative takes only two further points, f(x + h e_i + h e_j) and f(x - h e_i - h e_j),
+    beside the points along the axes.
 
     Raises
     ------
     EdgeError
-        If the function is minus infinity at one of the points.
+        If the function is not finite at one of the points.
     """
     k = len(point)
     axes = step * np.eye(k)
@@ -68,13 +69,13 @@ def derivatives(function: Rows, point: Array, step: float) -> tuple[Array, Array
     return (up - down) / (2 * step), hessian
 
 
-def gradient(function: Rows, point: Array, step: float) -> Array:
+def gradient(function: BatchFunction, point: Array, step: float) -> Array:
     """Gradient (k,) by central differences; 2 k points in one call.
 
     Raises
     ------
     EdgeError
-        If the function is minus infinity at one of the points.
+        If the function is not finite at one of the points.
     """
     axes = step * np.eye(len(point))
     values = function(np.concatenate([point + axes, point - axes]))
@@ -84,8 +85,8 @@ def gradient(function: Rows, point: Array, step: float) -> Array:
     return (up - down) / (2 * step)
 
 
-def curvature_along(function: Rows, point: Array, direction: Array, step: float) -> Array:
-    """Product (k,) of the Hessian with a direction, from the gradients on either side."""
+def curvature_along(function: BatchFunction, point: Array, direction: Array, step: float) -> Array:
+    """Product (k,) of the Hessian with a direction, by central differences of the gradient."""
     length = np.linalg.norm(direction)
     if length == 0:
         return np.zeros_like(point)
@@ -94,42 +95,16 @@ def curvature_along(function: Rows, point: Array, direction: Array, step: float)
     return (ahead - behind) * length / (2 * step)
 
 
-def climb(function: Rows, start: Array) -> Top:
-    """Go up from `start` (k,) until the gradient vanishes, or until one step leads off an edge.
+def newton_maximize(function: BatchFunction, start: Array) -> Maximum:
+    """Maximise from `start` (k,) until the gradient vanishes or the edge of the support is met.
 
-    A trust region bears with minus infinity, which is a step too far, with Hessians of any sign,
-    and with functions that level off towards infinity, where it stops.
+    The trust region copes with values of -inf (a step too far), with indefinite Hessians, and with
+    functions that level off towards infinity, where the search stops.
     """
-    known: dict[bytes, tuple[Array, Array]] = {}
-    best = Top(start, -np.inf, at_edge=False)
-    before, n_idle = -np.inf, 0
-
-    def descent(z: Array) -> float:
-        nonlocal best
-        value = float(function(z[np.newaxis])[0])
-        if value > best.value:
-            best = Top(z.copy(), value, at_edge=False)
-        return -value
-
-    def differences(z: Array) -> tuple[Array, Array]:
-        if z.tobytes() not in known:  # gradient and Hessian are asked for one after the other
-            known.clear()
-            known[z.tobytes()] = derivatives(function, z, STEP)
-        return known[z.tobytes()]
-
-    def stop_if_idle(_: Array) -> None:
-        nonlocal before, n_idle
-        n_idle = n_idle + 1 if best.value < before + MIN_GAIN else 0
-        before = best.value
-        if n_idle == MAX_IDLE:
-            raise StopIteration
-
-    if len(start) <= MANY:
-        method: dict[str, Any] = {
-            "method": "trust-exact",
-            "jac": lambda z: -differences(z)[0],
-            "hess": lambda z: -differences(z)[1],
-        }
+    search = _Search(function, start)
+    method: dict[str, Any]
+    if len(start) <= MAX_DENSE:
+        method = {"method": "trust-exact", "jac": search.gradient, "hess": search.hessian}
     else:
         method = {
             "method": "trust-ncg",
@@ -138,12 +113,50 @@ def climb(function: Rows, start: Array) -> Top:
         }
     try:
         minimize(
-            descent,
+            search.objective,
             start,
             **method,
-            callback=stop_if_idle,
+            callback=search.stop_if_idle,
             options={"gtol": MAX_GRADIENT, "maxiter": MAX_ITERATIONS},
         )
     except EdgeError:
-        return best._replace(at_edge=True)
-    return best
+        return search.best._replace(at_edge=True)
+    return search.best
+
+
+class _Search:
+    """Objective and derivatives for SciPy's minimiser, and the best point so far."""
+
+    def __init__(self, function: BatchFunction, start: Array) -> None:
+        self._function = function
+        self.best = Maximum(start, -np.inf, at_edge=False)
+        self._previous, self._n_idle = -np.inf, 0
+        self._known: dict[bytes, tuple[Array, Array]] = {}
+
+    def objective(self, z: Array) -> float:
+        """Minus the function."""
+        value = float(self._function(z[np.newaxis])[0])
+        if value > self.best.value:
+            self.best = Maximum(z.copy(), value, at_edge=False)
+        return -value
+
+    def gradient(self, z: Array) -> Array:
+        """Gradient of the objective."""
+        return -self._derivatives(z)[0]
+
+    def hessian(self, z: Array) -> Array:
+        """Hessian of the objective."""
+        return -self._derivatives(z)[1]
+
+    def _derivatives(self, z: Array) -> tuple[Array, Array]:
+        if z.tobytes() not in self._known:  # SciPy asks for the two one after the other
+            self._known = {z.tobytes(): derivatives(self._function, z, STEP)}
+        return self._known[z.tobytes()]
+
+    def stop_if_idle(self, _: Array) -> None:
+        """Stop after `MAX_IDLE` iterations in a row without a gain."""
+        idle = self.best.value < self._previous + MIN_GAIN
+        self._n_idle = self._n_idle + 1 if idle else 0
+        self._previous = self.best.value
+        if self._n_idle == MAX_IDLE:
+            raise StopIteration

@@ -1,17 +1,17 @@
-"""What every estimator of the evidence gives, before it is reported as an `Evidence`."""
+"""The contract of an evidence estimator: what it is given and what it returns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A log-evidence, its error, and how they came about.
+    """A log-evidence, its standard error, and how they were obtained.
 
     Attributes
     ----------
@@ -19,9 +19,10 @@ class Estimate:
     se : float
         Numerical standard error; NaN if the estimator has none, as Laplace's.
     settings : mapping of str to float
-        What the estimator chose and met: scales, counts, effective numbers.
+        Settings and diagnostics (scales, counts, effective sample sizes), stored in the group
+        ``evidence`` beside the estimate.
     doubts : tuple of str
-        Reasons why the error may be larger than it says, each with its cure.
+        Reasons why the error may be larger than `se`, each with a remedy.
     """
 
     log_evidence: float
@@ -30,11 +31,67 @@ class Estimate:
     doubts: tuple[str, ...] = ()
 
 
+@runtime_checkable
 class Estimator(Protocol):
-    """The evidence from draws of a posterior, and a log-density that can be evaluated."""
+    """An algorithm that estimates the evidence from posterior draws and a log-density.
+
+    Any object with these three members can be passed to `estimate_evidence`. Its own settings are
+    its attributes, checked when it is constructed; it raises `ModelError` for a model that it
+    cannot treat.
+
+    Examples
+    --------
+    Importance sampling from a normal distribution fitted to the draws:
+
+    >>> import numpy as np
+    >>> from scipy.stats import multivariate_normal
+    >>> from pymc_statespace_filters.evidence.estimators import Estimate
+    >>> class NormalImportance:
+    ...     name = "normal_importance"
+    ...
+    ...     def n_evaluations(self, posterior):
+    ...         return 1000
+    ...
+    ...     def estimate(self, posterior, *, rng):
+    ...         draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
+    ...         q = multivariate_normal(draws.mean(axis=0), np.cov(draws.T))
+    ...         x = q.rvs(1000, random_state=rng).reshape(1000, -1)
+    ...         weights = np.exp(posterior.evaluate(x, rng) - q.logpdf(x))
+    ...         se = weights.std() / weights.mean() / 1000**0.5
+    ...         return Estimate(float(np.log(weights.mean())), float(se))
+
+    It estimates the evidence of a model beside a built-in estimator:
+
+    >>> import arviz as az
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> normals = np.random.default_rng(1).standard_normal((4, 1000))
+    >>> idata = az.from_dict({"posterior": {"mu": 4 / 13 + normals / np.sqrt(3.25)}})
+    >>> with pm.Model():
+    ...     mu = pm.Normal("mu", 0, 2)
+    ...     _ = pm.Normal("y", mu, 1, observed=[0.3, -0.4, 1.1])
+    ...     found = psf.estimate_evidence(
+    ...         idata, estimators=["bridge", NormalImportance()], random_seed=2
+    ...     )
+    >>> list(found), bool(found.agreement)
+    (['bridge', 'normal_importance'], True)
+    """
+
+    @property
+    def name(self) -> str:
+        """Name under which the estimate is returned and stored."""
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
-        """Estimate the log-evidence."""
+        """Estimate the log-evidence.
+
+        Parameters
+        ----------
+        posterior : Posterior
+            Unconstrained draws with their log-densities, and functions that evaluate the
+            log-density and the prior at further points.
+        rng : numpy.random.Generator
+            The only source of randomness.
+        """
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """About how many evaluations of the log-density it will take."""
+        """Approximate number of log-density evaluations, for the progress bar."""

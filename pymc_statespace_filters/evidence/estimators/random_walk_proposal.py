@@ -1,12 +1,12 @@
 """The random-walk proposal q of Chib and Jeliazkov's identity: its centre and its width.
 
-The centre x* may be any point; it bears on the error only. Several are tried, because each fails
-somewhere: the mean and the median are the steadiest, but lie in the hole of a ring or between two
-modes; the centres of two clusters of the draws lie in two modes, if those are far apart; the draw
-of largest log-density is never in a hole, but far from the centre in many dimensions, and with a
-noisy likelihood merely a lucky one. The log-density at each is averaged over fresh estimates, holes
-are left out, and the centre with the smallest predicted error of the evidence is taken, and then
-the width.
+The centre x* may be any point; it affects only the error. Several candidates are compared, because
+each fails for some posterior: the mean and the median are the most stable, but lie in the hole of a
+ring or between two modes; the centres of two clusters of draws lie in two modes if these are far
+apart; the draw of largest log-density never lies in a hole, but far from the centre in many
+dimensions, and with a noisy likelihood its estimate is biased upwards. The log-density at each
+candidate is averaged over fresh estimates and candidates in holes are discarded. The candidate with
+the smallest predicted error of the evidence is chosen, then the width.
 """
 
 from dataclasses import dataclass, replace
@@ -16,28 +16,28 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators.whitening import Whitened, moments
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-N_PILOT = 500  # evaluations that serve the choice of the scale and are then thrown away
-N_REPEATS = 20  # fresh estimates behind the constant of a noisy likelihood
+N_PILOT = 500  # evaluations to choose the scale, not used for the estimate
+N_REPEATS = 20  # fresh estimates averaged into f(x*) of a noisy likelihood
 N_CLUSTERS = 2
-N_CLUSTERED = 4000  # draws that are clustered, at most
-HOLE = 0.1  # quantile of the draws' log-densities, below which a centre lies in a hole
+N_CLUSTERED = 4000  # draws to be clustered, at most
+HOLE = 0.1  # quantile of the draws' log-densities below which a centre lies in a hole
 N_ITERATIONS = 30
-MAX_LOG = 200.0  # a relative variance beyond all use
-LEAST = 500  # proposals, unless fewer are asked for
-SHARE = 1 / 3  # of the numerator's error, that the denominator may have
-NEGLIGIBLE = 0.01  # nats, an error that is not worth more evaluations
+MAX_LOG = 200.0  # avoids overflow of a useless relative variance
+MIN_PROPOSALS = 500  # of the default
+MAX_ERROR_RATIO = 1 / 3  # error of the denominator over that of the numerator
+NEGLIGIBLE = 0.01  # nats, an error that needs no more evaluations
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """q(x*, .) = N(x*, s^2 C), with the one log-density that is used at x* everywhere."""
+    """q(x*, .) = N(x*, s^2 C), with the log-density at x*, a constant in all terms."""
 
     point: Array  # (k,)
     log_density: float
@@ -47,7 +47,7 @@ class Proposal:
     def log_q(self, x: Array) -> Array:
         """Log q(x, x*) of x (..., k)."""
         k = len(self.point)
-        z = Whitened(self.point, self.chol).whitened(x.reshape(-1, k)) / self.scale
+        z = Whitening(self.point, self.chol).whitened(x.reshape(-1, k)) / self.scale
         log_det = np.log(np.diag(self.chol)).sum() + k * np.log(self.scale)
         log_q = -0.5 * (z**2).sum(axis=1) - 0.5 * k * np.log(2 * np.pi) - log_det
         return log_q.reshape(x.shape[:-1])
@@ -57,18 +57,18 @@ class Proposal:
         z = rng.standard_normal((count, len(self.point)))
         return self.point + self.scale * z @ self.chol.T
 
-    def log_leaving(self, log_density: Array) -> Array:
-        """Log alpha(x*, x) for x of these log-densities; where there is no density it is -inf."""
+    def log_alpha_from_center(self, log_density: Array) -> Array:
+        """Log alpha(x*, x), given the log-densities of x; -inf where the density is zero."""
         return np.minimum(0.0, log_density - self.log_density)
 
-    def log_arriving(self, log_density: Array) -> Array:
-        """Log alpha(x, x*) for x of these log-densities."""
+    def log_alpha_to_center(self, log_density: Array) -> Array:
+        """Log alpha(x, x*), given the log-densities of x."""
         return np.minimum(0.0, self.log_density - log_density)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A proposal, how many draws of it to take, and what they promise."""
+class ProposalPlan:
+    """A proposal, the number of draws to take from it, and the predicted standard error."""
 
     proposal: Proposal
     n_proposals: int
@@ -77,28 +77,28 @@ class Plan:
 
 def plan_proposal(
     posterior: Posterior, *, n_proposals: int | None, most: int, rng: np.random.Generator
-) -> Plan:
+) -> ProposalPlan:
     """Choose x*, the scale s and the number of proposals for the smallest predicted error.
 
     Parameters
     ----------
     posterior : Posterior
-        Not the draws that will be averaged: the plan would favour what they happen to favour.
+        Not the draws to be averaged: a plan fitted to them would bias the estimate.
     n_proposals : int, optional
-        By default so many that the denominator's error is a third of the numerator's, or
-        negligible. They are counted before the first is drawn, so that no look at the result
-        decides when to stop.
+        By default the number for which the denominator's error is a third of the numerator's, or
+        negligible. It is fixed before the first proposal is drawn, so that there is no optional
+        stopping.
     most : int
-        Bound of the default.
+        Upper bound of the default.
     """
     candidates = _candidates(posterior, rng)
     log_evidence = _pilot(posterior, rng)
 
-    def planned(proposal: Proposal) -> Plan:
+    def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
-        allowed = max(SHARE**2 * numerator, NEGLIGIBLE**2)
-        count = n_proposals or int(np.clip(relative / allowed, LEAST, most))
-        return Plan(proposal, count, float(np.sqrt(numerator + relative / count)))
+        allowed = max(MAX_ERROR_RATIO**2 * numerator, NEGLIGIBLE**2)
+        count = n_proposals or int(np.clip(relative / allowed, MIN_PROPOSALS, most))
+        return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
     best = min(map(planned, candidates), key=lambda plan: plan.se).proposal
     plans = [planned(replace(best, scale=scale)) for scale in SCALES]
@@ -106,7 +106,7 @@ def plan_proposal(
 
 
 def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal]:
-    """Points in the bulk of the draws, densest first, each with its constant log-density."""
+    """Points in the bulk of the draws with their log-densities, densest first."""
     k = posterior.draws.shape[-1]
     draws = posterior.draws.reshape(-1, k)
     coordinates = moments(draws)
@@ -121,7 +121,7 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
         ]
     )
 
-    # A noisy likelihood is averaged, so that the constant is a typical value.
+    # A noisy likelihood is averaged, so that f(x*) is a typical value.
     n_repeats = N_REPEATS if posterior.is_noisy else 1
     log_density = posterior.evaluate(np.repeat(points, n_repeats, axis=0), rng)
     constants = [log_mean(estimates) for estimates in log_density.reshape(len(points), -1)]
@@ -133,7 +133,7 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
     ]
     if not found:
         raise DataMismatchError(
-            "the model gives no density at the mean, the median or the best of the draws: "
+            "the model has zero density at the mean, the median and the best of the draws: "
             "idata belongs to another model or to other data"
         )
     floor = min(np.quantile(posterior.log_density, HOLE), max(p.log_density for p in found))
@@ -142,9 +142,9 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
 
 
 def _pilot(posterior: Posterior, rng: np.random.Generator) -> float:
-    """Estimate the log-evidence roughly, by a bridge to the Gaussian of the draws.
+    """Estimate the log-evidence roughly, by bridge sampling to the Gaussian of the draws.
 
-    The iteration of Meng and Wong (1996); no centre x* is chosen yet, and this needs none.
+    The iteration of Meng and Wong (1996), which needs no centre x*.
     """
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
     mean, chol = moments(draws)
@@ -167,15 +167,15 @@ def _predicted_variances(
 ) -> tuple[float, float]:
     """Predict relative variances from the draws alone, given a rough log-evidence.
 
-    Gives that of the numerator's mean, which is what it will be, and that of one term of the
-    denominator. The two moments of the latter follow from the draws: with D the mean of
-    alpha(x*, x) over q, and pi the posterior,
+    Returns the variance of the numerator's mean and that of one term of the denominator. The
+    moments of the latter follow from the draws: with D the mean of alpha(x*, x) over q, and pi the
+    posterior,
 
         D = p(D) / e^f(x*) E_pi[alpha(x, x*) q(x, x*)],
         E_q[alpha(x*, x)^2] = p(D) / e^f(x*) E_pi[exp(-|f(x) - f(x*)|) q(x, x*)].
     """
     log_q = proposal.log_q(posterior.draws)
-    numerator = log_mean_of_chains(proposal.log_arriving(posterior.log_density) + log_q)
+    numerator = log_mean_of_chains(proposal.log_alpha_to_center(posterior.log_density) + log_q)
     second = log_mean(log_q - np.abs(posterior.log_density - proposal.log_density))
     log_ordinate = proposal.log_density - log_evidence  # of the posterior density
     log_relative = min(second + log_ordinate - 2 * numerator.value, MAX_LOG)

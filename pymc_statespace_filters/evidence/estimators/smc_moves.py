@@ -1,4 +1,4 @@
-"""Particles of tempered laws: drawn from the prior, resampled, and moved by Metropolis steps."""
+"""Particles for tempered SMC: drawn from the prior, resampled, moved by Metropolis steps."""
 
 import math
 from typing import NamedTuple
@@ -7,25 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.prior_and_likelihood import (
-    evaluate_factors,
-    prior_of,
-)
-from pymc_statespace_filters.evidence.estimators.whitening import Whitened
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
-MIN_ALIVE = 50  # draws of the prior that have a likelihood
+MIN_ALIVE = 50  # prior draws of positive likelihood
 
 Array = NDArray[np.float64]
 
 
 class Particles(NamedTuple):
-    """Points with what is known of them; the runs one after the other."""
+    """Points with their log-densities and ancestors, the runs concatenated."""
 
     x: Array  # (runs * particles, k)
     log_prior: Array  # (runs * particles,)
-    log_likelihood: Array  # (runs * particles,), estimates that were made with the points
-    ancestor: NDArray[np.int64]  # (runs * particles,), which draw of the prior they descend from
+    log_likelihood: Array  # (runs * particles,); if noisy, the estimate stored with the point
+    ancestor: NDArray[np.int64]  # (runs * particles,), index of the prior draw
 
     def at(self, index: NDArray[np.int64]) -> "Particles":
         """Copies of the particles at flat indices."""
@@ -37,23 +33,23 @@ class Particles(NamedTuple):
         )
 
 
-def particles_of_prior(posterior: Posterior, count: int, rng: np.random.Generator) -> Particles:
-    """Independent draws of the prior, some of which may have no likelihood."""
-    x = prior_of(posterior).sample(count, rng)
-    log_prior, log_likelihood = evaluate_factors(posterior, x, rng)
+def sample_prior_particles(posterior: Posterior, count: int, rng: np.random.Generator) -> Particles:
+    """Independent draws of the prior; some may have zero likelihood."""
+    x = posterior.required_prior.sample(count, rng)
+    log_prior, log_likelihood = posterior.evaluate_factors(x, rng)
     alive = int(np.isfinite(log_likelihood).sum())
     if alive < MIN_ALIVE:
         raise ModelError(
-            f"{alive} of {count} draws of the prior have a likelihood, fewer than {MIN_ALIVE}: "
-            "narrow the priors to values that the model can have"
+            f"the likelihood is positive at {alive} of {count} draws of the prior, fewer than "
+            f"{MIN_ALIVE}: narrow the priors to plausible values"
         )
     return Particles(x, log_prior, log_likelihood, np.arange(count))
 
 
-def resampled(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Flat indices of particles by their weights (runs, particles), systematically in each run.
+def resample_systematic(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Flat indices of particles by systematic resampling within each run (runs, particles).
 
-    A run of which no particle is alive has lost its evidence for good, and stays as it is.
+    A run without particles of positive weight keeps its particles: its evidence is zero for good.
     """
     n_runs, n_particles = log_weights.shape
     peak = log_weights.max(axis=1, keepdims=True)
@@ -66,15 +62,15 @@ def resampled(log_weights: Array, rng: np.random.Generator) -> NDArray[np.int64]
     return (index + n_particles * np.arange(n_runs)[:, np.newaxis]).ravel()
 
 
-class Learnt(NamedTuple):
-    """Whitened coordinates for either half of the runs, learnt from the other half.
+class CrossFittedWhitening(NamedTuple):
+    """Whitened coordinates for each half of the runs, fitted to the other half.
 
-    Proposals fitted to the very particles that they move would not keep their law: in 12 dimensions
-    and with 1600 particles the evidence was too large by 0.07 nats.
+    Proposals fitted to the particles that they move would not leave the target invariant: in 12
+    dimensions and with 1600 particles the evidence was too large by 0.07 nats.
     """
 
-    first: Whitened
-    second: Whitened
+    first: Whitening
+    second: Whitening
 
     def whitened(self, x: Array) -> Array:
         """Whitened points of all particles x (runs * particles, k)."""
@@ -87,49 +83,50 @@ class Learnt(NamedTuple):
         return np.concatenate([self.first.unconstrained(first), self.second.unconstrained(second)])
 
 
-def learnt_from(x: Array) -> Learnt:
-    """Learn from the particles of each half of the runs what the other is to be moved by."""
+def cross_fit(x: Array) -> CrossFittedWhitening:
+    """Fit the coordinates of each half of the runs to the particles of the other half."""
     first, second = np.split(x, 2)
-    return Learnt(_fitted(second), _fitted(first))
+    return CrossFittedWhitening(_fitted(second), _fitted(first))
 
 
-def _fitted(x: Array) -> Whitened:
+def _fitted(x: Array) -> Whitening:
     """Coordinates in which the particles have mean zero and covariance one."""
     k = x.shape[1]
     try:
         chol = np.linalg.cholesky(np.cov(x, rowvar=False).reshape(k, k))
     except np.linalg.LinAlgError:
         raise ModelError(
-            f"too few different particles are left to move in {k} dimensions: narrow the priors, "
-            "or use an estimator that starts from the draws"
+            f"too few distinct particles are left to move in {k} dimensions: narrow the priors, "
+            "or use an estimator that starts from posterior draws"
         ) from None
-    return Whitened(x.mean(axis=0), chol)
+    return Whitening(x.mean(axis=0), chol)
 
 
-def metropolis(
+def metropolis_step(
     particles: Particles,
     temperature: float,
-    coordinates: Learnt,
+    coordinates: CrossFittedWhitening,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,
 ) -> tuple[Particles, float, float]:
-    """One step of every particle: by a coin a random walk, or a jump to an independent place.
+    """Move every particle by a random-walk or an independence proposal, with equal probability.
 
-    The walk copes with any shape; the jump, from the normal law that was learnt, takes particles
-    all the way where that is a good likeness. Also returns the shares of either that were accepted.
+    The random walk suits any shape; the independence proposal, the fitted normal distribution,
+    mixes at once if the target is nearly normal. Returns the particles and the acceptance rates of
+    the two.
     """
     k = particles.x.shape[1]
     z = coordinates.whitened(particles.x)
     walks = rng.random(len(z)) < 0.5
     normals = rng.standard_normal(z.shape)
     proposed = np.where(walks[:, np.newaxis], z + scale * 2.38 / math.sqrt(k) * normals, normals)
-    # The normal density cancels in a walk, not in a jump.
+    # Proposal densities cancel for the random walk, not for the independence proposal.
     log_jump = np.where(walks, 0.0, 0.5 * ((proposed**2).sum(axis=1) - (z**2).sum(axis=1)))
 
     x = coordinates.unconstrained(proposed)
-    log_prior, log_likelihood = evaluate_factors(posterior, x, rng)
-    with np.errstate(invalid="ignore"):  # neither here nor there a likelihood: not accepted
+    log_prior, log_likelihood = posterior.evaluate_factors(x, rng)
+    with np.errstate(invalid="ignore"):  # zero likelihood at both points: NaN, not accepted
         log_ratio = log_prior - particles.log_prior + log_jump
         log_ratio += temperature * (log_likelihood - particles.log_likelihood)
         accepted = np.log(rng.random(len(z))) < log_ratio

@@ -1,11 +1,10 @@
-"""Mixtures of multivariate Student-t laws, fitted to draws, as proposals of independent points.
+"""Mixtures of multivariate Student-t distributions fitted to draws, for importance sampling.
 
-The tails are heavier than those of most posteriors, which is what a proposal is asked for. A
-mixture is fitted by expectation-maximisation with known degrees of freedom (Peel and McLachlan
-2000); each component also borrows a few draws from the whole, so that none can shrink to a point.
-The number of components is that which makes the weights of held-out draws vary least. A last
-component as wide as everything keeps the weights in the outskirts from being large (Hesterberg
-1995).
+The tails are heavier than those of most posteriors, as an importance density needs. A mixture is
+fitted by expectation-maximisation with fixed degrees of freedom (Peel and McLachlan 2000); the
+scale matrices are regularised towards the covariance of all draws, so that no component can shrink
+to a point. The number of components minimises the variance of the weights of held-out draws. A
+wide defensive component bounds the weights in the tails (Hesterberg 1995).
 """
 
 import math
@@ -16,22 +15,22 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from pymc_statespace_filters.evidence.estimators.whitening import moments
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 DEGREES_OF_FREEDOM = 5.0
 MOST_COMPONENTS = 10
-MIN_GAIN = 0.02  # in the log of the weights' second moment, for which a component is worth having
-PATIENCE = 2  # numbers of components tried after the best
-MOST_FITTED = 4000  # draws; more tell little about a proposal
-N_STEPS, MIN_STEP = 200, 1e-3  # of EM; in nats per draw
-WIDE_SHARE, WIDE_SCALE = 0.1, 1.5  # of the last component; in standard deviations of the draws
+MIN_GAIN = 0.02  # in the log of the weights' second moment, to accept a further component
+PATIENCE = 2  # further numbers of components tried after the best
+MOST_FITTED = 4000  # draws used for the fit
+N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
+WIDE_SHARE, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class StudentMixture:
-    """A mixture of J multivariate Student-t laws in k dimensions."""
+    """A mixture of J multivariate Student-t distributions in k dimensions."""
 
     weights: Array  # (J,)
     means: Array  # (J, k)
@@ -42,7 +41,7 @@ class StudentMixture:
         return np.asarray(logsumexp(self.log_joint(x), axis=0))
 
     def log_joint(self, x: Array) -> Array:
-        """Log-density of each component at x (m, k), weight included: shape (J, m)."""
+        """Log-density of each component times its weight at x (m, k), shape (J, m)."""
         nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
         log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
         constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
@@ -50,7 +49,7 @@ class StudentMixture:
         return (np.log(self.weights) - log_det)[:, None] + constant - tail
 
     def squared_distances(self, x: Array) -> Array:
-        """Mahalanobis distances of x (m, k) from each component, squared: shape (J, m)."""
+        """Squared Mahalanobis distances of x (m, k) from each component, shape (J, m)."""
         z = np.linalg.inv(self.chols) @ np.swapaxes(x - self.means[:, None], 1, 2)
         return np.asarray((z**2).sum(axis=1))
 
@@ -62,8 +61,8 @@ class StudentMixture:
         moves = np.einsum("mij,mj->mi", self.chols[component], normals)
         return self.means[component] + spread[:, None] * moves
 
-    def widened(self) -> "StudentMixture":
-        """The same with a component as wide as standardised draws, and wider."""
+    def with_defensive_component(self) -> "StudentMixture":
+        """Add a component wider than the standardised draws."""
         k = self.means.shape[-1]
         return StudentMixture(
             np.append((1 - WIDE_SHARE) * self.weights, WIDE_SHARE),
@@ -71,16 +70,16 @@ class StudentMixture:
             np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
         )
 
-    def mapped(self, mean: Array, chol: Array) -> "StudentMixture":
-        """The law of mean + chol x."""
+    def affine(self, mean: Array, chol: Array) -> "StudentMixture":
+        """The distribution of mean + chol x."""
         return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
 
 
 def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMixture:
-    """Fit to the draws the mixture that promises the most effective proposals.
+    """Fit the mixture of the largest predicted effective sample size to the draws.
 
-    Components are added to a fit of the first half of every chain as long as that lowers the second
-    moment of the weights w = p / q, seen by the second half: E_q[w^2] = E_p[w].
+    Components are added to a fit of the first half of every chain as long as this lowers the second
+    moment of the weights w = p / q on the second half: E_q[w^2] = E_p[w].
 
     Raises
     ------
@@ -90,25 +89,26 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
     mean, chol = coordinates = moments(posterior.draws)
     halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves()]
     first, second = (coordinates.whitened(half.draws.reshape(-1, len(mean))) for half in halves)
-    best, n_best, least = scattered(first, 1, rng), 0, np.inf
+    best, n_best, least = place_components(first, 1, rng), 0, np.inf
     for n_components in range(1, MOST_COMPONENTS + 1):
-        q = fitted_mixture(first, scattered(first, n_components, rng))
+        q = fit_mixture(first, place_components(first, n_components, rng))
         moment = logsumexp(halves[1].log_density.ravel() - q.log_density(second))
         if moment < least - MIN_GAIN:
             best, n_best, least = q, n_components, moment
         elif n_components == n_best + PATIENCE:
             break
-    # On from where the best was found, lest EM end elsewhere.
-    return fitted_mixture(np.concatenate([first, second]), best).widened().mapped(mean, chol)
+    # Restart EM from the best fit, so that it converges to the same mode.
+    final = fit_mixture(np.concatenate([first, second]), best)
+    return final.with_defensive_component().affine(mean, chol)
 
 
-def scattered(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
-    """Place components at draws x (n, k) far from each other, as k-means++ does."""
+def place_components(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
+    """Place components at draws x (n, k) far from each other (k-means++ initialisation)."""
     chosen = [x[rng.integers(len(x))]]
     while len(chosen) < n_components:
         nearest = np.min([((x - point) ** 2).sum(axis=1) for point in chosen], axis=0)
         if not nearest.any():
-            break  # fewer different draws than components
+            break  # fewer distinct draws than components
         chosen.append(x[rng.choice(len(x), p=nearest / nearest.sum())])
     scale = np.eye(x.shape[-1]) * len(chosen) ** (-1 / x.shape[-1])
     return StudentMixture(
@@ -116,7 +116,7 @@ def scattered(x: Array, n_components: int, rng: np.random.Generator) -> StudentM
     )
 
 
-def fitted_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
+def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
     """Fit to standardised draws x (n, k) by expectation-maximisation."""
     reached = -np.inf
     for _ in range(N_STEPS):
@@ -125,20 +125,20 @@ def fitted_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
         if log_density.mean() < reached + MIN_STEP:
             break
         reached = log_density.mean()
-        mixture = _maximised(mixture, x, np.exp(log_joint - log_density))
+        mixture = _m_step(mixture, x, np.exp(log_joint - log_density))
     return mixture
 
 
-def _maximised(mixture: StudentMixture, x: Array, members: Array) -> StudentMixture:
-    """One step of EM, given the shares (J, n) that the components have in each draw."""
+def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:
+    """Maximisation step of EM, given the responsibilities (J, n) of the components."""
     nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
-    # A draw far out in the tail of its component tells little about where that is.
-    told = members * (nu + k) / (nu + mixture.squared_distances(x))
-    sizes = members.sum(axis=1)
-    means = (told @ x) / told.sum(axis=1, keepdims=True)
+    # Draws in the tail of a component get little weight.
+    weighted = responsibilities * (nu + k) / (nu + mixture.squared_distances(x))
+    sizes = responsibilities.sum(axis=1)
+    means = (weighted @ x) / weighted.sum(axis=1, keepdims=True)
     centred = x - means[:, None]
-    scatter = np.swapaxes(centred, 1, 2) @ (told[..., None] * centred)
-    # Each component borrows k + 1 draws of the whole, whose covariance is the identity.
+    scatter = np.swapaxes(centred, 1, 2) @ (weighted[..., None] * centred)
+    # Regularise by k + 1 pseudo-draws of covariance one, that of all standardised draws.
     scales = (scatter + (k + 1) * np.eye(k)) / (sizes + k + 1)[:, None, None]
     weights = (sizes + 1) / (sizes + 1).sum()
     return StudentMixture(weights, means, np.linalg.cholesky(scales))

@@ -1,36 +1,37 @@
-r"""The evidence on the way from the prior to the posterior: tempered sequential Monte Carlo.
+r"""Tempered sequential Monte Carlo: the evidence along a path from the prior to the posterior.
 
-Particles of the prior are led through the laws :math:`p(x) L(x)^\beta`, with the temperature
-:math:`\beta` raised from 0 to 1. At each step they are weighted by :math:`L^{\beta' - \beta}`,
-resampled, and moved by Metropolis steps that keep the law at :math:`\beta'`; the evidence is the
-product of the mean weights,
+Particles of the prior pass through the distributions :math:`p(x) L(x)^\beta`, where the inverse
+temperature :math:`\beta` increases from 0 to 1. At each stage they are weighted by
+:math:`L^{\beta' - \beta}`, resampled, and moved by Metropolis steps that leave the distribution at
+:math:`\beta'` invariant; the evidence is the product of the mean weights,
 
 .. math::
 
     \hat p(D) = \prod_t \frac{1}{N} \sum_{i=1}^N L(x_i)^{\beta_{t+1} - \beta_t},
 
-without bias whatever the moves (Del Moral, Doucet and Jasra 2006). Several runs go side by side
-under the same temperatures, chosen for all particles together; proposals are learnt from those of
-other runs. Their evidences are averaged, and never the logarithms; their spread is the error.
+which is unbiased for any moves (Del Moral, Doucet and Jasra 2006). Several runs share the
+temperatures, chosen for all particles together; proposals are fitted to the particles of other
+runs. The evidences of the runs are averaged, not their logarithms, and their spread gives the
+error.
 
-The temperature is raised until the effective number of the weighted particles has fallen to a share
-(Jasra, Stephens, Doucet and Tsagaris 2011), and the particles are moved until one move more brings
-them hardly further from where they started.
+The next temperature is that at which the effective sample size has fallen to a given share (Jasra,
+Stephens, Doucet and Tsagaris 2011). The particles are moved until a further move hardly increases
+their distance from the starting points.
 
-With a noisy likelihood an estimate is made with its point and stays with it until the point is
-left; so do L and all powers of it mean that stored estimate. On the space of points x and noise u,
-with density g(u) and estimates L(x, u), the laws are :math:`p(x) g(u) L(x, u)^\beta`. A proposal
-has fresh noise, drawn from g, so that g cancels in its acceptance. At :math:`\beta = 0` this is the
-prior and fresh noise, at :math:`\beta = 1` its integral is that of prior times expected likelihood:
-the evidence is exact, though the laws on the way depend on the noise.
+With a noisy likelihood an estimate is made when a point is proposed and stored with it; L and its
+powers denote the stored estimate. On the space of points x and noise u, with density g(u) and
+estimates L(x, u), the distributions are :math:`p(x) g(u) L(x, u)^\beta`. A proposal has fresh
+noise, drawn from g, so that g cancels in its acceptance probability. At :math:`\beta = 0` this is
+the prior and fresh noise; at :math:`\beta = 1` its integral is that of the prior times the expected
+likelihood: the evidence is exact, although the intermediate distributions depend on the noise.
 
-No draw of the posterior is used. So modes that the chains have missed are found here.
+Posterior draws are not used, so that modes missed by the chains can be found.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,22 +42,20 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.smc_moves import (
     Particles,
-    learnt_from,
-    metropolis,
-    particles_of_prior,
-    resampled,
+    cross_fit,
+    metropolis_step,
+    resample_systematic,
+    sample_prior_particles,
 )
-from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from pymc_statespace_filters.system.checks import check_count, is_integer
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
-SHARE = (
-    0.85  # of the effective number that a step of the temperature leaves; longer steps miss tails
-)
+ESS_SHARE = 0.85  # left by a step of the temperature; longer steps miss tails
 # Move until the squared distance from the start grows by less than a share of itself.
 MIN_MOVES, MAX_MOVES, MIN_GAIN = 2, 50, 0.1
-ACCEPTANCE = 0.25  # of random walks
-SCALES = (0.1, 2.0)  # least and largest of random walks, in the optimal one for a Gaussian
+ACCEPTANCE = 0.25  # target rate of the random walk
+SCALES = (0.1, 2.0)  # bounds for the random walk, relative to the optimum for a Gaussian
 MIN_ACCEPTANCE = 0.02
 MIN_ANCESTORS = 5
 MAX_SPREAD = 0.7
@@ -65,24 +64,24 @@ Array = NDArray[np.float64]
 
 
 class _Stage(NamedTuple):
-    """How the moves at one temperature went."""
+    """Statistics of the moves at one temperature."""
 
     n_moves: int
-    acceptance: float  # of walks and independent proposals together
-    scale: float  # of the walks at the end
+    acceptance: float  # rate over random-walk and independence proposals
+    scale: float  # of the random walk after adaptation
 
 
 @dataclass(frozen=True)
 class TemperedSMC:
-    """Tempered sequential Monte Carlo from the prior; draws of the posterior are not used.
+    """Tempered sequential Monte Carlo from the prior; posterior draws are not used.
 
     Parameters
     ----------
     n_particles : int
-        In each run; at least 50.
+        Particles in each run, at least 50.
     n_runs : int
-        Independent but for what they learn from each other; even, because either half learns from
-        the other, and at least 8, so that their spread is an error.
+        Number of runs; even, because the proposals of each half are fitted to the other half, and
+        at least 8, because their spread gives the standard error.
 
     Examples
     --------
@@ -91,6 +90,7 @@ class TemperedSMC:
     TemperedSMC(n_particles=500, n_runs=16)
     """
 
+    name: ClassVar[str] = "tempered_smc"
     n_particles: int = 250
     n_runs: int = 16
 
@@ -101,67 +101,67 @@ class TemperedSMC:
             raise ModelError(f"n_runs must be an even integer of at least {MIN_RUNS}, got {runs!r}")
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """A guess: the number of temperatures and of moves is found on the way."""
+        """A rough guess: the numbers of temperatures and moves are adaptive."""
         return self.n_runs * self.n_particles * (1 + 5 * (2 + posterior.draws.shape[-1]))
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
-        """Estimate the log-evidence from draws of the prior.
+        """Estimate the log-evidence from prior draws.
 
         Raises
         ------
         ModelError
-            If the prior is improper, or too few of its draws have a likelihood.
+            If the prior is improper, or too few of its draws have a positive likelihood.
         """
-        particles = particles_of_prior(posterior, self.n_runs * self.n_particles, rng)
+        particles = sample_prior_particles(posterior, self.n_runs * self.n_particles, rng)
         log_evidences = np.zeros(self.n_runs)
         temperature, scale = 0.0, 1.0
         stages: list[_Stage] = []
         while True:
-            # Weight the particles where they are; only then resample and move them.
-            raised = raised_from(temperature, particles.log_likelihood)
+            # Weight before resampling and moving: the estimate is unbiased for any moves.
+            raised = next_temperature(temperature, particles.log_likelihood)
             log_weights = (raised - temperature) * particles.log_likelihood
             log_weights = log_weights.reshape(self.n_runs, self.n_particles)
             log_evidences += logsumexp(log_weights, axis=1) - np.log(self.n_particles)
-            particles = particles.at(resampled(log_weights, rng))
+            particles = particles.at(resample_systematic(log_weights, rng))
             temperature = raised
             if temperature == 1:
                 return _summary(log_evidences, particles.ancestor, stages)
-            particles, stage = moved(particles, temperature, scale, posterior, rng)
+            particles, stage = move_particles(particles, temperature, scale, posterior, rng)
             scale = stage.scale
             stages.append(stage)
 
 
-def raised_from(temperature: float, log_likelihood: Array) -> float:
-    """The next temperature, at which the effective number has fallen to `SHARE`; at most one.
+def next_temperature(temperature: float, log_likelihood: Array) -> float:
+    """The temperature at which the effective sample size has fallen to `ESS_SHARE`; at most one.
 
-    Particles without a likelihood are lost at the first step, however small: the share is one of
-    the others.
+    The share refers to particles of positive likelihood: all others are lost at the first step,
+    however small.
     """
     alive = log_likelihood[np.isfinite(log_likelihood)]
 
     def surplus(step: float) -> float:
         log_effective = 2 * logsumexp(step * alive) - logsumexp(2 * step * alive)
-        return math.exp(log_effective) / len(alive) - SHARE
+        return math.exp(log_effective) / len(alive) - ESS_SHARE
 
     if surplus(1 - temperature) >= 0:
         return 1.0
-    # The step may be smaller than any absolute tolerance, if the prior is wide.
+    # Under a wide prior the step may be smaller than any absolute tolerance.
     return temperature + brentq(surplus, 0.0, 1 - temperature, xtol=1e-300, rtol=1e-9)
 
 
-def moved(
+def move_particles(
     particles: Particles,
     temperature: float,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,
 ) -> tuple[Particles, _Stage]:
-    """Move particles by steps that keep p(x) L(x)^temperature, until they are far enough."""
-    coordinates = learnt_from(particles.x)
+    """Move particles by steps that leave p(x) L(x)^temperature invariant, until they have mixed."""
+    coordinates = cross_fit(particles.x)
     start = coordinates.whitened(particles.x)
     distance, rates = 0.0, []
     for _ in range(MAX_MOVES):
-        particles, walks, jumps = metropolis(
+        particles, walks, jumps = metropolis_step(
             particles, temperature, coordinates, scale, posterior, rng
         )
         rates.append((walks + jumps) / 2)
@@ -174,13 +174,12 @@ def moved(
 
 
 def _summary(log_evidences: Array, ancestor: NDArray[np.int64], stages: list[_Stage]) -> Estimate:
-    """The mean of the runs' evidences (runs,), with its error from their spread."""
+    """Average the evidences of the runs (runs,), with the standard error from their spread."""
     n_runs = len(log_evidences)
     peak = log_evidences.max()
     evidences = np.exp(log_evidences - peak)
     spread = float(evidences.std(ddof=1) / evidences.mean())
-    # So wide that errors in its unit have the variance one, where Student's law, for so few runs,
-    # has (n - 1) / (n - 3).
+    # Few runs: inflate by the standard deviation of Student's t, whose variance is (n-1) / (n-3).
     student = math.sqrt((n_runs - 1) / (n_runs - 3))
     n_ancestors = len(np.unique(ancestor)) / n_runs
     acceptance = min((stage.acceptance for stage in stages), default=1.0)
@@ -196,26 +195,26 @@ def _summary(log_evidences: Array, ancestor: NDArray[np.int64], stages: list[_St
             "n_ancestors": n_ancestors,
             "spread_of_runs": spread,
         },
-        doubts=tuple(_doubts(acceptance, n_ancestors, spread)),
+        doubts=tuple(_check(acceptance, n_ancestors, spread)),
     )
 
 
-def _doubts(acceptance: float, n_ancestors: float, spread: float) -> Iterator[str]:
-    """Reasons for doubt, from the worst stage, the survivors in a run, and the runs' spread."""
+def _check(acceptance: float, n_ancestors: float, spread: float) -> Iterator[str]:
+    """Check the acceptance of the worst stage, the surviving ancestors and the runs' spread."""
     if acceptance < MIN_ACCEPTANCE:
         yield (
-            f"moves are hardly accepted (at worst {acceptance:.1%}): lessen the noise of the "
-            "likelihood, or give the parameters a scale on which the posterior is smoother"
+            f"moves are rarely accepted ({acceptance:.1%} at worst): reduce the noise of the "
+            "likelihood, or reparametrise towards a Gaussian posterior"
         )
     if n_ancestors < MIN_ANCESTORS:
         yield (
-            f"its particles descend from {n_ancestors:.1f} draws of the prior in each run, fewer "
-            f"than {MIN_ANCESTORS}: narrow the priors, or trust estimators that start from the "
-            "draws"
+            f"the particles of a run descend from {n_ancestors:.1f} draws of the prior, fewer "
+            f"than {MIN_ANCESTORS}: narrow the priors, or use estimators that start from "
+            "posterior draws"
         )
     if spread > MAX_SPREAD:
         yield (
-            f"its runs disagree, with a standard deviation of {spread:.2f} of their mean: a few of "
-            "them carry it, and its error is itself a guess: narrow the priors, or trust "
-            "estimators that start from the draws"
+            f"the evidences of the runs have a standard deviation of {spread:.2f} of their mean: "
+            "a few runs dominate it, and the standard error is unreliable; narrow the priors, or "
+            "use estimators that start from posterior draws"
         )

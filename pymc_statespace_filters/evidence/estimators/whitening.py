@@ -1,4 +1,4 @@
-"""Location and scale of draws, by which proposals are placed and spaces are standardised."""
+"""Whitening of draws by their mean and the Cholesky factor of their covariance."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from pymc_statespace_filters.errors import ModelError
 Array = NDArray[np.float64]
 
 
-class Whitened(NamedTuple):
+class Whitening(NamedTuple):
     """Coordinates z in which draws have mean zero and covariance one: x = mean + chol z."""
 
     mean: Array  # (k,)
@@ -22,11 +22,11 @@ class Whitened(NamedTuple):
 
     def whitened(self, x: Array) -> Array:
         """Whitened points of x (m, k)."""
-        # SciPy's triangular solution wakes BLAS's threads, for milliseconds, whatever the size.
+        # SciPy's triangular solver starts BLAS threads, which takes milliseconds at any size.
         return (x - self.mean) @ np.linalg.inv(self.chol).T
 
 
-def moments(draws: Array) -> Whitened:
+def moments(draws: Array) -> Whitening:
     """Mean and lower Cholesky factor of the covariance of draws (..., k).
 
     Raises
@@ -39,10 +39,11 @@ def moments(draws: Array) -> Whitened:
     return _factored(flat.mean(axis=0), np.cov(flat, rowvar=False).reshape(k, k), len(flat))
 
 
-def moments_within_chains(draws: Array) -> Whitened:
+def moments_within_chains(draws: Array) -> Whitening:
     """Mean of draws (chain, draw, k), and the factor of their covariance within chains.
 
-    Chains in separate modes would otherwise blur the width of each.
+    Between-chain variance is excluded: with chains in separate modes it would hide the widths of
+    the modes.
 
     Raises
     ------
@@ -54,11 +55,11 @@ def moments_within_chains(draws: Array) -> Whitened:
     return _factored(draws.mean(axis=(0, 1)), about_mean.T @ about_mean / count, count)
 
 
-def _factored(mean: Array, covariance: Array, count: int) -> Whitened:
+def _factored(mean: Array, covariance: Array, count: int) -> Whitening:
     try:
-        return Whitened(mean, np.linalg.cholesky(covariance))
+        return Whitening(mean, np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
         raise ModelError(
-            "idata must hold draws that vary in every direction; the covariance of "
-            f"{count} draws of {len(mean)} unconstrained parameters is singular"
+            "the draws of idata must vary in every direction, got a singular covariance of "
+            f"{count} draws of {len(mean)} unconstrained parameters"
         ) from None

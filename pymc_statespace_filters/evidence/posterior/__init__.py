@@ -1,12 +1,5 @@
-"""The posterior and the prior of a model as numbers: what estimators integrate."""
+"""The posterior and the prior of a model as arrays and functions, for evidence estimators."""
 
-from pymc_statespace_filters.evidence.posterior.density import ModelDensity, RowFunction
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, Prior, posterior_of
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, Prior
 
-__all__ = [
-    "ModelDensity",
-    "Posterior",
-    "Prior",
-    "RowFunction",
-    "posterior_of",
-]
+__all__ = ["Posterior", "Prior"]

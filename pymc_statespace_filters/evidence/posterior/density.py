@@ -1,7 +1,8 @@
-"""A model's log-density at many points at once: machine code, in threads.
+"""A model's log-density at many points, evaluated by machine code in threads.
 
 The log-density is PyTensor's compiled function, called by its address. Each point comes with the
-noise seeds of its estimate, so that neither the order nor the number of threads matters.
+noise seeds of its estimate, so that the values depend neither on the order nor on the number of
+threads.
 """
 
 from collections.abc import Callable
@@ -23,18 +24,18 @@ Array = NDArray[np.float64]
 
 
 class RowFunction:
-    """A number that depends on the free variables of a model, compiled over one flat vector.
+    """A scalar function of a model's free variables, compiled over their flat vector.
 
     Parameters
     ----------
     model : pymc.Model
     output : TensorVariable
-        A scalar graph of the model's value variables; the noise seeds become arguments.
+        Scalar graph of the model's value variables; the noise seeds become arguments.
 
     Attributes
     ----------
     seed_names : tuple of str
-        The noisy state-space variables, in the order of the columns of a seed array.
+        Names of the noisy state-space variables, in the order of the columns of a seed array.
     model_seeds : ndarray of int64
         The seeds that the model holds for them.
     """
@@ -55,7 +56,7 @@ class RowFunction:
 
     @property
     def on_progress(self) -> Callable[[int], None]:
-        """Told, in the main thread, how many points were evaluated since it was last told."""
+        """Called in the main thread with the number of points evaluated since the last call."""
         return self._calls.on_progress
 
     @on_progress.setter
@@ -65,7 +66,7 @@ class RowFunction:
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
         """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.
 
-        Without seeds every point has the model's own.
+        Without `seeds` every point gets the seeds of the model.
         """
         if seeds is None:
             seeds = np.broadcast_to(self.model_seeds, (len(x), self.model_seeds.size))
@@ -80,18 +81,19 @@ class ModelDensity(RowFunction):
     ----------
     model : pymc.Model
     moved : bool
-        Whether the draws' noise was moved along the chain, by the smooth versions of the filters.
+        Whether the chain moved its noise (``correlation``), with the smooth versions of the
+        filters.
     """
 
     def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
         if model.discrete_value_vars:
             names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
             raise ModelError(
-                f"model must have continuous free variables only; {names} are discrete: "
-                "sum them out of the likelihood first"
+                f"model must have continuous free variables only, got discrete {names}: "
+                "marginalise them out of the likelihood first"
             )
         if not model.free_RVs:
-            raise ModelError("model must have at least one free variable, it has none")
+            raise ModelError("model must have at least one free variable, got none")
         self.model = model
         self.moved = moved
         log_density = model.logp()

@@ -1,6 +1,6 @@
-"""The posterior as an evidence estimator needs it: unconstrained draws and their log-density.
+"""The posterior as estimators see it: unconstrained draws, log-densities, and the prior.
 
-The compiled log-density holds the Jacobians of the transforms.
+Log-densities on the unconstrained space include the Jacobians of the transforms.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
-N_CHECKED = 16  # draws whose stored log-density is recomputed
-STORED_NAMES = ("lp", "logp")  # PyMC's and nutpie's name of it in sample_stats
+N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
+STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie
 
 Array = NDArray[np.float64]
 
@@ -29,12 +29,12 @@ class Prior(Protocol):
         """Log-density of points x (m, k), shape (m,); normalised if the priors are."""
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Independent draws, shape (count, k); a `ModelError` if there is no law to draw from."""
+        """Independent draws, shape (count, k); `ModelError` if the prior cannot be sampled."""
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of a posterior with their log-densities, and the means to evaluate more.
+    """Draws of a posterior with their log-densities, and functions to evaluate further points.
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class Posterior:
         Unconstrained.
     log_density : ndarray (chain, draw)
         Log prior + log likelihood + log Jacobian of each draw. With a noisy likelihood these are
-        the estimates by which the chain accepted: drawn again, they would belong to another chain.
+        the estimates by which the chain accepted the draws; fresh ones cannot replace them.
     evaluate : callable
-        ``evaluate(x, rng)`` with x (m, k) gives log-densities (m,), never NaN; a noisy likelihood
-        takes fresh noise from `rng` for each.
+        ``evaluate(x, rng)`` returns the log-densities (m,) of points x (m, k), never NaN; a noisy
+        likelihood takes fresh noise from `rng` for each point.
     is_noisy : bool
-        Whether `evaluate` gives something else each time.
-    prior : Prior
-        Everything else in `evaluate` is the likelihood.
+        Whether repeated evaluations at one point differ.
+    prior : Prior, optional
+        The likelihood is the log-density of `evaluate` minus that of the prior.
     """
 
     draws: Array
@@ -58,8 +58,22 @@ class Posterior:
     is_noisy: bool = False
     prior: Prior | None = None
 
+    @property
+    def required_prior(self) -> Prior:
+        """The prior, for estimators that cannot do without it."""
+        assert self.prior is not None, "a posterior without a prior"
+        return self.prior
+
+    def evaluate_factors(self, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Log prior and log-likelihood of points x (m, k), each of shape (m,).
+
+        A noisy likelihood is estimated with fresh noise for each point.
+        """
+        log_prior = self.required_prior.log_density(x)
+        return log_prior, log_likelihood_of(self.evaluate(x, rng), log_prior)
+
     def halves(self) -> tuple["Posterior", "Posterior"]:
-        """Split every chain in the middle."""
+        """Split every chain into its first and second half."""
         middle = self.draws.shape[1] // 2
         return (
             replace(self, draws=self.draws[:, :middle], log_density=self.log_density[:, :middle]),
@@ -67,19 +81,25 @@ class Posterior:
         )
 
     def thinned(self, most: int) -> "Posterior":
-        """Every so manieth draw of each chain, that there are about `most` in all, or fewer."""
+        """Thin every chain evenly, so that about `most` draws remain in all, or fewer."""
         step = -(-self.log_density.size // most)
         return replace(self, draws=self.draws[:, ::step], log_density=self.log_density[:, ::step])
 
 
-def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
-    """Bring the draws of `idata` and their model together.
+def log_likelihood_of(log_density: Array, log_prior: Array) -> Array:
+    """Log-density minus log prior; -inf wherever the log-density is -inf."""
+    finite = np.isfinite(log_density)
+    return np.subtract(log_density, log_prior, out=np.full_like(log_density, -np.inf), where=finite)
+
+
+def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
+    """Combine the draws of `idata` with the compiled density of their model.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Posterior draws. ``sample_stats`` may hold the log-density ``lp`` of each draw, and must do
-        so (or hold the noise seeds ``<name>_seed``) if the noise was drawn anew along the chain.
+        Posterior draws. ``sample_stats`` may hold the log-density ``lp`` of each draw; it must hold
+        it, or the noise seeds ``<name>_seed``, if the noise was refreshed along the chain.
     density : ModelDensity
         The compiled model.
 
@@ -87,7 +107,7 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     -------
     Posterior
     str
-        What happened to the noise: "none", "refreshed" or "held", as in `Evidence`.
+        The treatment of the noise: "none", "refreshed" or "held", as in `Evidence`.
 
     Raises
     ------
@@ -100,15 +120,15 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     stored = _stored_name(stats)
     if density.moved and stored is None:
         raise DataMismatchError(
-            "sample_stats of idata holds no log-density of the draws, and as their noise was moved "
-            "along the chain no seed gives it again: sample all variables by one DRAM step, and "
-            "keep the group sample_stats"
+            "sample_stats of idata must hold the log-density of the draws, because the chain moved "
+            "its noise (correlation) and no seed reproduces it: sample all variables by one DRAM "
+            "step, and keep the group sample_stats"
         )
     if lacking and stored is None:
         raise DataMismatchError(
-            f"sample_stats of idata holds neither the noise seeds of the draws ({lacking}) nor "
-            "their log-density: the estimates that the chain accepted cannot be found again. Keep "
-            "the group sample_stats that DRAM leaves"
+            f"sample_stats of idata must hold the noise seeds of the draws ({lacking}) or their "
+            "log-density, to recover the likelihood estimates of the chain: keep the group "
+            "sample_stats that DRAM stores"
         )
     seeds = _stored_seeds(stats, density, draws.shape[:2])
     log_density = _stored_log_density(stats, density, draws, seeds)
@@ -116,9 +136,9 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
     held = not density.moved and bool((seeds == seeds[:1, :1]).all())
     if not (held or density.moved) and (seeds == seeds[:, :1]).all():
         raise ModelError(
-            "idata must hold chains of one noise seed if the seed was held; its "
-            f"{len(seeds)} chains kept {len(np.unique(seeds[:, 0], axis=0))} different ones: give "
-            "one chain at a time"
+            "idata must hold chains of one noise seed if the seed was held, got "
+            f"{len(np.unique(seeds[:, 0], axis=0))} seeds in {len(seeds)} chains: pass one chain "
+            "at a time"
         )
     noise = "none" if not density.seed_names else "held" if held else "refreshed"
 
@@ -135,7 +155,7 @@ def posterior_of(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, 
 def _stored_seeds(
     stats: xr.Dataset, density: ModelDensity, shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Noise seeds behind the draws, (chain, draw, n_seeds); unless stored, the model's own."""
+    """Noise seeds of the draws, (chain, draw, n_seeds); the model's where none are stored."""
     columns = [
         stats[f"{name}_seed"].transpose("chain", "draw").values
         if f"{name}_seed" in stats
@@ -148,10 +168,10 @@ def _stored_seeds(
 
 
 def _stored_name(stats: xr.Dataset) -> str | None:
-    """The name of the log-density of whole draws in `stats`, if there is one.
+    """Name of the joint log-density of the draws in `stats`, if there is one.
 
-    Several step methods side by side store one column each, none of them that of the whole draw;
-    and PyMC fills in zeros if the last of them stores none.
+    Compound step methods store one column each, none of which is the joint log-density, and PyMC
+    fills in zeros if the last of them stores none.
     """
     for name in STORED_NAMES:
         if name in stats and stats[name].ndim == 2 and stats[name].values.any():
@@ -170,24 +190,24 @@ def _stored_log_density(
         log_density = density.evaluate(flat_draws, flat_seeds)
         if impossible := int(np.isneginf(log_density).sum()):
             raise DataMismatchError(
-                f"{impossible} of {len(flat_draws)} draws of idata have no density under the "
+                f"{impossible} of {len(flat_draws)} draws of idata have zero density under the "
                 "model: they belong to another model or to other data"
             )
         return log_density.reshape(draws.shape[:2])
 
     stored = stats[name].transpose("chain", "draw").values.astype(np.float64)
-    if density.moved:  # there is nothing to compare with
+    if density.moved:  # cannot be recomputed for comparison
         return stored
     checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
     recomputed = density.evaluate(flat_draws[checked], flat_seeds[checked])
     expected = stored.ravel()[checked]
-    # Near a bound the transform loses digits, so a minority of the draws may differ.
+    # The transform loses digits near a bound, so that a minority of the draws may differ.
     agree = np.isclose(recomputed, expected, rtol=1e-6, atol=1e-4)
     if agree.mean() < 0.5:
         worst = int(np.flatnonzero(~agree)[0])
         raise DataMismatchError(
-            f"sample_stats[{name!r}] of idata is {expected[worst]:.6g} where the model gives "
-            f"{recomputed[worst]:.6g}: the draws belong to another model, other data or other "
-            "settings"
+            f"sample_stats[{name!r}] of idata must be the model's log-density, got "
+            f"{expected[worst]:.6g} where the model gives {recomputed[worst]:.6g}: the draws "
+            "belong to another model, other data or other settings"
         )
     return stored

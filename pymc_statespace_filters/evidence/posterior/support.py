@@ -1,4 +1,4 @@
-"""What an evidence owes to the supports of the priors: their volume, and whether they have one."""
+"""Supports of the priors: volume of Uniform ones, improper and unnormalised priors."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,9 +13,8 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorVariable
 
-# PyMC's densities that have no integral.
-_IMPROPER = (FlatRV, HalfFlatRV, ICARRV)
-_N_TRIED = 50  # draws that a transform must bear
+_IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
+_N_TRIED = 50  # draws to test whether a transform is invertible on the whole support
 
 
 @dataclass(frozen=True)
@@ -28,64 +27,64 @@ class Support:
 
     @classmethod
     def of(cls, model: pm.Model) -> "Support":
-        """Read the priors of a model's free variables; nothing is drawn."""
+        """Inspect the priors of a model's free variables."""
         widths = {rv.name: log_widths for rv in model.free_RVs for log_widths in _widths(rv, model)}
         improper = [rv.name for rv in model.free_RVs if is_improper(rv, model)]
         return cls(float(sum(widths.values())), ", ".join(widths), ", ".join(improper))
 
-    def doubts(self) -> Iterator[str]:
-        """An evidence under an improper prior says little about a model."""
+    def check(self) -> Iterator[str]:
+        """Yield a reason if a prior is improper."""
         if self.improper:
             yield (
                 f"the prior of {self.improper} is improper or not normalised, so that the evidence "
-                "depends on the unit of each: give it a proper prior"
+                "depends on the units of the parameters: give them proper priors"
             )
 
 
 def is_improper(rv: TensorVariable, model: pm.Model) -> bool:
     """Whether the density of a free variable is known not to integrate to one."""
-    return not has_law(rv, model) or is_restricted(rv, model)
+    return not can_sample(rv, model) or is_restricted(rv, model)
 
 
-def has_law(rv: TensorVariable, model: pm.Model) -> bool:
-    """Whether there is a law to draw from, as far as PyMC's own distributions are concerned."""
+def can_sample(rv: TensorVariable, model: pm.Model) -> bool:
+    """Whether a prior can be sampled; false for PyMC's improper distributions."""
     return not any(isinstance(op, _IMPROPER) for op in _operations(rv, model))
 
 
 def _operations(rv: TensorVariable, model: pm.Model) -> Iterator[object]:
-    """What a variable's own law is made of, down to the other variables of the model."""
+    """The operations in a variable's distribution, down to the other variables of the model."""
     others = {other for other in model.basic_RVs if other is not rv}
     pending: list[Variable] = [v for v in ancestors([rv], blockers=others) if v not in others]
     while pending:
         owner = pending.pop().owner
         if owner is not None:
             yield owner.op
-            # A distribution made of others holds them in a graph of its own.
+            # A compound distribution holds its components in an inner graph.
             pending.extend(ancestors(getattr(owner.op, "inner_outputs", ())))
 
 
 def is_restricted(rv: TensorVariable, model: pm.Model) -> bool:
-    """Whether a transform leaves a part of the support out, as an ordering does.
+    """Whether a transform excludes a part of the support, as an ordering does.
 
-    Such a density is that of the law, on a part of its support, and nothing normalises it. What a
-    variable's law may draw then does not survive the way there and back.
+    The density is then restricted to a part of its support without being normalised, and random
+    draws do not survive a round trip through the transform.
     """
     transform = model.rvs_to_transforms[rv]
     if transform is None:
         return False
-    there = transform.forward(rv, *rv.owner.inputs)
-    back = transform.backward(there, *rv.owner.inputs)
+    unconstrained = transform.forward(rv, *rv.owner.inputs)
+    back = transform.backward(unconstrained, *rv.owner.inputs)
     try:
-        # Few calls: not worth machine code.
+        # Too few calls to be worth machine code.
         draw = compile_pymc([], [rv, back], random_seed=0, mode="FAST_COMPILE")
         pairs = [draw() for _ in range(_N_TRIED)]
-    except NotImplementedError:  # it, or what it depends on, has no law: nobody can tell
+    except NotImplementedError:  # it, or a variable it depends on, cannot be sampled
         return False
     return not all(np.allclose(before, after, rtol=1e-4) for before, after in pairs)
 
 
 def _widths(rv: TensorVariable, model: pm.Model) -> Iterator[float]:
-    """Sum of the log widths of a Uniform prior, if it is one and its bounds are constant."""
+    """Sum of the log widths of a prior, if it is Uniform with constant bounds."""
     if not isinstance(rv.owner.op, UniformRV):
         return
     bounds = rv.owner.op.dist_params(rv.owner)
