@@ -1,7 +1,7 @@
 """cuthbert: its extended Kalman, ensemble Kalman and bootstrap filters, jitted.
 
 It predicts before each update, so the first cycle has steps of length zero. The ensembles take all
-20 steps between two observations inside one prediction. The extended Kalman filter linearizes one
+20 steps between two observations inside one prediction. The extended Kalman filter linearises one
 step at a time, with NaN at the steps without an observation, which it skips.
 """
 
