@@ -1,11 +1,11 @@
-# Two commands do everything on a fresh machine: `make demo` and `make test`. `make help` lists the rest.
+# On a fresh machine, start with `make demo` or `make test`. `make help` lists the rest.
 
 VENV   ?= .venv
 LATEST ?= .venv-latest
-# The packages that `make bench` compares with; the names are those that benchmarks/ looks for.
+# Environments of the packages that `make bench` compares with; benchmarks/ looks for these names.
 BENCH  := .venv-bench
 
-# The first of these that runs, is of a version that PyMC supports and can make environments.
+# Use the first of these that runs, has a version supported by PyMC and can create environments.
 CANDIDATES = python3 python3.14 python3.13 python3.12
 FITS = import ensurepip, sys, venv; sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 14))
 PYTHON ?= $(shell for p in $(CANDIDATES); do $$p -c '$(FITS)' >/dev/null 2>&1 && echo $$p && break; done)
@@ -24,67 +24,67 @@ STUDIES = hidden_state validation double_well mass_spring_damper model_choice ai
 .DEFAULT_GOAL := help
 .PHONY: help environment demo demo-quick thesis thesis-quick test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
 
-help:  ## this list
+help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
 
-environment: $(VENV)/.installed  ## what all commands need, in .venv; they make it themselves
+environment: $(VENV)/.installed  ## create .venv; all other commands do this themselves
 
-demo: $(VENV)/.installed  ## three rival models of a double well, in out/; CSV=yours for your own record
+demo: $(VENV)/.installed  ## compare three models of a double well, in out/; CSV=my_record.csv for your own record
 	$(IN)/python examples/double_well.py $(if $(CSV),--csv "$(CSV)")
 
-demo-quick: $(VENV)/.installed  ## the same with short chains, to see that it runs
+demo-quick: $(VENV)/.installed  ## the same with short chains, to check that it runs
 	$(IN)/python examples/double_well.py --quick --out out/quick $(if $(CSV),--csv "$(CSV)")
 
-thesis: $(VENV)/.installed  ## every study of the thesis at its own settings, in out/thesis; hours, resumes; STUDIES=double_well
+thesis: $(VENV)/.installed  ## run the studies of the thesis at its settings, in out/thesis; takes hours, resumes; STUDIES=double_well
 	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py $(ARGS) || exit 1; done
 
-thesis-quick: $(VENV)/.installed  ## the same in a short form, minutes; fails where a verdict does not hold
+thesis-quick: $(VENV)/.installed  ## the same in a short form; takes minutes, fails if a verdict does not hold
 	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py --quick $(ARGS) || exit 1; done
 
-test: $(VENV)/.installed  ## the tests, in two processes
+test: $(VENV)/.installed  ## run the tests, in two processes
 	$(IN)/python $(PYTEST)
 
-test-mpi: $(VENV)/.installed  ## the tests by real MPI, on one, two and four ranks
+test-mpi: $(VENV)/.installed  ## run the MPI tests, on one, two and four ranks
 	$(IN)/python -m pytest -m "mpi and not slow" tests/mpi
 
-test-slow: $(VENV)/.installed  ## the statistical calibrations that `make test` leaves out
+test-slow: $(VENV)/.installed  ## run the statistical calibrations that `make test` leaves out
 	$(IN)/python $(PYTEST) -m slow -o faulthandler_timeout=0
 
-test-latest: $(LATEST)/.exists  ## the tests with the newest release of every dependency
+test-latest: $(LATEST)/.exists  ## run the tests with the newest release of every dependency
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[test]'
 	$(LATEST)/bin/python $(PYTEST)
 
-lint: $(VENV)/.installed  ## style, format, types, and who imports whom
+lint: $(VENV)/.installed  ## check style, format, types and import layers
 	$(IN)/ruff check .
 	$(IN)/ruff format --check .
 	$(IN)/mypy
 	$(IN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed  ## the guide, in docs/_build/html; every notebook in it is run, two at a time
+docs: $(VENV)/.installed  ## build the guide in docs/_build/html and run its notebooks, two at a time
 	$(IN)/python -m sphinx -E -j 2 -W --keep-going --quiet -b html docs docs/_build/html
 
-linkcheck: $(VENV)/.installed  ## the guide's links to other sites, on a machine that reaches them
+linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
 
-bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  ## all timings beside other packages, into docs/; ARGS="--only ekf"
+bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  ## time everything against other packages, into docs/; ARGS="--only ekf"
 	$(IN)/python -m benchmarks $(ARGS)
 
-bench-quick: $(VENV)/.installed  ## our filters beside loops by hand, a minute
+bench-quick: $(VENV)/.installed  ## time our filters against hand-written loops; takes a minute
 	$(IN)/python -m benchmarks.quick
 
-bench-mpi: $(VENV)/.installed  ## seconds against ranks, into docs/; two cores, half an hour
+bench-mpi: $(VENV)/.installed  ## time against the number of ranks, into docs/; needs two cores, takes half an hour
 	$(IN)/python -m benchmarks.mpi $(ARGS)
 
-lock: $(LATEST)/.exists  ## resolve anew; PYTHON=python3.12, so that the versions suit every Python
+lock: $(LATEST)/.exists  ## update the locked versions; use PYTHON=python3.12, so that they suit every Python
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]' hatchling editables
 	sed '/^[^#]/,$$d' requirements.lock > $(LATEST)/lock
 	$(LATEST)/bin/pip freeze --exclude-editable >> $(LATEST)/lock
 	mv $(LATEST)/lock requirements.lock
 
-clean:  ## remove what the commands made, the environments excepted
+clean:  ## remove everything the commands made except the environments
 	rm -rf out docs/_build docs/reference/api .cache .pytest_cache .mypy_cache .ruff_cache
 
-# The environment is made once and brought up to date when the lock or the metadata change.
+# The environment is created once and updated when the lock or the metadata change.
 $(VENV)/.installed: requirements.lock pyproject.toml
 	@$(if $(PYTHON),,$(NO_PYTHON))
 	$(PYTHON) -m venv $(VENV)
@@ -92,7 +92,7 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 	$(IN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 
-# A package that cannot be installed here must not stop the others: the table says who did not run.
+# A package that cannot be installed must not stop the others: the table says which did not run.
 $(BENCH)/.installed: benchmarks/requirements.txt
 $(BENCH)-pymc-extras/.installed: benchmarks/requirements-pymc-extras.txt
 $(BENCH)/.installed $(BENCH)-pymc-extras/.installed:

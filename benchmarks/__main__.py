@@ -1,8 +1,8 @@
 """Measure everything and write the tables and figures of ``docs/reference/benchmarks.md``.
 
-``python -m benchmarks`` measures part after part and keeps each as a file in ``out/benchmarks``;
-``--only ekf enkf`` measures some parts anew, ``--resume`` those that are not there yet, and
-``--report`` writes the documentation from what is there.
+``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
+``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
+writes the documentation from the stored parts.
 """
 
 import argparse
@@ -38,7 +38,7 @@ PARTS = {
 
 
 def on_one_core() -> None:
-    """Pin this process and the ones it starts, so that CPU time is that of one thread."""
+    """Pin this process and its children to one core, so that CPU time is that of one thread."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
@@ -54,12 +54,12 @@ def versions(peers: Peers) -> dict[str, str]:
         ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
     )
     found["commit"] = head.stdout.strip() or "unknown"
-    # The versions of the peers' own PyMC and numba come first where the names are the same.
+    # The versions of the peers' own PyMC and numba take precedence where the names are the same.
     return {f"{name} (peer)": v for name, v in peers.versions.items()} | found
 
 
 def measure(part: str) -> None:
-    """Measure one part and keep it."""
+    """Measure one part and store it."""
     start, peers = time.perf_counter(), Peers()
     try:
         rows = [row.as_json() for row in PARTS[part](peers)]

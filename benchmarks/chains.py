@@ -1,8 +1,8 @@
-"""What a compiled chain costs besides its likelihood, what threads gain, what checkpoints cost.
+"""Cost of a compiled chain apart from its likelihood, gain from threads, cost of checkpoints.
 
-The overhead is taken on a model whose density costs next to nothing, four normals: the time of
-chains, from the random numbers to the DataTree, less that of the same number of evaluations by
-machine code. What threads and checkpoints do is wall time, of runs in turn.
+The overhead is measured on a model whose density costs almost nothing, four normals. It is the time
+of the chains, from the random numbers to the DataTree, less that of the same number of evaluations
+in machine code. Threads and checkpoints are measured in wall time, with the runs in turn.
 """
 
 import logging
@@ -56,7 +56,7 @@ def four_normals() -> pm.Model:
 
 
 def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
-    """Of a chain of one stage, warm-up or draws, all that its evaluations do not take."""
+    """Return the time of a one-stage chain, warm-up or draws, apart from its evaluations."""
     model = four_normals()
     run = partial(
         psf.sample_dram, chains=1, cores=1, stages=1, random_seed=1, progressbar=False, model=model
@@ -83,7 +83,7 @@ def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
 
 
 def walls(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Median wall seconds of each, in turn, once warm."""
+    """Return median wall seconds of each, run in turn, once warm."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for name in runs:
         runs[name]()
@@ -96,7 +96,7 @@ def walls(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
 
 
 def two_chains(model: pm.Model, **settings) -> Callable:
-    """Two chains from the truth on, given the number of draws."""
+    """Return a function that runs two chains from the truth for a given number of draws."""
     return partial(
         psf.sample_dram,
         tune=0,
@@ -110,7 +110,7 @@ def two_chains(model: pm.Model, **settings) -> Callable:
 
 
 def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
-    """Two chains in two threads, against the same one after the other."""
+    """Compare two chains in two threads with the same chains one after the other."""
     run = two_chains(model)
     taken = walls(
         {
@@ -127,7 +127,7 @@ def threads(what: str, model: pm.Model, draws: int) -> ChainCost:
 
 
 def checkpoints(seconds: float = 16.0) -> ChainCost:
-    """Chains of some seconds with a checkpoint every five, and without."""
+    """Compare chains of some seconds with a checkpoint every five seconds and without."""
     model = double_well_model(psf.EKF())
     run = two_chains(model, cores=2)
     start = time.perf_counter()
@@ -155,7 +155,7 @@ def checkpoints(seconds: float = 16.0) -> ChainCost:
 
 
 def chains() -> list[ChainCost]:
-    logging.getLogger("pymc").setLevel(logging.ERROR)  # of far too short chains
+    logging.getLogger("pymc").setLevel(logging.ERROR)  # of much too short chains
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
     four = "one chain, four parameters, one stage; from the random numbers to the DataTree"
     found = [

@@ -1,7 +1,7 @@
-"""What the first call of a model costs, compilation included, imports not.
+"""Cost of the first call of a model, including compilation but not imports.
 
-Each first call is made in a process of its own with an empty cache; then again in a second
-process; then for another system with as many states, in the same cache.
+Each first call runs in its own process with an empty cache, then again in a second process, then
+for another system with as many states and the same cache.
 """
 
 import os
@@ -21,7 +21,7 @@ KINDS = {
     "PFEnKF(250)": "ours.of(name, psf.PFEnKF(250)).value()",
 }
 
-# Simulating the record compiles too: it is done before the clock starts.
+# Simulating the record compiles too, so do it before the clock starts.
 CHILD = """
 import sys, time
 import pymc_statespace_filters as psf
@@ -36,7 +36,7 @@ print(time.process_time() - start)
 
 @dataclass(frozen=True)
 class Cold:
-    """CPU seconds of the first call: empty cache, second process, another model."""
+    """Return CPU seconds of the first call: empty cache, second process, another model."""
 
     kind: str
     states: int

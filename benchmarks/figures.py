@@ -14,7 +14,7 @@ OURS_COLOUR, OTHERS_COLOUR = "#1b6ca8", "#b0b7bd"
 
 
 def bars(rows: list[Row], target: Path) -> None:
-    """Every work a panel; the times of all contenders over the time of ours, on one log scale."""
+    """Plot a panel for each task: the times of all contenders divided by ours, on one log scale."""
     works = [
         [row for row in rows if row.work == work and row.timing]
         for work in dict.fromkeys(row.work for row in rows)
@@ -37,7 +37,7 @@ def bars(rows: list[Row], target: Path) -> None:
         group = sorted(group, key=lambda row: -row.timing.median)
         times = [row.timing.median / ours for row in group]
         colours = [OURS_COLOUR if row.who.startswith("ours") else OTHERS_COLOUR for row in group]
-        # From 1, so that what is faster than ours points to the left.
+        # From 1, so that contenders faster than ours point to the left.
         axis.barh([row.who for row in group], [t - 1.0 for t in times], left=1.0, color=colours)
         for i, t in enumerate(times):
             axis.annotate(
@@ -62,7 +62,7 @@ def bars(rows: list[Row], target: Path) -> None:
 
 
 def curves(growth: list[Curve], target: Path) -> None:
-    """Cost of a call against particles, steps and states."""
+    """Plot the cost of a call against particles, steps and states."""
     kinds = list(dict.fromkeys(curve.against for curve in growth))
     if not kinds:
         return

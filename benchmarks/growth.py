@@ -1,4 +1,4 @@
-"""How the cost of one likelihood grows with particles, steps and states."""
+"""Growth of the cost of one likelihood with particles, steps and states."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -22,7 +22,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Curve:
-    """CPU seconds of a call at each size; `ends` says why a curve stops early."""
+    """Return CPU seconds of a call at each size; `ends` says why a curve stops early."""
 
     against: str
     who: str

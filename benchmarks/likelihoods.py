@@ -1,4 +1,4 @@
-"""The likelihoods: which contenders do which work. Every function is one part of the table."""
+"""The likelihoods: which contender does which task. Every function is one part of the table."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
-"""Loops written by hand for one system: what the compiled filters are held against.
+"""Hand-written loops for one system each, the reference for the compiled filters.
 
-They need numpy and numba alone, and read a record as arrays.
+They need only numpy and numba, and read a record as arrays.
 """
 
 import math
@@ -63,7 +63,7 @@ def ekf_mass_spring_damper(theta, steps, observed, inputs):
 
 @by_hand
 def propagate_double_well(theta, steps, normals, x):
-    """Only the steps of an ensemble x (N,) on stored normals (1 + steps + J, N): no update."""
+    """Run only the steps of an ensemble x (N,) on stored normals (1 + steps + J, N): no update."""
     alpha, beta, sigma, _ = theta
     scale = math.sqrt(DT * (0.36 + sigma * sigma))
     for i in range(x.size):
@@ -77,7 +77,7 @@ def propagate_double_well(theta, steps, normals, x):
 
 @by_hand
 def propagate_mass_spring_damper(theta, steps, inputs, normals, x, v):
-    """The same for the mass-spring-damper, on normals (2 + steps + J, N)."""
+    """Run the same for the mass-spring-damper, on normals (2 + steps + J, N)."""
     c, c3, stiffness, k2, k3, gain, sigma, _, x0 = theta
     scale = math.sqrt(DT) * sigma
     for i in range(x.size):

@@ -1,4 +1,4 @@
-"""One comparison: several contenders at the same work, timed in turn, their answers compared."""
+"""One comparison: several contenders on the same task, timed in turn, their answers compared."""
 
 import statistics
 from collections.abc import Callable
@@ -10,12 +10,12 @@ from benchmarks.timing import Contender, Timing, in_turn
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "out" / "benchmarks"
-N_SEEDS = 16  # estimates that are averaged where an answer is random
+N_SEEDS = 16  # number of estimates to average where an answer is random
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: who did which work, in how many CPU seconds, and what came out."""
+    """One line of the table: contender, task, CPU seconds, and the answer."""
 
     work: str
     who: str
@@ -33,7 +33,7 @@ class Row:
 
 
 class Peers:
-    """The processes of other packages, started when first asked for."""
+    """The processes of other packages, started on first use."""
 
     def __init__(self) -> None:
         self.open: dict[str, Peer] = {}
@@ -60,7 +60,7 @@ def compare(
     notes: dict[str, str] | None = None,
     without_answer: tuple[str, ...] = (),
 ) -> list[Row]:
-    """Rows of one work; who cannot do it has a row that says why.
+    """Return the rows of one task; a contender that cannot do it has a row with the reason.
 
     ``without_answer`` names contenders that do not compute the likelihood.
     """
@@ -88,7 +88,7 @@ def compare(
 
 
 def as_text(values: list[float]) -> str:
-    """The log-likelihood to 1e-6, or its mean and the standard error of that."""
+    """Return the log-likelihood to 1e-6, or its mean and the standard error of the mean."""
     if len(values) == 1:
         return f"{values[0]:.6f}"
     error = statistics.stdev(values) / len(values) ** 0.5

@@ -1,10 +1,10 @@
-"""How far an estimated log-likelihood moves when its normals are moved by an autoregression.
+"""Change of an estimated log-likelihood when an autoregression moves its normals.
 
 The double well at the parameters of its record. Normals u are those of one seed, v those of
-another; the numbers are variances of log L(rho u + sqrt(1 - rho^2) v) - log L(u) over pairs of
-seeds, good to a sixth of their size. Run with ``python -m benchmarks.noise_variance`` from the root
-of the repository; it takes a few minutes. ``docs/explanation/noisy-likelihoods.md`` shows some of
-the rows.
+another. The numbers are variances of log L(rho u + sqrt(1 - rho^2) v) - log L(u) over pairs of
+seeds, accurate to a sixth of their size. Run it with ``python -m benchmarks.noise_variance`` from
+the root of the repository; it takes a few minutes. ``docs/explanation/noisy-likelihoods.md`` shows
+some of the rows.
 """
 
 import warnings
@@ -37,7 +37,7 @@ FAMILIES = (
 
 
 def variances(filters, n_observations) -> np.ndarray:
-    """Variances of the differences, (filters, correlations), of filters that share normals."""
+    """Return variances of the differences, (filters, correlations); the filters share normals."""
     steps = STEPS_BETWEEN * np.arange(n_observations)
     inputs, observed = simulated(DOUBLE_WELL, DOUBLE_WELL_TRUTH, steps)
     theta = theta_of(DOUBLE_WELL, DOUBLE_WELL_TRUTH)

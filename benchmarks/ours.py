@@ -1,7 +1,7 @@
 """Our likelihoods through the public operation, compiled as PyTensor compiles them for a model.
 
-What is timed is the compiled machine code that PyTensor made of the graph: its call from Python
-is the same for any function and a row of its own.
+The timing is of the machine code that PyTensor compiled from the graph. Its call from Python is the
+same for any function and has its own row.
 """
 
 import numpy as np
@@ -11,18 +11,19 @@ from pytensor.graph.replace import vectorize_graph
 
 from benchmarks.systems import STEPS, SYSTEMS, simulated, theta_of
 from benchmarks.timing import Timed
-from pymc_statespace_filters import ops
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
 
 
 class Likelihood:
-    """The log-likelihood of one record by one filter, as something to be timed."""
+    """The log-likelihood of one record by one filter, as a task to time."""
 
     def __init__(self, system, filter, truth, *, steps=STEPS) -> None:
         self.system, self.filter, self.steps = system, filter, np.asarray(steps)
         self.at = theta_of(system, truth)
         self.inputs, self.observed = simulated(system, truth, self.steps)
 
-    def total(self, theta, noise=0, operation=ops.LogLikelihood):
+    def total(self, theta, noise=0, operation=LogLikelihood):
         record = [pytensor.shared(a) for a in (self.steps, self.observed, self.inputs)]
         if isinstance(noise, int):
             noise = pt.constant(noise, dtype="int64")
@@ -36,11 +37,11 @@ class Likelihood:
         return Timed(lambda s: run(self.at, np.asarray(s))[0].item())
 
     def on_held_noise(self) -> Timed:
-        """On normals that are drawn and stored once: common random numbers."""
+        """With normals that are drawn and stored once: common random numbers."""
         theta, stored, seed = pt.dvector("theta"), pt.dvector("stored"), pt.lscalar("seed")
-        normals = ops.StoredNoise(self.system, self.filter)(pt.constant(self.steps), seed)
+        normals = StoredNoise(self.system, self.filter)(pt.constant(self.steps), seed)
         draw = pytensor.function([seed], normals, mode="NUMBA")
-        total = self.total(theta, stored, ops.LogLikelihoodOfNoise)
+        total = self.total(theta, stored, LogLikelihoodOfNoise)
         run = machine_code([theta, stored], [total])
         return Timed(lambda noise: run(self.at, noise)[0].item(), draw)
 
@@ -51,13 +52,13 @@ class Likelihood:
         return Timed(lambda s: run(self.at)[0].item())
 
     def called_from_python(self) -> Timed:
-        """The value by PyTensor's own function, as a sampler that calls Python does."""
+        """The value by PyTensor's own function, as a sampler in Python calls it."""
         theta = pt.dvector("theta")
         function = pytensor.function([theta], self.total(theta), mode="NUMBA", trust_input=True)
         return Timed(lambda s: function(self.at).item())
 
     def batch(self, n_points: int) -> Timed:
-        """Several parameter points in one call, nearby ones, as chains have them."""
+        """Several nearby parameter points in one call, as for several chains."""
         theta, points = pt.dvector("theta"), pt.dmatrix("points")
         run = machine_code([points], [vectorize_graph(self.total(theta), {theta: points})])
         spread = 0.01 * np.random.default_rng(0).normal(size=(n_points, self.at.size))
@@ -67,13 +68,13 @@ class Likelihood:
 
 
 def machine_code(inputs, outputs):
-    """PyTensor's compiled function without the checks of its call from Python."""
+    """Return PyTensor's compiled function without the checks of its call from Python."""
     function = pytensor.function(inputs, outputs, mode="NUMBA")
     cells = [cell.storage[0] for cell in function.input_storage[len(inputs) :]]
     return lambda *arguments: function.vm.jit_fn(*arguments, *cells)
 
 
 def of(name: str, filter) -> Likelihood:
-    """The likelihood of the record of one of the systems."""
+    """Return the likelihood of the record of one of the systems."""
     system, truth = SYSTEMS[name]
     return Likelihood(system, filter, truth)

@@ -1,4 +1,4 @@
-"""Our filters against the loops by hand, in a minute: run it before a release.
+"""Our filters compared with hand-written loops, in a minute: run it before a release.
 
 ``python -m benchmarks.quick`` (or ``make bench-quick``) needs no other package and no compiler.
 """

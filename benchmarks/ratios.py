@@ -1,4 +1,4 @@
-"""The ratios that matter, taken between rows that were measured in turn."""
+"""The most informative ratios, between rows that were measured in turn."""
 
 from benchmarks.growth import Curve
 from benchmarks.likelihoods import FAST, HELD, N_POINTS, O2, OURS, PROPAGATION
@@ -10,7 +10,7 @@ SYSTEMS = ("double well, 4 parameters", "mass-spring-damper, 9 parameters")
 
 
 def ratios(rows: list[Row], growth: list[Curve], chains: list[Chains]) -> list[Ratio]:
-    """What, the ratio or None where one of the two is missing, and which way is good."""
+    """Return description, ratio or None where one of the two is missing, and which way is good."""
     times = {(row.work, row.who): row.timing.median for row in rows if row.timing}
 
     def over(work: str, who: str, by: tuple[str, str]) -> float | None:

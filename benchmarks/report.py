@@ -1,4 +1,4 @@
-"""From what was measured to the tables and figures of the documentation."""
+"""Write the measurements to the tables and figures of the documentation."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ KINDS = {
 
 
 def write(parts: list[str]) -> str:
-    """Write everything; returns the tables as text."""
+    """Write everything; return the tables as text."""
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
     found = {
         part: [KINDS[part](**row) if part in KINDS else Row.of_json(row) for row in k["rows"]]
@@ -108,7 +108,7 @@ def likelihood_tables(rows: list[Row]) -> str:
 
 
 def best_of_ours(group: list[Row]) -> float | None:
-    """The row that the others are divided by: ours, as a model uses it."""
+    """Return the row that the others are divided by: ours, as a model uses it."""
     return next((row.timing.median for row in group if row.who == "ours" and row.timing), None)
 
 
@@ -168,7 +168,7 @@ def write_csv(rows: list[Row], target: Path) -> None:
 
 
 def seconds(value: float) -> str:
-    """Seconds with three digits, in the unit that fits."""
+    """Format seconds with three digits, in the unit that fits."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if value >= size:
             return f"{value / size:.3g} {unit}"

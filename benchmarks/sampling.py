@@ -1,9 +1,9 @@
 """Chains on the double well by EKF: draws and effective draws per CPU second.
 
 Every sampler starts at the parameters of the record and runs one chain per seed. Time is counted in
-two ways: of all iterations, tuning included, and of the draws kept alone; the effective sample size
-is that of the draws kept. What is spent before the first iteration is measured by a run of one draw
-and taken off. What follows the last one, up to the DataTree, counts.
+two ways: for all iterations, including tuning, and for the kept draws alone. The effective sample
+size is that of the kept draws. A run of one draw measures the time before the first iteration,
+which is subtracted. The time after the last one, up to the DataTree, is included.
 """
 
 import logging
@@ -29,9 +29,9 @@ NAMES = ("alpha", "beta", "sigma", "gamma")
 
 @dataclass(frozen=True)
 class Chains:
-    """What one sampler did: per CPU second, medians over the seeds, the lowest and the highest.
+    """Results of one sampler per CPU second: medians over the seeds, lowest and highest.
 
-    The first numbers count the whole run, the last two the draws kept and their time.
+    The first numbers count the whole run, the last two the kept draws and their time.
     """
 
     sampler: str
@@ -59,7 +59,7 @@ def double_well_model(filter, steps=STEPS) -> pm.Model:
 
 
 def summarised(sampler: str, chains, seconds, kept_seconds, note: str = "") -> Chains:
-    """Chains (seed, draw, parameter), and the CPU seconds of each, whole and of the draws kept."""
+    """Chains (seed, draw, parameter), and the CPU seconds of each, whole and of the kept draws."""
     smallest = [min(array_stats.ess(chain[None, :, i]) for i in range(4)) for chain in chains]
     rates = np.array(smallest) / seconds
     speed = np.median((TUNE + DRAWS) / np.array(seconds))
@@ -76,15 +76,15 @@ def summarised(sampler: str, chains, seconds, kept_seconds, note: str = "") -> C
 
 
 def by_pymc(sampler: str, step: Callable) -> Chains:
-    """Chains of ``pm.sample`` with a step method."""
+    """Run chains of ``pm.sample`` with a step method."""
     quiet = {"quiet": True, "compute_convergence_checks": False, "cores": 1}
     return of_runs(sampler, lambda **run: pm.sample(step=step(), **quiet, **run))
 
 
 def of_runs(sampler: str, sample: Callable) -> Chains:
-    """Chains of a function with the arguments of ``pm.sample``.
+    """Run chains of a function with the arguments of ``pm.sample``.
 
-    A second run of the same seed that ends with the tuning tells what the draws kept took.
+    A second run of the same seed that stops after tuning gives the time of the kept draws.
     """
 
     def run(seed, tune, draws):
@@ -100,7 +100,7 @@ def of_runs(sampler: str, sample: Callable) -> Chains:
         seconds = time.process_time() - start
         return np.stack([idata.posterior[name].values[0] for name in NAMES], axis=1), seconds
 
-    logging.getLogger("pymc").setLevel(logging.ERROR)  # of far too short chains
+    logging.getLogger("pymc").setLevel(logging.ERROR)  # of much too short chains
     with double_well_model(psf.EKF()):
         run(0, 1, 1)
         before = np.median([run(0, 1, 1)[1] for _ in range(5)])

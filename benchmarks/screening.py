@@ -1,10 +1,11 @@
-"""What a screen saves: likelihood calls and effective draws, the double well by PF-EnKF.
+"""Savings from a screen: likelihood calls and effective draws, the double well by PF-EnKF.
 
-For each screen a few chains from the parameters of the record. All iterations, warm-up included,
-count as CPU time and as calls of the likelihood; what a run of two iterations takes, to compile and
-to convert, is taken off. The effective sample size is the smallest of the four parameters, of the
-draws kept. Run with ``python -m benchmarks.screening`` from the root of the repository; it takes
-some twenty minutes and writes the table of ``docs/explanation/noisy-likelihoods.md``.
+Each screen runs a few chains from the parameters of the record. All iterations, including warm-up,
+count as CPU time and as calls of the likelihood. The time of a run of two iterations, for
+compilation and conversion, is subtracted. The effective sample size is the smallest of the four
+parameters, of the kept draws. Run it with ``python -m benchmarks.screening`` from the root of the
+repository; it takes some twenty minutes and writes the table of
+``docs/explanation/noisy-likelihoods.md``.
 """
 
 import logging
@@ -25,7 +26,7 @@ SCREENS = {"`EKF()`": psf.EKF(), "`EnKF(100)`": psf.EnKF(100)}
 
 
 class Plan(NamedTuple):
-    """How many chains of how many draws, and the powers of their screens."""
+    """Numbers of chains and draws, and the powers of their screens."""
 
     chains: int
     draws: int
@@ -55,7 +56,7 @@ def timed(model: pm.Model, settings: dict, chains: int, tune: int, draws: int):
 
 
 def row(name: str, model: pm.Model, plan: Plan, settings: dict) -> str:
-    """Run a screen's chains, and put them in a row of the table."""
+    """Run a screen's chains and return their row of the table."""
     before = min(timed(model, settings, plan.chains, 5, 5)[1] for _ in range(2))
     idata, seconds = timed(model, settings, plan.chains, TUNE, plan.draws)
     seconds -= before

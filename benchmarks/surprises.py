@@ -1,9 +1,10 @@
-"""How far each filter falls below the truth on a record with surprises.
+"""How far each filter falls below the exact log-likelihood on a record with surprises.
 
-A double well, a precise sensor, a thousand observations of which three are 5, 6 and 7 predicted
-standard deviations off. The truth is a point-mass filter. All numbers are nats, filter minus
-truth: over the whole record, at each surprise with the observation after it, and elsewhere. Run
-with ``python -m benchmarks.surprises`` from the root of the repository; it takes five minutes.
+The record is a double well observed by a precise sensor: a thousand observations, of which three
+are 5, 6 and 7 predicted standard deviations off. The reference is a point-mass filter. All numbers
+are in nats, filter minus reference: over the whole record, at each surprise with the observation
+after it, and elsewhere. Run it with ``python -m benchmarks.surprises`` from the root of the
+repository; it takes five minutes.
 """
 
 import time
@@ -29,7 +30,7 @@ FILTERS = (
 
 
 def errors(filter, n_seeds, truth) -> tuple[np.ndarray, bool]:
-    """Errors of the terms (n_seeds, J), and whether the package warned."""
+    """Return errors of the terms (n_seeds, J), and whether the package warned."""
     record = double_well_with_surprises()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -1,4 +1,4 @@
-"""The systems and records that everybody is measured on, written as a user would write them."""
+"""The systems and records of all comparisons, written as a user would write them."""
 
 from pathlib import Path
 
@@ -73,7 +73,7 @@ LINEAR_TRUTH = {"c": 0.4, "k": 4.0, "sigma": 0.3, "gamma": 0.02}
 
 
 def ring(n_states: int) -> psf.StateSpaceModel:
-    """Double wells in a ring, each pulled to its two neighbours; the first one is observed."""
+    """Return double wells in a ring, each coupled to its neighbours; the first one is observed."""
 
     def drift(x, alpha, beta, coupling):
         return alpha * x + beta * x**3 + coupling * (pt.roll(x, 1) + pt.roll(x, -1) - 2.0 * x)
@@ -101,14 +101,14 @@ def theta_of(system: psf.StateSpaceModel, truth: dict[str, float]) -> np.ndarray
 
 
 def simulated(system, truth, steps=STEPS, seed=1):
-    """Inputs (steps, n_inputs) and observations (J, 1) of one record."""
+    """Return inputs (steps, n_inputs) and observations (J, 1) of one record."""
     u = np.sin(np.arange(steps[-1] + 1) * DT)[:, None] if system.n_inputs else None
     data = psf.simulate(system, truth, steps=steps, inputs=u, random_seed=seed)
     return (np.zeros((0, 0)) if u is None else u), data["observations"].values
 
 
 def write_records(path: Path) -> None:
-    """Write what every contender reads: parameters, steps, inputs, observations of the systems."""
+    """Write the contenders' input: parameters, steps, inputs, observations of the systems."""
     arrays = {"dt": np.float64(DT), "steps": STEPS}
     for name, (system, truth) in SYSTEMS.items():
         inputs, observed = simulated(system, truth)

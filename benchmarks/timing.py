@@ -1,4 +1,4 @@
-"""CPU times of several contenders, taken in turn, round and round. Standard library only."""
+"""CPU times of several contenders, measured in rounds. Standard library only."""
 
 import statistics
 import time
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-SHORTEST = 0.02  # seconds: a faster call is repeated until it takes as long
+SHORTEST = 0.02  # seconds: a faster call is repeated until it takes this long
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Timing:
 
 
 class Contender(Protocol):
-    """Something that does the work, gives its answers, and says how many CPU seconds it took."""
+    """A contender that does the task, returns its answers, and reports its CPU seconds."""
 
     def warm_up(self) -> None: ...
 
@@ -32,10 +32,10 @@ class Contender(Protocol):
 class Timed:
     """A function of noise, in this process.
 
-    Without ``draw`` the function takes a seed, a new one for every timed call. With it the function
-    takes what ``draw`` made of a seed, and every timed call is on the same stored noise.
-    A call that does ``per`` pieces of work counts for one of them.
-    The functions of other packages are timed by this class too, in their own process.
+    Without ``draw``, the function takes a seed, a new one for every timed call. With ``draw``, it
+    takes the result of ``draw`` for a seed, and every timed call uses the same stored noise. A call
+    that does ``per`` pieces of work is divided by their number. This class also times the functions
+    of other packages, in their own processes.
     """
 
     def __init__(
@@ -52,9 +52,9 @@ class Timed:
         self.seed = 0
 
     def warm_up(self) -> None:
-        """Call once, compiling what is compiled, then count the calls that fill the shortest time.
+        """Call once, to compile, then count the calls that fill the shortest time.
 
-        The second count is the one that holds: few calls after the first are still cold.
+        The second count is used: the first few calls are still cold.
         """
         self.function(self.held if self.draw else 0)
         for _ in range(2):
@@ -64,12 +64,12 @@ class Timed:
                 return
 
     def values(self, n_seeds: int) -> list[float]:
-        """Answers for the first seeds, all equal where nothing is random."""
+        """Return answers for the first seeds, all equal where nothing is random."""
         draw = self.draw or (lambda seed: seed)
         return [float(self.function(draw(seed))) for seed in range(n_seeds)]
 
     def seconds(self) -> float:
-        """CPU seconds of one call."""
+        """Return CPU seconds of one call."""
         start = time.process_time()
         for _ in range(self.calls):
             self.seed += 1
@@ -78,7 +78,7 @@ class Timed:
 
 
 def in_turn(contenders: dict[str, Contender], rounds: int) -> dict[str, Timing]:
-    """Time every contender once per round, so that a slow minute of the machine hits all alike."""
+    """Time every contender once per round, so that a slow minute affects all of them alike."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, contender in contenders.items():

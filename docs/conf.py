@@ -28,34 +28,36 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-# The notes of a study are sections of the page on the thesis.
+# The notes of the studies are included in the page on the thesis.
 exclude_patterns = ["_build", "thesis/*/*.md"]
 nitpicky = True  # every reference within the guide must be found
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
-# Notebooks are kept without outputs and run once in every build from scratch. One that raises, or
+# Notebooks are stored without outputs and run once in every build. A notebook that raises, or
 # writes a warning to its stderr, fails the build.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_merge_streams = True
 nb_output_stderr = (
-    "warn"  # a cell whose warning the text is about shows it: output_stderr
+    "warn"  # a cell that is meant to show a warning sets output_stderr
 )
 os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
 
 # The reference is the list of public names in __init__.py.
 autosummary_generate = False
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # shapes and types are told in the docstrings
+autodoc_typehints = "none"  # the docstrings give shapes and types
 numpydoc_show_class_members = False
-# Sphinx would show that of __new__, by which PyMC makes every step method: (*args, **kwargs).
+# Sphinx would show the signature of PyMC's __new__ for step methods: (*args, **kwargs).
 DRAM.__signature__ = signature(DRAM)
 
 copybutton_exclude = ".linenos, .gp, .go"
 
-html_theme = "pydata_sphinx_theme"  # that of PyMC's own pages is made from it
+html_theme = (
+    "pydata_sphinx_theme"  # the theme of PyMC's own pages derives from it
+)
 html_title = "pymc-statespace-filters"
 html_static_path = ["_static"]
 html_css_files = ["guide.css"]
@@ -70,7 +72,7 @@ html_theme_options = {
     "show_nav_level": 2,
 }
 
-# `make linkcheck`, on a machine that reaches them.
+# For `make linkcheck`, which needs network access.
 linkcheck_timeout = 20
 linkcheck_anchors = False
 

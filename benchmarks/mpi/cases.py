@@ -1,4 +1,4 @@
-"""The likelihoods that are spread over ranks: the double well, 2001 states, 101 observations."""
+"""The likelihoods that are divided among ranks: the double well, 2001 states, 101 observations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ EXACT, FAST, BOOTSTRAP, ENKF = "PFEnKF, exact kernels", "PFEnKF", "BootstrapPF",
 FILTERS = {EXACT: psf.PFEnKF, FAST: psf.PFEnKF, BOOTSTRAP: psf.BootstrapPF, ENKF: psf.EnKF}
 SIZES = (1000, 10_000, 100_000)
 RANKS = (1, 2, 4, 8, 16, 20, 40, 100)
-THREADS = (1, 2, 4, 8, 16)  # more at a time measure each other
+THREADS = (1, 2, 4, 8, 16)  # more at a time would disturb each other
 
 
 class Ranks(Protocol):
-    """What a filter asks of `parallel.Ranks`."""
+    """The part of `Communicator` that a filter uses."""
 
     rank: int
     size: int
@@ -43,7 +43,7 @@ class Case:
 
     @property
     def scale(self) -> float:
-        """From what is measured to the whole record."""
+        """Factor from the measured part to the whole record."""
         return STEPS.size / self.n_seen
 
     def fits(self, n_ranks: int) -> bool:
@@ -51,9 +51,9 @@ class Case:
 
 
 def cases(exact: bool) -> list[Case]:
-    """Those with exact kernel sums, or the others.
+    """Return the cases with exact kernel sums, or the others.
 
-    Exact sums of many particles take a time that is all but proportional to the observations.
+    The time of exact sums of many particles is nearly proportional to the number of observations.
     """
     if exact:
         return [Case(EXACT, n, seen) for n, seen in zip(SIZES, (STEPS.size, 5, 1), strict=True)]
@@ -61,10 +61,10 @@ def cases(exact: bool) -> list[Case]:
 
 
 def with_exact_kernels() -> None:
-    """Switch the lattice off, in this process, before anything is compiled.
+    """Switch the lattice off in this process, before anything is compiled.
 
-    With one or two states the package has no use for exact sums over so many particles; the thesis
-    has no others. Their machine code must go to a cache of its own.
+    With one or two states the package does not use exact sums for so many particles; the thesis has
+    no others. Their machine code must go to a separate cache.
     """
     _kernel_density._LINE_FROM = _kernel_density._PLANE_FROM = 2**62
 
@@ -75,7 +75,7 @@ def record() -> tuple[np.ndarray, np.ndarray]:
 
 
 def evaluation(case: Case, ranks: Ranks) -> Callable[[int], float]:
-    """The log-likelihood, shared by ranks, as a function of a seed."""
+    """Return the log-likelihood, divided among ranks, as a function of a seed."""
     filter, steps = FILTERS[case.kind](case.n), STEPS[: case.n_seen]
     inputs, observed = record()
     theta = theta_of(DOUBLE_WELL, DOUBLE_WELL_TRUTH)

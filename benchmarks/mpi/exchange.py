@@ -1,7 +1,7 @@
-"""What an exchange between two ranks of one machine costs: run by two ranks.
+"""Cost of an exchange between two ranks of one machine: run on two ranks.
 
-From machine code, by way of the callback, as a filter does it; and the bare call of mpi4py, with
-the other rank and alone, whose difference is one message.
+It measures an exchange from machine code, through the callback, as in a filter, and the bare call
+of mpi4py, with the other rank and alone; their difference is one message.
 """
 
 import json
@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks.mpi.with_callback import many_exchanges
+from benchmarks.mpi.watched import many_exchanges
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.parallel.communicator import communicator_of
 
-ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as the filters have them
-ROUNDS = 300  # short ones: some meet a moment without neighbours
+ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as in the filters
+ROUNDS = 300  # short ones: some run without interference
 
 
 def seconds(work: Callable[[int], object], n: int) -> float:
-    """Seconds of one of n, in the quickest of some rounds: neighbours only make it slower."""
+    """Return the seconds of one of n calls in the fastest round: other load only slows it down."""
     rounds = []
     for _ in range(ROUNDS):
         MPI.COMM_WORLD.Barrier()

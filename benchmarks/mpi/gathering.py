@@ -1,6 +1,6 @@
-"""Draws on their way to rank 0: seconds, and memory there. Run by two ranks, and by one.
+"""Time and memory of gathering draws on rank 0: run on two ranks, and on one.
 
-Four chains of 100,000 draws of five parameters, of a density that costs next to nothing.
+Four chains of 100,000 draws of five parameters, with a density that costs almost nothing.
 """
 
 import json
@@ -42,7 +42,7 @@ class Clock:
 
 
 def memory(what: str) -> float:
-    """VmRSS, or VmHWM, its peak since it was last forgotten, in megabytes."""
+    """Return VmRSS, or VmHWM, its peak since the last reset, in megabytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(what)) / 1024
 
@@ -56,7 +56,7 @@ def size(tree: DataTree) -> float:
 
 
 def main(target: str) -> None:
-    logging.getLogger("pymc").setLevel(logging.CRITICAL)  # of far too short chains
+    logging.getLogger("pymc").setLevel(logging.CRITICAL)  # of much too short chains
     clock = Clock(("receive", "receive_arrays"))
     with pm.Model() as model:
         pm.Normal("x", 0, 1, shape=N)
@@ -78,7 +78,7 @@ def main(target: str) -> None:
         if idata is not None:
             found["wall"].append(wall)
             found["received"].append(clock.seconds)
-            if i == 0:  # later ones find memory that this one has given back to Python alone
+            if i == 0:  # later runs reuse memory that the first one returned to Python only
                 found |= {"peak": [memory("VmHWM") - baseline], "result": [size(idata)]}
     if MPI.COMM_WORLD.rank == 0:
         Path(target).write_text(json.dumps(found))

@@ -1,6 +1,6 @@
-"""One likelihood on one and on two processes in turn: run by two ranks.
+"""One likelihood on one and on two processes in turn: run on two ranks.
 
-While one rank evaluates alone the other sleeps.
+While one rank evaluates alone, the other sleeps.
 """
 
 import json
@@ -14,15 +14,15 @@ from statistics import median
 from mpi4py import MPI
 
 from benchmarks.mpi.cases import Case, cases, evaluation, with_exact_kernels
-from benchmarks.mpi.with_callback import Watched
+from benchmarks.mpi.watched import Watched
 from pymc_statespace_filters.parallel.communicator import communicator_of
 
-SECONDS, MOST, LEAST = 40.0, 15, 5  # of a case: about so long, at most and at least so many rounds
+SECONDS, MOST, LEAST = 40.0, 15, 5  # per case; at most and at least so many rounds
 
 
 @dataclass(frozen=True)
 class Wall:
-    """Wall seconds of an evaluation: medians of rounds in turn, and what of it were exchanges."""
+    """Wall seconds of an evaluation, and its exchanges: medians of rounds in turn."""
 
     case: Case
     one: list[float]
@@ -30,7 +30,7 @@ class Wall:
     in_exchanges: list[float]
 
     def median(self, n_ranks: int) -> float:
-        """Of the whole record."""
+        """Scaled to the whole record."""
         return self.case.scale * median(self.one if n_ranks == 1 else self.two)
 
     def as_json(self) -> dict:
@@ -48,7 +48,7 @@ def taken(evaluate: Callable[[int], float], seed: int) -> float:
 
 
 def wait_politely(comm: MPI.Comm) -> None:
-    """A barrier in which nobody takes a core from whoever still works."""
+    """Wait at a barrier without taking a core from a rank that still works."""
     request = comm.Ibarrier()
     while not request.Test():
         time.sleep(1e-3)

@@ -1,10 +1,10 @@
-"""Seconds of an evaluation on more ranks than there are cores here.
+"""Model of the seconds of an evaluation on more ranks than this machine has cores.
 
 T(R) = compute(R) + exchanges (overhead + stages(R) message) + bytes (1 - 1/R) / bandwidth
 
-compute(R) is measured: CPU time of the busiest of R ranks, which are threads of one process. So are
-the number of exchanges and their bytes. An exchange is an allgather by recursive doubling, of
-ceil(log2 R) stages of one message each (Thakur, Rabenseifner and Gropp 2005).
+compute(R) is measured: the CPU time of the busiest of R ranks, which are threads of one process.
+The number of exchanges and their bytes are measured too. An exchange is an allgather by recursive
+doubling, with ceil(log2 R) stages of one message each (Thakur, Rabenseifner and Gropp 2005).
 """
 
 import math
@@ -18,7 +18,7 @@ from benchmarks.mpi.cases import RANKS, Case
 
 @dataclass(frozen=True)
 class Link:
-    """What joins ranks: seconds of the way through the callback, of a message; bytes a second."""
+    """A connection of ranks: seconds of the callback and of a message; bytes per second."""
 
     name: str
     overhead: float
@@ -33,9 +33,9 @@ class Link:
 
 
 def links(exchange: dict) -> list[Link]:
-    """Shared memory as measured, then networks as assumed: their bytes are copied here as well."""
+    """Return shared memory as measured, then assumed networks, whose bytes are copied here too."""
     n_bytes, times = np.array(exchange["n_bytes"]), np.array(exchange["callback"])
-    # Relative errors count. Two ranks: half of an array travels.
+    # Fit relative errors. Two ranks: half of an array travels.
     (latency, of_a_byte), _ = nnls(
         np.column_stack([np.ones(times.size), n_bytes / 2]) / times[:, None], np.ones(times.size)
     )
@@ -50,7 +50,7 @@ def links(exchange: dict) -> list[Link]:
 
 @dataclass(frozen=True)
 class Spread:
-    """A likelihood against ranks: what was measured on threads, and the model from it."""
+    """A likelihood against ranks: measurements on threads, and the model based on them."""
 
     case: Case
     ranks: list[int]
@@ -63,8 +63,8 @@ class Spread:
         return cls(**(row | {"case": Case(**row["case"])}))
 
     def seconds(self, n_ranks: int, link: Link) -> float:
-        """Of the whole record."""
-        # How many exchanges and bytes hardly depends on the number of ranks.
+        """Scaled to the whole record."""
+        # The number of exchanges and their bytes hardly depend on the number of ranks.
         near = max(i for i, r in enumerate(self.ranks) if r <= n_ranks)
         exchanged = link.seconds(n_ranks, self.n_exchanges[near], self.n_bytes[near])
         if n_ranks in self.ranks:
@@ -73,21 +73,21 @@ class Spread:
         return self.case.scale * (serial + divided / n_ranks + exchanged)
 
     def best(self, link: Link) -> tuple[int, float]:
-        """The number of ranks, of those measured, with the shortest time; one over the other."""
+        """Return the measured number of ranks with the shortest time, and its speed-up over one."""
         n = min(filter(self.case.fits, RANKS), key=lambda r: self.seconds(r, link))
         return n, self.seconds(1, link) / self.seconds(n, link)
 
     def parts(self) -> tuple[float, float]:
-        """Seconds that every rank spends, and seconds that are divided: serial + divided / R."""
+        """Return the serial and the divided seconds of a fit serial + divided / R."""
         times = np.array(self.compute)
         basis = np.column_stack([np.ones(times.size), 1 / np.array(self.ranks)])
-        # Relative errors count: the times span two decades.
+        # Fit relative errors: the times span two decades.
         (serial, divided), _ = nnls(basis / times[:, None], np.ones(times.size))
         return float(serial), float(divided)
 
 
 def makespan(seconds: list[float], n_ranks: int) -> float:
-    """When the last job ends if the longest come first and a free rank takes the next."""
+    """Return when the last job ends if the longest start first and a free rank takes the next."""
     free = [0.0] * n_ranks
     for job in sorted(seconds, reverse=True):
         i = free.index(min(free))

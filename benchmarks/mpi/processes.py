@@ -1,4 +1,4 @@
-"""Ranks as processes: how they are started, and what each finds."""
+"""Ranks as processes: how they are started, and their output."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ AS_ROOT = {
 
 
 def launcher() -> str:
-    """The mpiexec of this environment, or of the system."""
+    """Return the mpiexec of this environment, or of the system."""
     here = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     found = shutil.which("mpiexec", path=here)
     if found is None:
@@ -26,7 +26,7 @@ def launcher() -> str:
 
 
 def start(n_ranks: int, module: str, *arguments: str, cache: Path | None = None) -> None:
-    """Run a module on so many ranks, on none if 0; what it prints is shown."""
+    """Run a module on so many ranks, or without MPI if 0, and show its output."""
     command = [sys.executable, "-W", "ignore", "-m"]
     if n_ranks > 0:
         command = [launcher(), "-n", str(n_ranks), *command, "mpi4py", "-m"]

@@ -1,4 +1,4 @@
-"""From what was measured to the tables of ``docs/reference/mpi_scaling.md``."""
+"""Write the measurements to the tables of ``docs/reference/mpi_scaling.md``."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ THESIS = {1: 12.49, 2: 6.36, 4: 3.35, 8: 1.82, 10: 1.57, 20: 1.09, 40: 0.77, 100
 
 
 def write(folder: Path) -> str:
-    """Write the tables of all parts that are there; returns them."""
+    """Write the tables of all stored parts; return them."""
     kept = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
     both = [kept.get(f"{part}_{k}", []) for part in PARTS for k in ("fast", "exact")]
     walls = {wall.case.name: wall for rows in both[:2] for wall in map(Wall.of_json, rows)}
@@ -52,7 +52,7 @@ def likelihood_table(
     *,
     with_thesis: bool,
 ) -> str:
-    """Seconds against ranks: as measured in upright numbers, as modelled in italics."""
+    """Return the table of run times: measured numbers upright, modelled ones in italics."""
     columns = [f"{kind}, {n}" for kind in kinds for n in SIZES]
     lines = []
     for n_ranks in RANKS:
@@ -75,7 +75,7 @@ def cell(
 
 
 def ends_table(spreads: dict[str, Spread], joined: list[Link]) -> str:
-    """The best number of ranks of those modelled, and what it gains."""
+    """Return the best of the modelled numbers of ranks, and its speed-up."""
     lines = []
     for name, spread in spreads.items():
         best = [spread.best(link) for link in joined]
@@ -97,7 +97,7 @@ def link_table(joined: list[Link]) -> str:
 
 
 def make_table(spreads: dict[str, Spread], walls: dict[str, Wall], link: Link) -> str:
-    """What goes into the model, and its answer for two ranks beside the measured one."""
+    """Return the inputs of the model, and its answer for two ranks next to the measured one."""
     lines = []
     for name, spread in spreads.items():
         i, seen = spread.ranks.index(2), spread.case.n_seen

@@ -1,6 +1,6 @@
-"""A whole study on one rank and on two: three rivals of four chains each, by ``run_models``.
+"""A whole study on one rank and on two: three rivals with four chains each, by ``run_models``.
 
-Without arguments, every run in turn, each in processes of its own; with them, one such run.
+Without arguments, it makes every run in turn, each in its own processes; with them, one such run.
 """
 
 import json
@@ -55,13 +55,13 @@ def rival(coefficients: tuple[str, ...], record) -> pm.Model:
 
 
 def cpu_seconds() -> float:
-    """Of this process, system calls included."""
+    """CPU seconds of this process, including system calls."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
 def timed(rivals: dict[str, pm.Model], tune: int, draws: int) -> tuple[float, float, dict | None]:
-    """Wall and CPU seconds of a run on this rank, and its result."""
+    """Return wall and CPU seconds of a run on this rank, and its result."""
     wall, cpu = time.perf_counter(), cpu_seconds()
     found = psf.run_models(
         rivals,
@@ -78,10 +78,10 @@ def timed(rivals: dict[str, pm.Model], tune: int, draws: int) -> tuple[float, fl
 
 
 def run(target: str) -> None:
-    """One study on the ranks that mpiexec started."""
+    """Run one study on the ranks that mpiexec started."""
     from mpi4py import MPI
 
-    logging.getLogger("pymc").setLevel(logging.CRITICAL)  # of far too short chains
+    logging.getLogger("pymc").setLevel(logging.CRITICAL)  # of much too short chains
     rivals = models()
     before, cpu_before, _ = timed(rivals, 1, 1)
     MPI.COMM_WORLD.Barrier()
@@ -100,7 +100,7 @@ def run(target: str) -> None:
 
 
 def one(n_ranks: int, module: str = MODULE) -> dict:
-    """One run in processes of its own; ``process_cpu`` and ``process_wall`` are theirs, whole."""
+    """Make one run in its own processes; ``process_cpu`` and ``process_wall`` are theirs, whole."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "run.json"
         used = resource.getrusage(resource.RUSAGE_CHILDREN)

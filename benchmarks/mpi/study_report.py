@@ -1,4 +1,4 @@
-"""The tables of a whole study: seconds against ranks, efficiency, and the way to rank 0."""
+"""The tables of a whole study: run time against ranks, efficiency, and gathering on rank 0."""
 
 from statistics import median
 
@@ -9,7 +9,7 @@ RANKS = (1, 2, 3, 4, 6, 12)
 
 
 def study_table(found: dict) -> str:
-    """Three rivals of four chains: measured on one and two ranks, modelled beyond."""
+    """Three rivals with four chains each: measured on one and two ranks, modelled beyond."""
     one, two = found["runs"]["1"], found["runs"]["2"]
     first = one[0]["evaluations"]
     evaluations = [n for chains in first.values() for n in chains]
@@ -38,7 +38,7 @@ def study_table(found: dict) -> str:
 
 
 def efficiency_table(found: dict) -> str:
-    """What a CPU second brings on two ranks, over what it brings on one."""
+    """Return the work done per CPU second on two ranks, relative to one."""
     one, two = found["runs"]["1"], found["runs"]["2"]
 
     def ratio(of) -> list[float]:
@@ -58,7 +58,7 @@ def efficiency_table(found: dict) -> str:
 
 
 def gathering_table(one: dict, two: dict) -> str:
-    """What four chains of 100,000 draws of five parameters ask of rank 0."""
+    """Return what gathering four chains of 100,000 draws of five parameters costs rank 0."""
 
     def peak(found: dict) -> str:
         return (

@@ -1,4 +1,4 @@
-"""What an evaluation costs the busiest of so many ranks, which are threads of one process."""
+"""Cost of an evaluation for the busiest of so many ranks, which are threads of one process."""
 
 import json
 import sys
@@ -7,10 +7,10 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.mpi.cases import SIZES, THREADS, cases, with_exact_kernels
-from benchmarks.mpi.with_callback import Cost, cost
+from benchmarks.mpi.watched import Cost, cost
 
 ROUNDS = 5
-LONG, FEW = 5.0, (1, 2, 16)  # what takes so many CPU seconds is measured once, on few sizes
+LONG, FEW = 5.0, (1, 2, 16)  # cases that take this many CPU seconds are measured once, on few sizes
 
 
 def main(target: str, kernels: str) -> None:

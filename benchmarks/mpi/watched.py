@@ -17,11 +17,11 @@ N_TOLLS = 200
 SIGNATURE = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_ssize_t, ctypes.c_ssize_t
 )
-"""Of an exchange: the address of an array, its rows, its columns, and columns of a block."""
+"""Arguments of an exchange: address of an array, rows, columns, columns per block."""
 
 
 class Watched:
-    """Ranks with an exchange around theirs: its calls, and the seconds that a clock gives them."""
+    """A communicator that counts and times the exchanges of another one."""
 
     def __init__(self, ranks: Ranks, clock: Callable[[], float]):
         self.rank, self.size, self.check_exchange = ranks.rank, ranks.size, ranks.check_exchange
@@ -31,7 +31,7 @@ class Watched:
         self.exchange = ctypes.cast(self._callback, ctypes.c_void_p).value if ranks.size > 1 else 0
 
     def forget(self) -> None:
-        """Begin to count anew."""
+        """Reset the counts."""
         self.seconds, self.n_bytes = 0.0, []
 
     def _call(self, address: int, rows: int, columns: int, per_block: int) -> None:
@@ -42,7 +42,7 @@ class Watched:
 
 
 class Cost(NamedTuple):
-    """CPU seconds of the busiest rank besides its exchanges; how many these are, their bytes."""
+    """CPU seconds of the busiest rank apart from its exchanges; their number and bytes."""
 
     compute: float
     n_exchanges: int
@@ -50,9 +50,9 @@ class Cost(NamedTuple):
 
 
 def cost(case: Case, n_ranks: int, seed: int) -> Cost:
-    """What an evaluation costs each of so many ranks, whatever joins them.
+    """Return the cost of an evaluation on each of so many ranks, without a network.
 
-    The ranks are threads, of which this machine runs few at a time: their CPU time is their own.
+    The ranks are threads, of which this machine runs few at a time, so each has its own CPU time.
     """
 
     def run(rank: FakeRank) -> tuple[Cost, float]:
@@ -73,7 +73,7 @@ def cost(case: Case, n_ranks: int, seed: int) -> Cost:
 
 @cache
 def toll(n_ranks: int) -> float:
-    """CPU seconds from machine code to `Watched` and back, among so many threads.
+    """Return CPU seconds from machine code to `Watched` and back, on so many threads.
 
     The model counts them as part of an exchange.
     """

@@ -1,4 +1,4 @@
-"""Our side of the conversation with another package in a process of its own."""
+"""Our side of the communication with another package in its own process."""
 
 import json
 import os
@@ -15,11 +15,11 @@ ONE_THREAD = {
 
 
 class PeerError(Exception):
-    """A package that is not installed, or did not do the work; the message is one line."""
+    """A package that is not installed, or that failed; the message is one line."""
 
 
 class Peer:
-    """A file of this folder, running in an environment, asked for one thing at a time."""
+    """A file of this folder, running in its environment, that serves one request at a time."""
 
     def __init__(self, name: str, environment: Path, records: Path) -> None:
         python = environment / "bin" / "python"

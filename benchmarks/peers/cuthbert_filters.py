@@ -1,8 +1,8 @@
 """cuthbert: its extended Kalman, ensemble Kalman and bootstrap filters, jitted.
 
-It predicts before each update, so that the first cycle has steps of length zero. The ensembles
-take all 20 steps between two observations inside one prediction. The extended Kalman filter
-linearises one step at a time, with NaN at the steps without an observation, which it passes over.
+It predicts before each update, so the first cycle has steps of length zero. The ensembles take all
+20 steps between two observations inside one prediction. The extended Kalman filter linearises one
+step at a time, with NaN at the steps without an observation, which it skips.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ from cuthbertlib.resampling import adaptive, systematic
 DT = 0.01
 THETA, STEPS, _, OBSERVED = record("double_well")
 GAPS = int(np.diff(STEPS)[0])
-# Lengths of the steps of each cycle: the first cycle is an update alone.
+# Lengths of the steps of each cycle: the first cycle is only an update.
 STEP = jnp.full(len(STEPS), DT).at[0].set(0.0)
 
 

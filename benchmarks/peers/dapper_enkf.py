@@ -1,7 +1,7 @@
 """DAPPER: its ensemble Kalman filter with perturbed observations.
 
-The loop is that of its class ``EnKF`` without the statistics, which cost more than the filter, and
-with the likelihood, which it does not compute: the mean of the densities given the members.
+The loop is that of its class ``EnKF`` without the statistics, which cost more than the filter. We
+add the likelihood, which it does not compute: the mean of the densities given the members.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
-"""dynamax: its extended Kalman filter, jitted, asked for the log-likelihood alone.
+"""dynamax: its extended Kalman filter, jitted, for the log-likelihood only.
 
-It knows no missing observations. At the 1900 steps without one the observation is zero with the
-variance ``HUGE``, which moves nothing by more than rounding; the log-density of those zeros, which
-is a constant, is taken off.
+It does not support missing observations. At the 1900 steps without one the observation is zero with
+the variance ``HUGE``, which changes nothing by more than rounding. The log-density of those zeros,
+a constant, is subtracted.
 """
 
 import numpy as np

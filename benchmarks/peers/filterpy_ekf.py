@@ -1,4 +1,4 @@
-"""filterpy: its extended Kalman filter, one call a step."""
+"""filterpy: its extended Kalman filter, one call per step."""
 
 import numpy as np
 

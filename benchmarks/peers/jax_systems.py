@@ -1,4 +1,4 @@
-"""What the packages that run on JAX share: the systems' steps, jitted calls, names of tasks."""
+"""Shared code of the packages that run on JAX: the systems' steps, jitted calls, task names."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ DT = 0.01
 
 
 def call_of(value: Callable, theta, gradient: bool) -> Callable:
-    """The value at theta, or value and gradient, jitted; the seed is not used."""
+    """Return the value at theta, or value and gradient, jitted; the seed is not used."""
     run = jax.jit(jax.value_and_grad(value) if gradient else value)
     if gradient:
         return lambda seed: jax.block_until_ready(run(theta))[0]
@@ -17,7 +17,7 @@ def call_of(value: Callable, theta, gradient: bool) -> Callable:
 
 
 def tasks_of(task: Callable) -> dict[str, Callable]:
-    """``task(name, gradient)`` of both systems, by the names that the benchmark asks for."""
+    """Return ``task(name, gradient)`` of both systems, with the benchmark's names."""
     return {
         f"{name}/{what}": task(name, what == "gradient")
         for name in ("double_well", "mass_spring_damper")

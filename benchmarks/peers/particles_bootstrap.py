@@ -1,7 +1,7 @@
-"""particles: its bootstrap filter, on a Feynman-Kac model written for this system.
+"""particles: its bootstrap filter, with a Feynman-Kac model written for this system.
 
-A move takes all 20 steps between two observations on whole arrays, which is quicker than its
-classes of state-space models, in which every step is a time of the filter.
+A move takes all 20 steps between two observations on whole arrays. This is faster than its classes
+of state-space models, in which every step is a time step of the filter.
 """
 
 import numpy as np

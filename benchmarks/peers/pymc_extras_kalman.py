@@ -1,6 +1,6 @@
 """pymc-extras: its Kalman filter on the linear oscillator, compiled by JAX and by numba.
 
-Every step is a time of the filter, with NaN at the steps without an observation.
+Every step is a time step of the filter, with NaN at the steps without an observation.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""pymcmcstat: its DRAM chains on the likelihood by the loop of ``loops.py``.
+"""pymcmcstat: its DRAM chains with the likelihood from the loop in ``loops.py``.
 
-Not part of the conversation in ``serve``: a chain is run per seed, and all go to one file.
-``python -m benchmarks.peers.pymcmcstat_dram RECORDS CHAINS N_SEEDS TUNE DRAWS``
+It does not use ``serve``: it runs one chain per seed and writes all of them to one file. ``python
+-m benchmarks.peers.pymcmcstat_dram RECORDS CHAINS N_SEEDS TUNE DRAWS``
 """
 
 import sys
@@ -13,7 +13,7 @@ import scipy
 
 from benchmarks.loops import ekf_double_well
 
-# Its release of 2021 imports a name that SciPy has since dropped; with it back, it runs.
+# Its release of 2021 imports a name that SciPy has since removed; with that restored, it runs.
 scipy.pi, scipy.sin, scipy.cos = np.pi, np.sin, np.cos
 
 from pymcmcstat.MCMC import MCMC  # noqa: E402
@@ -22,7 +22,7 @@ NAMES = ("alpha", "beta", "log_sigma", "log_gamma")
 
 
 def minus_two_log_posterior(q, steps, observed):
-    """The density that PyMC samples: scales in logs, with the Jacobian of that."""
+    """Return the density that PyMC samples: scales in logs, with the Jacobian."""
     alpha, beta, log_sigma, log_gamma = q
     theta = np.array([alpha, beta, np.exp(log_sigma), np.exp(log_gamma)])
     prior = -0.5 * (alpha**2 + beta**2) / 100.0
@@ -34,7 +34,7 @@ def chain(seed, n, start, steps, observed):
     np.random.seed(seed)  # noqa: NPY002 - it draws from the global generator
     mcmc = MCMC()
     mcmc.data.add_data_set(x=np.zeros(1), y=np.zeros(1))
-    # The record travels by closure: the data structure of the package is for regressions.
+    # Pass the record by closure: the data structure of the package is for regressions.
     mcmc.simulation_options.define_simulation_options(
         nsimu=n, updatesigma=False, method="dram", verbosity=0, waitbar=False
     )

@@ -1,4 +1,4 @@
-"""The side of the conversation that runs beside another package. It needs numpy alone."""
+"""The side of the communication that runs in the other package's process. It needs only numpy."""
 
 import json
 import os
@@ -11,19 +11,19 @@ import numpy as np
 
 from benchmarks.timing import Timed
 
-# JAX reads these when it is imported; one thread for everybody.
+# JAX reads these when it is imported; one thread for all.
 os.environ["JAX_ENABLE_X64"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
 
-# What a package prints must not be taken for an answer.
+# Output that a package prints must not be mistaken for an answer.
 ANSWERS, sys.stdout = sys.stdout, sys.stderr
 
 RECORDS = dict(np.load(sys.argv[1]))
 
 
 def record(name: str) -> tuple[np.ndarray, ...]:
-    """Parameters, steps (J,), inputs (steps,) and observations (J, 1) of one system."""
+    """Return parameters, steps (J,), inputs (steps,) and observations (J, 1) of one system."""
     return (
         RECORDS[f"{name}_theta"],
         RECORDS["steps"],
@@ -33,7 +33,7 @@ def record(name: str) -> tuple[np.ndarray, ...]:
 
 
 def every_step(steps: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Observations (steps[-1] + 1, p) with NaN at the steps without one."""
+    """Return observations (steps[-1] + 1, p) with NaN at the steps without one."""
     rows = np.full((steps[-1] + 1, observed.shape[1]), np.nan)
     rows[steps] = observed
     return rows

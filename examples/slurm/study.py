@@ -1,13 +1,13 @@
 """Three rival equations of a particle in a double well, on a laptop or on a cluster.
 
-In one process, in eight, or by SLURM:
+Run it in one process, in eight, or with SLURM:
 
     python study.py
     mpiexec -n 8 python -m mpi4py study.py
     sbatch job.sh
 
-All of them draw the same numbers. A job that was killed goes on where it was when it is started
-again, on as many ranks as there are then.
+All of them draw the same numbers. A job that was killed resumes when it is started again, on any
+number of ranks.
 """
 
 import argparse
@@ -43,7 +43,7 @@ def rival(parameters, filter, steps, observed):
 
 
 def study(out, quick):
-    """Runs on every rank alike; the result is on the first alone."""
+    """Run on every rank; only the first rank gets the result."""
     filter, draws = (psf.EKF(), 2000) if quick else (psf.BootstrapPF(256), 8000)
     steps = range(0, 2001, 20)
     truth = {"alpha": 4.0, "beta": -4.0, "sigma_m": 0.0}

@@ -1,15 +1,15 @@
-"""Which spring holds a fluttering wing in its limit cycle, and what comes at a higher speed.
+"""Which spring holds a fluttering wing in its limit cycle? Two records, and a higher speed.
 
-The closing wish of the thesis, on simulated records. Past its flutter speed a wing section does not
-fly apart but goes into a limit cycle, since its pitch spring hardens: because it is cubic, or
-because it has freeplay and a stop. Plunge and pitch are measured with noise, three times a cycle,
-first at 13 m/s and then at 15 m/s; one record was made by a cubic spring and one by freeplay. Four
-springs compete for each: linear, cubic, freeplay, and both. Unknown are the stiffnesses, the
-damping in pitch and the strength of the gusts; the rest of the section is known
+This is the future work that the thesis proposes, on simulated records. Past its flutter speed a
+wing section does not diverge but goes into a limit cycle, because its pitch spring hardens: either
+it is cubic, or it has freeplay and a stop. Plunge and pitch are measured with noise, three times a
+cycle, first at 13 m/s and then at 15 m/s. One record is simulated with a cubic spring and one with
+freeplay. Four springs compete for each: linear, cubic, freeplay, and both. The unknowns are the
+stiffnesses, the damping in pitch and the strength of the gusts; the rest of the section is known
 (`airfoil_section.py`).
 
-The questions of an engineer: does one speed tell the springs apart, or are two needed? Do EKF and
-EnKF agree? And how far will the section pitch at 17 m/s, where nobody has been?
+An engineer would ask: does one speed distinguish the springs, or are two needed? Do EKF and EnKF
+agree? And how far will the section pitch at 17 m/s, where there is no data?
 """
 
 from collections.abc import Mapping
@@ -33,14 +33,14 @@ from study import Study, check, study
 
 import pymc_statespace_filters as psf
 
-# How the filters fare depends on the record: they are compared on as many, made alike.
+# Filter performance depends on the record, so compare on several, simulated in the same way.
 SEEDS, SEED_DRAWS = range(1, 9), 2000
 
 type Comparisons = Mapping[tuple[str, str], Comparison]
 
 
 def likelihood_table(settings: Study) -> pd.DataFrame:
-    """Log-likelihoods at the truth of some records by three filters; the bootstrap is unbiased."""
+    """Compute log-likelihoods at the truth by three filters; the bootstrap filter is unbiased."""
     filters = {
         "EKF": (psf.EKF(), 1),
         "EnKF": (psf.EnKF(settings.particles), 8),
@@ -67,9 +67,9 @@ def likelihood_table(settings: Study) -> pd.DataFrame:
 
 
 def lead_table(settings: Study) -> pd.DataFrame:
-    """The lead of the spring that made a record over the other one, on all records by EKF.
+    """Compute the lead of the true spring over the other one, on all records, by EKF.
 
-    By EnKF too, on the record on which that lead is least.
+    Also by EnKF, on the record with the smallest lead.
     """
     rows, short = {}, replace(settings, draws=SEED_DRAWS)
     for name in TRUTHS:
@@ -86,14 +86,14 @@ def lead_table(settings: Study) -> pd.DataFrame:
 
 
 def probability_table(comparisons: Comparisons) -> pd.DataFrame:
-    """A row for each spring, by each comparison."""
+    """Return a row for each spring, by each comparison."""
     columns = ["log_evidence", "se", "prob", "undecided", "rhat"]
     tables = {key: comparison.table[columns] for key, comparison in comparisons.items()}
     return pd.concat(tables, names=["record", "looks and filter", "spring"])
 
 
 def parameter_table(comparisons: Comparisons) -> pd.DataFrame:
-    """Posterior of the true spring's parameters: mean and sd by each comparison."""
+    """Return mean and sd of the true spring's parameters, by each comparison."""
     rows = {}
     for (record, by), comparison in comparisons.items():
         posterior = comparison.draws[record]["posterior"]
@@ -105,7 +105,7 @@ def parameter_table(comparisons: Comparisons) -> pd.DataFrame:
 
 
 def peak_table(peaks: Mapping[str, Mapping[str, np.ndarray]]) -> pd.DataFrame:
-    """Quantiles of the largest pitch at the new speed, in degrees."""
+    """Return quantiles of the largest pitch at the new speed, in degrees."""
     rows = {
         (record, by): np.quantile(values, [0.05, 0.5, 0.95])
         for record, of in peaks.items()
@@ -117,7 +117,7 @@ def peak_table(peaks: Mapping[str, Mapping[str, np.ndarray]]) -> pd.DataFrame:
 
 
 def verdicts(comparisons: Comparisons, steps: pd.DataFrame) -> None:
-    """What the page says of the two records; ends with a message where it does not hold."""
+    """Stop with a message unless the page's claims on the two records hold."""
     check("the speeds are past the flutter speed", flutter_speed() < min(SPEEDS))
     amplitudes = steps["amplitude [deg]"].unstack("integrator")
     kept = abs(amplitudes["this step"] / amplitudes["exact"] - 1) < 0.02

@@ -1,4 +1,4 @@
-"""Pictures of the study of a wing section."""
+"""Figures of the study of a wing section."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 
 def draw_records(records: Mapping[str, Any]) -> Figure:
-    """The two records: pitch and plunge, the motion and what was seen of it."""
+    """Plot the two records: pitch and plunge, the motion and its measurements."""
     figure, panels = plt.subplots(2, 2, figsize=(10, 5), sharex=True, layout="constrained")
     for row, (name, record) in zip(panels, records.items(), strict=True):
         times, scale = DT * np.arange(len(record.states)), {"pitch": (1, 180 / np.pi, "°")}
@@ -33,7 +33,7 @@ def draw_records(records: Mapping[str, Any]) -> Figure:
 
 
 def draw_moments(curves: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """The moment of the pitch spring by each comparison, averaged over springs, and the truth."""
+    """Plot the averaged moment of the pitch spring by each comparison, and the truth."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for panel, (name, by) in zip(panels, curves.items(), strict=True):
         for i, (label, moment) in enumerate(by.items()):
@@ -50,7 +50,7 @@ def draw_moments(curves: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def draw_peaks(peaks: Mapping[str, Mapping[str, np.ndarray]], speed: float) -> Figure:
-    """The foretold largest pitch at a new speed, beside what the true section does."""
+    """Plot the predicted largest pitch at a new speed and that of the true section."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for panel, (name, by) in zip(panels, peaks.items(), strict=True):
         edges = np.linspace(6.0, 1.2 * np.max(by["truth"]), 61)

@@ -1,4 +1,4 @@
-"""Rival pitch springs on a record of a wing section: draws, evidences, what they foretell."""
+"""Rival pitch springs on a record of a wing section: draws, evidences, predictions."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -20,13 +20,13 @@ SPRINGS = {
     "freeplay": ("k_f", "delta"),
     "both": ("k_3", "k_f", "delta"),
 }
-PAIR = ("cubic", "freeplay")  # those that made the records
+PAIR = ("cubic", "freeplay")  # the true springs
 # Half-normal priors, vague on the scale of the section: none of the springs can be negative.
 SCALES = {"k_alpha": 10, "c_alpha": 0.1, "gust": 0.3, "k_3": 5000, "k_f": 100, "delta": 0.1}
 
-# An EnKF is fifty times as dear as an EKF: it gets a fifth of the draws, and begins where those of
-# the EKF end. So few members scatter the log-likelihood of a precise record by nats from seed to
-# seed; a chain that moves its noise a little at a time meets only a part of that.
+# An EnKF costs fifty times as much as an EKF. It gets a fifth of the draws, and its chains start
+# where those of the EKF end. With so few members the log-likelihood of a precise record varies by
+# nats from seed to seed; a chain that changes its noise a little at a time sees only part of that.
 ENKF_SHARE, ENKF_TUNE = 5, 300
 MOVED_NOISE = {"stages": 1, "correlation": 0.97}
 
@@ -35,10 +35,11 @@ ANGLES = np.deg2rad(np.linspace(-10, 10, 41))
 
 
 def rival(spring: str, filter: Any, record: Record) -> pm.Model:
-    """The PyMC model of a record with one of the springs."""
+    """Return the PyMC model of a record with one of the springs."""
     with pm.Model() as model:
         for name in COMMON + SPRINGS[spring]:
-            # Sampled as they are, not as logarithms: a spring may be absent, at zero.
+            # Sample the parameters themselves, not their logarithms: a spring may be absent, at
+            # zero.
             pm.HalfNormal(name, SCALES[name], default_transform=None)
         psf.StateSpace(
             "d",
@@ -52,7 +53,7 @@ def rival(spring: str, filter: Any, record: Record) -> pm.Model:
 
 
 class Comparison:
-    """Rival springs on one record, by one filter: draws, evidences, probabilities."""
+    """Rival springs on one record, with one filter: draws, evidences, probabilities."""
 
     def __init__(
         self, settings: Study, name: str, record: Record, models: dict[str, pm.Model], draws: dict
@@ -67,7 +68,7 @@ class Comparison:
     def by_ekf(
         cls, settings: Study, name: str, record: Record, springs: Iterable[str]
     ) -> "Comparison":
-        """The springs on a record by an EKF; `name` is that of the folder of the chains."""
+        """Sample the springs on a record by an EKF; `name` names the folder of the chains."""
         models = {spring: rival(spring, psf.EKF(), record) for spring in springs}
         sampling = {
             "tune": max(1000, settings.draws // 16),
@@ -76,7 +77,7 @@ class Comparison:
         simple = {spring: model for spring, model in models.items() if spring != "both"}
         draws = settings.run_models(name, simple, **sampling)
         if "both" in models:
-            # From the prior some chains find only the worse of the two springs, and stay there.
+            # From the prior, some chains find only the worse of the two springs and stay there.
             best = max(PAIR, key=lambda spring: float(draws[spring]["sample_stats"]["lp"].max()))
             begin = _ends(draws[best], "both")
             draws["both"] = settings.sample(
@@ -85,7 +86,7 @@ class Comparison:
         return cls(settings, name, record, models, draws)
 
     def by_enkf(self, settings: Study, name: str) -> "Comparison":
-        """The same springs on the same record by an EnKF, from the posteriors of this one."""
+        """Sample the same springs on the same record by an EnKF, started from these posteriors."""
         fewer = replace(settings, draws=max(200, settings.draws // ENKF_SHARE))
         models, draws = {}, {}
         for spring, known in self.draws.items():
@@ -101,7 +102,7 @@ class Comparison:
         return Comparison(settings, name, self.record, models, draws)
 
     def lead(self, spring: str) -> dict[str, float]:
-        """By how many nats the evidence of a spring is above that of the other of the `PAIR`."""
+        """Return a spring's lead in log-evidence over the other one of the `PAIR`, in nats."""
         pair = self.table.loc[[spring, *set(PAIR) - {spring}]]
         return {
             "lead": -float(np.diff(pair["log_evidence"])[0]),
@@ -110,7 +111,7 @@ class Comparison:
         }
 
     def moment(self) -> xr.DataArray:
-        """The moment of the pitch spring in N m, averaged over the springs."""
+        """Return the moment of the pitch spring in N m, averaged over the springs."""
         angle = xr.DataArray(ANGLES, dims="angle", coords={"angle": ANGLES})
         averaged = psf.average_models(
             self.draws,
@@ -121,7 +122,7 @@ class Comparison:
         return averaged["posterior"]["moment"]
 
     def peak(self) -> np.ndarray:
-        """The largest pitch in degrees in two seconds at `NEW_SPEED`, averaged over the springs."""
+        """Return the averaged largest pitch in degrees within two seconds at `NEW_SPEED`."""
         inputs = np.append(self.record.speeds, np.full(NEW_STEPS, NEW_SPEED))
 
         def of(spring: str) -> xr.DataArray:
@@ -146,7 +147,7 @@ class Comparison:
 
 
 def _ends(draws: xr.DataTree, spring: str) -> list[dict[str, float]]:
-    """Where the chains of a spring ended, as starts; what that spring lacks begins weak."""
+    """Return the last points of a spring's chains as starts; parameters it lacks start small."""
     last = draws["posterior"].to_dataset().isel(draw=-1)
     return [
         {
@@ -158,13 +159,13 @@ def _ends(draws: xr.DataTree, spring: str) -> list[dict[str, float]]:
 
 
 def largest_pitch(states: xr.DataArray, time: str) -> xr.DataArray:
-    """In degrees, in the second half of a path: the first is for the change of speed."""
+    """Return the largest pitch in degrees in a path's second half, after the speed change."""
     pitch = np.rad2deg(states.sel(state="pitch"))
     return abs(pitch.isel({time: slice(NEW_STEPS // 2, None)})).max(time)
 
 
 def true_peaks(name: str, record: Record) -> np.ndarray:
-    """The same for the system that made the record, under gusts of other seeds."""
+    """Return the same for the true system, under gusts with other seeds."""
     steps = record.speeds.size + np.arange(1, NEW_STEPS + 1)
     inputs = np.append(record.speeds, np.full(NEW_STEPS, NEW_SPEED))
     peaks = []

@@ -1,7 +1,7 @@
 """A wing section that pitches and plunges in a wind tunnel: equations, flutter, two records.
 
-The section hangs on a spring in plunge h (positive down, in m) and on one in pitch alpha (nose up,
-in rad), and air passes at the speed V:
+The section is mounted on a spring in plunge h (positive down, in m) and on one in pitch alpha (nose
+up, in rad), in air that flows at the speed V:
 
     m h''  + S alpha'' + c_h h'         + k_h h     = -L
     S h''  + I alpha'' + c_alpha alpha' + M(alpha)  = (1/2 + a) b L
@@ -9,10 +9,10 @@ in rad), and air passes at the speed V:
     M = k_alpha alpha + k_3 alpha^3 + freeplay(alpha; k_f, delta)
 
 per metre of span; the lift is quasi-steady. The numbers are those of the section at Texas A&M
-University by which such limit cycles are commonly studied (J. Ko, A. J. Kurdila, T. W. Strganac,
-Nonlinear control of a prototypical wing section with torsional nonlinearity, Journal of Guidance,
-Control, and Dynamics 20, 1997). Of its measured pitch spring, a polynomial, the linear and the
-cubic term are kept; the freeplay is made up.
+University, a standard example of such limit cycles (J. Ko, A. J. Kurdila, T. W. Strganac, Nonlinear
+control of a prototypical wing section with torsional nonlinearity, Journal of Guidance, Control,
+and Dynamics 20, 1997). Of its measured pitch spring, a polynomial, we keep the linear and the cubic
+term; the freeplay is our own.
 """
 
 from dataclasses import dataclass
@@ -32,25 +32,25 @@ K_H, C_H = 2844.4, 27.43  # N/m, N s/m
 AIR, LIFT_SLOPE = 1.225, 6.28  # kg/m^3, per rad
 INVERSE_MASS = np.linalg.inv([[MASS, STATIC_MOMENT], [STATIC_MOMENT, INERTIA]])
 
-# Against the outer pitch spring the section swings at some 10 Hz, hardly damped. An Euler step
-# feeds energy into that, and the limit cycle is lost, even at 0.5 ms; the step below keeps it.
+# Against the outer pitch spring the section oscillates at some 10 Hz with little damping. An Euler
+# step adds energy to that, and the limit cycle is lost, even at 0.5 ms; the step below keeps it.
 DT = 0.0025
-DURATION, EVERY = 8.0, 32  # s; steps from one look to the next, three looks at a cycle
+DURATION, EVERY = 8.0, 32  # s; steps between observations, three observations per cycle
 SPEEDS = (13.0, 15.0)  # m/s, in the first and the second half of a record
 
-# c_alpha is that of the section. A gust of 0.3 m/s that is forgotten in a twentieth of a second has
-# about this strength, in m/s per root of a hertz.
+# c_alpha is that of the section. A gust of 0.3 m/s with a correlation time of a twentieth of a
+# second has about this strength, in m/s per root of a hertz.
 COMMON = {"k_alpha": 2.82, "c_alpha": 0.036, "gust": 0.1}
 TRUTHS = {
     "cubic": COMMON | {"k_3": 2.82 * 1315.5},
     "freeplay": COMMON | {"k_f": 110.0, "delta": 0.07},
 }
-# A record must show a limit cycle at both speeds. Every seed makes one: the first is taken.
+# A record must show a limit cycle at both speeds. Every seed gives one: take the first.
 SEED = 1
 
 
 def accelerations(x: Any, speed: Any, moment: Any, c_alpha: Any, gust: Any = 0.0) -> list:
-    """Of plunge and pitch, numbers or symbols; `moment` is that of the pitch spring."""
+    """Return accelerations of plunge and pitch; `moment` is that of the pitch spring."""
     h, alpha, h_rate, alpha_rate = x
     incidence = alpha + (h_rate + (0.5 - AXIS) * HALF_CHORD * alpha_rate + gust) / speed
     lift = AIR * speed**2 * HALF_CHORD * LIFT_SLOPE * incidence
@@ -60,7 +60,7 @@ def accelerations(x: Any, speed: Any, moment: Any, c_alpha: Any, gust: Any = 0.0
 
 
 def step(x, q, u, k_alpha, c_alpha, gust, k_3=0.0, k_f=0.0, delta=0.0):
-    """The state one step later: first the rates, and with the new rates the positions."""
+    """Return the state one step later: first the rates, then the positions from the new rates."""
     h, alpha, h_rate, alpha_rate = x
     moment = psf.cubic(alpha, k_alpha, k_3) + psf.freeplay(alpha, k_f, delta)
     a_h, a_alpha = accelerations(x, u[0], moment, c_alpha, gust * q[0] / np.sqrt(DT))
@@ -68,7 +68,7 @@ def step(x, q, u, k_alpha, c_alpha, gust, k_3=0.0, k_f=0.0, delta=0.0):
     return [h + DT * h_rate, alpha + DT * alpha_rate, h_rate, alpha_rate]
 
 
-START = [0.01, 0.0, 0.0, 0.0]  # let go 1 cm below rest
+START = [0.01, 0.0, 0.0, 0.0]  # released 1 cm below rest
 # Plunge is measured to half a millimetre, pitch to half a degree.
 airfoil = psf.StateSpaceModel(
     transition=step,
@@ -86,7 +86,7 @@ airfoil = psf.StateSpaceModel(
 
 @dataclass(frozen=True)
 class Record:
-    """What was seen in the tunnel.
+    """Measurements from the wind tunnel.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Record:
         Of the air, in m/s, at every step.
     observed : ndarray, shape (J, 2)
     states : ndarray, shape (steps + 1, 4)
-        The motion behind it.
+        The true motion.
     """
 
     steps: np.ndarray
@@ -104,14 +104,14 @@ class Record:
     states: np.ndarray
 
     def first_half(self) -> "Record":
-        """What was seen at the first speed."""
+        """Return the part of the record at the first speed."""
         n = self.speeds.size // 2
         seen = self.steps <= n
         return Record(self.steps[seen], self.speeds[:n], self.observed[seen], self.states[: n + 1])
 
 
 def simulated_record(name: str, seed: int = SEED) -> Record:
-    """A record of one of `TRUTHS`."""
+    """Simulate a record with one of `TRUTHS`."""
     n_steps = round(DURATION / DT)
     steps = np.arange(EVERY, n_steps + 1, EVERY)
     speeds = np.repeat(SPEEDS, n_steps // 2)
@@ -120,15 +120,15 @@ def simulated_record(name: str, seed: int = SEED) -> Record:
 
 
 def pitch_moment(alpha: Any, p: Any) -> Any:
-    """Moment of the pitch spring, in N m; `p` are numbers, or a posterior (then draws come out)."""
+    """Return the moment of the pitch spring in N m; `p` has numbers, or a posterior (for draws)."""
     gap = np.minimum(np.maximum(alpha, -p.get("delta", 0.0)), p.get("delta", 0.0))
     return p["k_alpha"] * alpha + p.get("k_3", 0.0) * alpha**3 + p.get("k_f", 0.0) * (alpha - gap)
 
 
 def growth(speed: float, k_alpha: float = COMMON["k_alpha"]) -> complex:
-    """Growth rate in 1/s (real) and angular frequency (imaginary) of the least damped motion.
+    """Return growth rate (real, 1/s) and angular frequency (imaginary) of the least damped mode.
 
-    An eigenvalue of the section with a linear pitch spring.
+    It is an eigenvalue of the section with a linear pitch spring.
     """
     columns = [
         [x[2], x[3], *accelerations(x, speed, k_alpha * x[1], COMMON["c_alpha"])] for x in np.eye(4)
@@ -137,14 +137,14 @@ def growth(speed: float, k_alpha: float = COMMON["k_alpha"]) -> complex:
 
 
 def flutter_speed() -> float:
-    """The speed in m/s above which the section does not stay at rest."""
+    """Return the speed in m/s above which the section does not stay at rest."""
     return brentq(lambda speed: growth(speed).real, 5.0, 20.0)
 
 
 def limit_cycle(times: np.ndarray, states: np.ndarray) -> tuple[float, float]:
-    """Amplitude of the pitch in degrees, and frequency in Hz, of the second half of a motion.
+    """Return pitch amplitude in degrees and frequency in Hz, for the second half of a motion.
 
-    NaN if it has turned over: then there is no cycle.
+    NaN if the section has turned over, because there is no cycle then.
     """
     if not np.all(np.abs(states[:, 1]) < np.pi):
         return np.nan, np.nan
@@ -158,7 +158,7 @@ def limit_cycle(times: np.ndarray, states: np.ndarray) -> tuple[float, float]:
 
 
 def motion(name: str, speed: float, how: str, seconds: float = 10.0) -> tuple:
-    """Times and states without gusts: `how` is "exact", "Euler 0.5 ms" or "this step"."""
+    """Return times and states without gusts: `how` is "exact", "Euler 0.5 ms" or "this step"."""
     p = TRUTHS[name] | {"gust": 0.0}
 
     def rates(_: float, x: np.ndarray) -> np.ndarray:
@@ -182,7 +182,7 @@ def motion(name: str, speed: float, how: str, seconds: float = 10.0) -> tuple:
 
 
 def flutter_table() -> pd.DataFrame:
-    """What the linear section does at rest: eigenvalues of its least damped motion."""
+    """Return eigenvalues of the linear section's least damped motion at rest."""
     speeds = {"flutter speed": flutter_speed()} | {f"record, {v:.0f} m/s": v for v in SPEEDS}
     rows = {
         where: {"V [m/s]": speed, "growth [1/s]": z.real, "frequency [Hz]": z.imag / 2 / np.pi}
@@ -193,7 +193,7 @@ def flutter_table() -> pd.DataFrame:
 
 
 def step_table() -> pd.DataFrame:
-    """Limit cycles without gusts: how far the steps change them."""
+    """Compare limit cycles without gusts between the step functions."""
     rows = {}
     for name in TRUTHS:
         for speed in SPEEDS:

@@ -1,19 +1,19 @@
 """Which equation moves a particle between two wells? The three rivals of section 5.2.
 
-A particle is pushed about in two wells by noise and seen now and then, with noise on top. Three
-equations compete for its record, of which M2 is true:
+Noise drives a particle between two wells, and it is observed now and then with measurement noise.
+Three equations compete for its record, of which M2 is true:
 
     M1: dx = (alpha x) dt + 0.6 dW + sigma_m dW_m
     M2: dx = (alpha x + beta x^3) dt + 0.6 dW + sigma_m dW_m
     M3: dx = (alpha x + beta x^3 + gamma x^5) dt + 0.6 dW + sigma_m dW_m        (Eqs. 5.17-5.19)
 
-What decides whether the record can tell them apart: how much of the motion it shows, how often the
-particle is seen, or the filter that turns the record into a likelihood? Case 1 has 101 observations
-in both wells, case 2 has 101 in one well only, case 3 has 21 in both. Each equation is given to
-each filter; for one state `GridFilter` is exact, so that the others can be held against it.
+What decides whether the record can distinguish them: how much of the motion it shows, how often the
+particle is observed, or the filter that computes the likelihood? Case 1 has 101 observations in
+both wells, case 2 has 101 in one well only, case 3 has 21 in both. Each equation is run with each
+filter. For one state `GridFilter` is exact, so the others can be compared with it.
 
-The tables and pictures are those of the thesis (Tables 3-17, Figs. 11-23), beside its numbers,
-which belong to records of its own: compare what they say, not their digits.
+The tables and figures are those of the thesis (Tables 3-17, Figs. 11-23), with its numbers next to
+ours. They belong to different records: compare the verdicts, not the digits.
 """
 
 from typing import NamedTuple
@@ -44,7 +44,7 @@ def drift(x, alpha, beta=0.0, gamma=0.0):
     return [alpha * x[0] + beta * x[0] ** 3 + gamma * x[0] ** 5]
 
 
-# Only sigma_m^2 + 0.6^2 enters, so that sigma_m is a size and has no sign.
+# Only sigma_m^2 + 0.6^2 enters, so sigma_m is a magnitude and has no sign.
 double_well = psf.StateSpaceModel(
     transition=psf.EulerMaruyama(drift, lambda sigma_m: [[0.6, sigma_m]], dt=DT),
     observation=lambda x: [x[0]],
@@ -59,16 +59,16 @@ RIVALS = {
     "M3": ("alpha", "beta", "gamma", "sigma_m"),
 }
 
-# The thesis has flat priors and states no support. Wells steeper than these move in Euler steps of
-# 0.01 s as no solution of the equation does: those of M2 are overshot from alpha = 50 on, where
-# 2 alpha dt = 1, and unstable from 100 on, and far from the wells paths explode much earlier.
+# The thesis has flat priors and states no support. In wells steeper than these, Euler steps of 0.01
+# s move as no solution of the equation does: those of M2 overshoot from alpha = 50 on, where 2
+# alpha dt = 1, and are unstable from 100 on; far from the wells paths explode much earlier.
 SUPPORTS = {
     "alpha": (-25.0, 25.0),
     "beta": (-50.0, 50.0),
     "gamma": (-25.0, 25.0),
     "sigma_m": (0.0, 5.0),
 }
-# These hold all intervals that the thesis prints.
+# These contain all intervals that the thesis prints.
 WIDE_SUPPORTS = {
     "alpha": (-100.0, 300.0),
     "beta": (-500.0, 200.0),
@@ -78,26 +78,27 @@ WIDE_SUPPORTS = {
 
 
 def record(seed: int, every: int) -> xr.Dataset:
-    """One path of 20 seconds, and what is seen of it at every so many fifths of a second."""
+    """Simulate a path of 20 seconds and observe it at every so many fifths of a second."""
     fifths = np.arange(0, 2001, 20)
     made = psf.simulate(double_well, TRUTH, steps=fifths, random_seed=seed)
     return made.isel(obs=slice(None, None, every))
 
 
-# Chains of these filters begin with the posterior by those, which take a fifth of their time.
+# Chains of these filters start from the posterior by those, which take a fifth of their time.
 PILOTED = {"EnKF": "BootstrapPF", "PFEnKF": "BootstrapPF"}
 
 # A jump is rare, one in some 300 seconds. Seed 20 is the first whose particle starts in the right
-# well and is seen at least a third of the time in each; seed 1 is the first, from 1 on, that stays
-# in the right one. Case 3 is case 1 seen every second: what differs is the number of observations.
+# well and is observed at least a third of the time in each; seed 1 is the first, from 1 on, that
+# stays in the right one. Case 3 is case 1 observed every second: only the number of observations
+# differs.
 RECORDS = {1: record(20, every=1), 2: record(1, every=1), 3: record(20, every=5)}
 
 
 def filters(particles: int) -> dict:
-    """The thesis's three, one whose likelihood is unbiased, and the exact one for a single state.
+    """Return the thesis's three filters, an unbiased one, and the exact one for a single state.
 
-    Chains on an unbiased likelihood have the exact posterior with any number of particles: it only
-    decides how well they move, and 250 make the variance of the log-likelihood about one.
+    Chains with an unbiased likelihood sample the exact posterior with any number of particles. The
+    number only decides how well they mix; 250 make the variance of the log-likelihood about one.
     """
     return {
         "EKF": psf.EKF(),
@@ -109,11 +110,11 @@ def filters(particles: int) -> dict:
 
 
 def sampled(settings: Study, case: int) -> list[str]:
-    """The filters whose posteriors are sampled.
+    """Return the filters whose posteriors are sampled.
 
-    The exact one is not: where paths may explode, as they do in Euler steps of the steep wells that
-    some records allow, it has no likelihood. In the short form an unbiased filter stands for all
-    that follow a jump, and where there is none the EKF.
+    The exact filter is left out: it has no likelihood where paths may explode, as they do in Euler
+    steps of the steep wells that some records allow. The short form uses an unbiased filter for all
+    that follow a jump, and the EKF where there is no jump.
     """
     if not settings.quick:
         return ["EKF", "EnKF", "PFEnKF", "BootstrapPF"]
@@ -121,18 +122,18 @@ def sampled(settings: Study, case: int) -> list[str]:
 
 
 def rival(parameters: tuple[str, ...], filter, seen: xr.Dataset, supports: dict) -> pm.Model:
-    """One equation, one filter, one record."""
+    """Return the PyMC model of one equation, one filter, one record."""
     with pm.Model() as model:
         for name in parameters:
-            # Many posteriors end where their support does. To a chain that end is then a wall; a
-            # transform would make an endless slope of it.
+            # Many posteriors end where their support does. Without a transform that end is a wall
+            # to a chain; with one it would become an infinite slope.
             pm.Uniform(name, *supports[name], default_transform=None)
         psf.StateSpace("d", double_well, filter, steps=seen["obs"], observed=seen["observations"])
     return model
 
 
 class Posterior(NamedTuple):
-    """What one filter says of one equation in one case."""
+    """Results of one filter for one equation in one case."""
 
     draws: xr.DataTree
     evidence: psf.Evidence
@@ -141,7 +142,7 @@ class Posterior(NamedTuple):
 def sample(
     settings: Study, name: str, seen: xr.Dataset, used: list[str], supports: dict = SUPPORTS
 ) -> dict[tuple[str, str], Posterior]:
-    """Posteriors and evidences from one record; the keys are filter and equation."""
+    """Compute posteriors and evidences from one record; the keys are filter and equation."""
     of_name = filters(settings.particles)
     models = {
         (filter, equation): rival(parameters, of_name[filter], seen, supports)
@@ -164,7 +165,7 @@ def sample(
 
 
 def at_the_truth(settings: Study, case: int) -> dict[str, xr.Dataset]:
-    """What each filter knows of the path, given the parameters that made it."""
+    """Return each filter's states along the path, at the true parameters."""
     seen = RECORDS[case]
     names = ["EKF", "GridFilter"] if settings.quick else ["EKF", "EnKF", "PFEnKF", "GridFilter"]
     of_name = filters(settings.particles)
@@ -173,7 +174,7 @@ def at_the_truth(settings: Study, case: int) -> dict[str, xr.Dataset]:
 
 
 def force(posterior: xr.Dataset) -> xr.DataArray:
-    """The deterministic part of the motion, within the wells and beyond."""
+    """Return the drift within the wells and beyond."""
     places = np.linspace(-2, 2, 101)
     x = xr.DataArray(places, dims="x", coords={"x": places})
     of_model = {name: posterior[name] for name in posterior.data_vars if name != "sigma_m"}
@@ -181,7 +182,7 @@ def force(posterior: xr.Dataset) -> xr.DataArray:
 
 
 def forces(posteriors: dict[int, dict], seed: int) -> dict[tuple[int, str, str], xr.DataArray]:
-    """The force averaged over the equations; keys are case, correction and filter."""
+    """Return the force averaged over the equations; keys are case, correction and filter."""
     found = {}
     for case, of_case in posteriors.items():
         for filter in dict.fromkeys(name for name, _ in of_case):
@@ -229,7 +230,7 @@ def main() -> None:
 
 
 def check_claims(posteriors: dict[int, dict], at_truth: pd.DataFrame) -> None:
-    """End where the computation does not say what is claimed of it."""
+    """Stop if the results do not support the claims of the page."""
     wrong = at_truth["EKF"] - at_truth["GridFilter"]
     check(f"the EKF is right in one well, within 3 nats of {wrong[2]:.1f}", abs(wrong[2]) < 3)
     check(f"it is wrong by tens of nats at a jump, by {wrong[1]:.1f}", wrong[1] < -10)
@@ -237,7 +238,7 @@ def check_claims(posteriors: dict[int, dict], at_truth: pd.DataFrame) -> None:
     for case, of_case in posteriors.items():
         for filter in dict.fromkeys(name for name, _ in of_case):
             if filter == "EKF" and case != 2:
-                continue  # it cannot follow the jump: nothing is claimed of what it then says
+                continue  # the EKF cannot follow the jump, so nothing is claimed about its verdict
             # With the 21 observations of case 3 the correction leaves open which one wins.
             for best, j in {"M3": None, "M2": J_PRINTED}.items():
                 table = probabilities(of_case, filter, corrected=j is not None, n_observations=j)

@@ -22,7 +22,7 @@ SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ", "sigma_m": "σ$_m$"}
 
 
 def draw_states(record: xr.Dataset, states: Mapping[str, xr.Dataset]) -> Figure:
-    """What each filter knows of the path at the true parameters (Figs. 12, 16, 20)."""
+    """Plot each filter's states at the true parameters (Figs. 12, 16, 20)."""
     figure, axes = plt.subplots(
         len(states),
         1,
@@ -45,7 +45,7 @@ def draw_states(record: xr.Dataset, states: Mapping[str, xr.Dataset]) -> Figure:
 
 
 def draw_measurements(records: Mapping[int, xr.Dataset]) -> Figure:
-    """The potential, and the histogram of the measurements of each case (Figs. 11, 13, 17, 21)."""
+    """Plot the potential and a histogram of each case's measurements (Figs. 11, 13, 17, 21)."""
     figure, axes = plt.subplots(
         1, 1 + len(records), figsize=(9, 2.3), sharex=True, layout="constrained"
     )
@@ -62,9 +62,9 @@ def draw_measurements(records: Mapping[int, xr.Dataset]) -> Figure:
 
 
 def draw_marginals(posteriors: Mapping, truth: Mapping[str, float]) -> Figure:
-    """Every parameter (rows) by every filter (columns), one line an equation (Figs. 14, 18, 22).
+    """Plot parameters (rows) by filters (columns), one line per equation (Figs. 14, 18, 22).
 
-    To equal height: a posterior ten times as narrow would hide the others.
+    Heights are scaled to be equal: a posterior ten times as narrow would hide the others.
     """
     filters = list(dict.fromkeys(name for name, _ in posteriors))
     figure, axes = plt.subplots(
@@ -94,7 +94,7 @@ def draw_marginals(posteriors: Mapping, truth: Mapping[str, float]) -> Figure:
 
 
 def draw_forces(forces: Mapping[tuple[int, str, str], xr.DataArray], truth: xr.DataArray) -> Figure:
-    """The force averaged over the equations (Figs. 15, 19, 23).
+    """Plot the force averaged over the equations (Figs. 15, 19, 23).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The tables of section 5.2, each number beside the one that the thesis prints."""
+"""The tables of section 5.2, each number next to the one printed in the thesis."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ import pymc_statespace_filters as psf
 PRINTED = Path(__file__).parent / "printed"
 PARAMETERS = ["alpha", "beta", "gamma", "sigma_m"]
 EXPONENT = 3.0  # of the correction: not stated for 5.2, but Tables 5-7 follow from 101^1.5
-J_PRINTED = 101  # what Tables 16 and 17 are corrected with, although case 3 has 21 observations
+J_PRINTED = 101  # the number used to correct Tables 16 and 17, although case 3 has 21 observations
 UNCORRECTED = "density one"
 
 
@@ -26,10 +26,10 @@ def probabilities(
     n_observations: int | None = None,
     uniform: bool = False,
 ) -> pd.DataFrame:
-    """Probability of each equation by one filter, as `compare_evidence` returns it.
+    """Return the probability of each equation by one filter, as `compare_evidence` does.
 
-    The thesis integrates the likelihood under a density of one, whatever the support (Eq. 3.7): to
-    do so is to weigh each equation by the volume of its support. `uniform` priors integrate to one.
+    The thesis integrates the likelihood under a density of one, whatever the support (Eq. 3.7).
+    This weights each equation by the volume of its support. `uniform` priors integrate to one.
     """
     found = {model: post.evidence for (name, model), post in posteriors.items() if name == filter}
     if n_observations is not None:
@@ -41,7 +41,7 @@ def probabilities(
 
 
 def write_tables(settings: Study, case: int, posteriors: Mapping) -> None:
-    """The tables of one case: 3-7, 8-12 or 13-17, and what is known of the chains."""
+    """Write the tables of one case, 3-7, 8-12 or 13-17, and the convergence of its chains."""
     settings.table(f"intervals_{case}", parameters_table(case, posteriors, _interval))
     settings.table(f"modes_{case}", parameters_table(case, posteriors, _mode))
     settings.table(f"probabilities_{case}", _probabilities_table(case, posteriors))
@@ -49,7 +49,7 @@ def write_tables(settings: Study, case: int, posteriors: Mapping) -> None:
 
 
 def parameters_table(case: int, posteriors: Mapping, cell: Callable) -> pd.DataFrame:
-    """A cell for every parameter (rows) and equation (columns), ours and the thesis's."""
+    """Return a cell for every parameter (rows) and equation (columns), ours and the thesis's."""
     ours = _cells(_parameters(posteriors), cell)
     filters = dict.fromkeys(name for name, _ in posteriors)
     rows = [(filter, name) for filter in filters for name in PARAMETERS]
@@ -57,13 +57,13 @@ def parameters_table(case: int, posteriors: Mapping, cell: Callable) -> pd.DataF
 
 
 def wide_table(posteriors: Mapping[int, Mapping]) -> pd.DataFrame:
-    """95 % intervals of all cases under the wide supports."""
+    """Return 95 % intervals of all cases under the wide supports."""
     tables = {case: parameters_table(case, post, _interval) for case, post in posteriors.items()}
     return pd.concat(tables, names=["case"])
 
 
 def evidence_table(posteriors: Mapping[int, Mapping]) -> pd.DataFrame:
-    """Log-evidences under a density of one, with standard errors; a column for each filter."""
+    """Return log-evidences under a density of one, with standard errors; one column per filter."""
     rows: dict[tuple[int, str], dict] = {}
     for case, of_case in posteriors.items():
         for (filter, model), post in of_case.items():
@@ -74,7 +74,7 @@ def evidence_table(posteriors: Mapping[int, Mapping]) -> pd.DataFrame:
 
 
 def largest_table(posteriors: Mapping[int, Mapping]) -> pd.DataFrame:
-    """Largest log-likelihood that each filter finds."""
+    """Return the largest log-likelihood that each filter finds."""
     rows: dict[tuple[int, str], dict] = {}
     for case, of_case in posteriors.items():
         for (filter, model), post in of_case.items():
@@ -91,7 +91,7 @@ def _printed(name: str, case: int) -> pd.DataFrame:
 
 
 def _parameters(posteriors: Mapping) -> pd.DataFrame:
-    """Interval and mode of every marginal; columns as in the printed table."""
+    """Return interval and mode of every marginal; columns as in the printed table."""
     rows = []
     for (filter, model), post in posteriors.items():
         intervals = az.hdi(post.draws, prob=0.95)
@@ -110,19 +110,19 @@ def _mode(row: pd.Series) -> str:
 
 
 def _cells(frame: pd.DataFrame, cell: Callable[[pd.Series], str]) -> pd.DataFrame:
-    """One row for a filter and parameter, one column for an equation."""
+    """Return one row for each filter and parameter, one column for each equation."""
     written = frame.assign(cell=frame.apply(cell, axis=1))
     return written.pivot(index=["filter", "parameter"], columns="model", values="cell")
 
 
 def _beside(ours: pd.DataFrame, printed: pd.DataFrame) -> pd.DataFrame:
-    """Ours and the thesis's, column by column."""
+    """Interleave our columns with the thesis's."""
     both = ours.join(printed.add_suffix(", 2013")).fillna("")
     return both[sorted(both.columns)]
 
 
 def _probabilities_table(case: int, posteriors: Mapping) -> pd.DataFrame:
-    """In per cent, with 95 % intervals for what the noise of the computation leaves open."""
+    """Return probabilities in per cent, with 95 % intervals for the numerical error."""
     (j,) = {post.evidence.n_observations for post in posteriors.values()}
     priors: dict[str, dict] = {UNCORRECTED: {}}
     priors |= {_corrected(n): {"corrected": True, "n_observations": n} for n in (j, J_PRINTED)}
@@ -150,7 +150,7 @@ def _percent(row: pd.Series) -> str:
 
 
 def _chains(posteriors: Mapping) -> pd.DataFrame:
-    """How far the chains can be trusted, and what the evidence warns of."""
+    """Return convergence diagnostics of the chains and warnings of the evidence."""
     rows = {}
     for (filter, model), post in posteriors.items():
         rows[filter, model] = {

@@ -1,16 +1,16 @@
-"""What does one measurement say of a hidden state? Four filters beside the exact answer.
+"""What does one measurement say about a hidden state? Four filters and the exact answer.
 
-A parameter alpha is known with an error, a state x is made of it with another, and one measurement
+A parameter alpha is known with an error, it determines a state x with another, and one measurement
 d is made of x (section 4.5 of the thesis):
 
     alpha ~ N(0.8, 0.5),   x = g(alpha) + q,  q ~ N(0, 2),   d = h(x) + e,  e ~ N(0, 0.1)
 
-g and h are each the identity (I) or the cosine (II), which makes four cases. Parameter and state
-together are the state of a filter (Eq. 4.46), so that one update by d = -0.5 estimates both. The
-exact posterior, Eq. 4.48, is summed up on a grid, and the filters are compared with it: in
-pictures, Figs. 6 to 9, and by distances over twenty seeds.
+g and h are each the identity (I) or the cosine (II), which gives four cases. Parameter and state
+together are the state of a filter (Eq. 4.46), so one update by d = -0.5 estimates both. The exact
+posterior, Eq. 4.48, is summed on a grid, and the filters are compared with it: in figures (Figs. 6
+to 9) and by distances over twenty seeds.
 
-Is that a way to estimate the parameters of a whole record? `hidden_state_augmented.py` tries it.
+`hidden_state_augmented.py` tries this method on the parameters of a whole record.
 """
 
 import numpy as np
@@ -24,12 +24,13 @@ from study import Study, study
 
 import pymc_statespace_filters as psf
 
-# The thesis gives d alone. alpha must not be 0, where the cosine is flat; process noise must be
-# large beside the parameter's, or the parameter too has several modes, which the thesis denies.
+# The thesis gives only d. alpha must not be 0, where the cosine is flat. Process noise must be
+# large compared with the variance of the parameter, or the parameter too has several modes, which
+# the thesis rules out.
 MEASURED = -0.5
 ALPHA_MEAN, ALPHA_VARIANCE = 0.8, 0.5
 PROCESS_VARIANCE, NOISE_VARIANCE = 2.0, 0.1
-SHARPER = (0.1, 0.01, 0.001)  # variances of better sensors
+SHARPER = (0.1, 0.01, 0.001)  # variances of more precise sensors
 
 CASES = {"I-I": (0, 0), "I-II": (0, 1), "II-I": (1, 0), "II-II": (1, 1)}
 FIGURES = dict(zip(CASES, (6, 7, 8, 9), strict=True))
@@ -38,7 +39,7 @@ N_SEEDS = 20
 
 
 def made_of_alpha(x, q, cosine_model):
-    """Whatever x was, it is now made of alpha; alpha stays as it is."""
+    """Compute x from alpha, whatever x was; alpha does not change."""
     alpha = x[1]
     return [pt.switch(cosine_model > 0, pt.cos(alpha), alpha) + q[0], alpha]
 
@@ -68,7 +69,7 @@ def filters(n_particles: int) -> dict:
 
 
 def exact_posterior(case: str, variance: float = NOISE_VARIANCE) -> xr.DataArray:
-    """Probabilities of the points of a grid, by Eq. 4.48 (with alpha_o for its alpha_i)."""
+    """Return the probabilities on a grid by Eq. 4.48 (with alpha_o for its alpha_i)."""
     g, h = (np.cos if cosine else np.positive for cosine in CASES[case])
     x = xr.DataArray(np.linspace(-9.0, 11.0, 4001), dims="x")
     alpha = xr.DataArray(np.linspace(-3.5, 5.1, 861), dims="alpha")
@@ -82,7 +83,7 @@ def exact_posterior(case: str, variance: float = NOISE_VARIANCE) -> xr.DataArray
 
 
 def updated(case: str, filter, seed: int, variance: float = NOISE_VARIANCE) -> xr.Dataset:
-    """State and parameter after the measurement, which comes one step after the start."""
+    """Return state and parameter after the measurement, which comes one step after the start."""
     model, sight = CASES[case]
     params = {"cosine_model": model, "cosine_sight": sight, "variance": variance}
     run = psf.run_filter(hidden_state, filter, params, [MEASURED], steps=[1], seed=seed)
@@ -90,7 +91,7 @@ def updated(case: str, filter, seed: int, variance: float = NOISE_VARIANCE) -> x
 
 
 def weighted_values(run: xr.Dataset, exact: xr.DataArray, name: str) -> tuple:
-    """One state's law by a filter, as values and weights; without particles it is a normal one."""
+    """Return a filter's marginal of one state as values and weights; a normal if no particles."""
     if "particles" in run:
         return run["particles"].sel(state=name).values, run["weights"].values
     mean, sd = (float(run[moment].sel(state=name)) for moment in ("mean", "sd"))
@@ -98,7 +99,7 @@ def weighted_values(run: xr.Dataset, exact: xr.DataArray, name: str) -> tuple:
 
 
 def row_of(exact: xr.DataArray, laws: list[dict]) -> dict:
-    """Distances of several computations of one law from the exact one, and their moments."""
+    """Return the distances of several computed marginals from the exact one, and their moments."""
     row = {}
     for name in ("x", "alpha"):
         marginal = exact.sum({"x", "alpha"} - {name})
@@ -123,7 +124,7 @@ def moments(values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
 
 
 def independent_draws(exact: xr.DataArray, n: int, seed: int) -> dict:
-    """Draws of the exact posterior: what the best of ensembles could be."""
+    """Draw from the exact posterior: no ensemble of this size can be expected to do better."""
     points = exact.stack(point=("x", "alpha"))
     chosen = np.random.default_rng(seed).choice(points.size, n, p=points)
     return {name: (points[name].values[chosen], np.ones(n)) for name in ("x", "alpha")}
@@ -134,7 +135,7 @@ def law_of(run: xr.Dataset, exact: xr.DataArray) -> dict:
 
 
 def case_study(settings: Study, case: str) -> pd.DataFrame:
-    """The picture of a case, and its rows of the table of distances."""
+    """Draw the figure of a case and return its rows of the table of distances."""
     exact = exact_posterior(case)
     whole = {name: (exact[name].values, exact.sum({"x", "alpha"} - {name})) for name in exact.dims}
     seeds = range(settings.seed, settings.seed + N_SEEDS)
@@ -156,7 +157,7 @@ def case_study(settings: Study, case: str) -> pd.DataFrame:
 
 
 def sharper_measurements(settings: Study) -> pd.DataFrame:
-    """Distances in x of the two particle filters, the more precise the measurement."""
+    """Return distances in x of the two particle filters for more and more precise measurements."""
     rows = {}
     for case in ("I-I", "I-II"):
         for variance in SHARPER:
@@ -171,7 +172,7 @@ def sharper_measurements(settings: Study) -> pd.DataFrame:
 
 
 def check(table: pd.DataFrame) -> None:
-    """Stop unless the table says what the page says."""
+    """Stop unless the table supports the claims of the page."""
     x, sd, error = (table[column] for column in ("distance x", "sd x", "± mean x"))
     for name in filters(2):
         if x["I-I", name] > 3 * x["I-I", "exact draws"]:

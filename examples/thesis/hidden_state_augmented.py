@@ -1,9 +1,9 @@
-"""Can a filter by itself estimate the parameters of a record? They are states that do not move.
+"""Can a filter by itself estimate the parameters of a record? They are states that do not change.
 
-The double well dx = (alpha x + beta x^3) dt + 0.6 dW, its record of twenty seconds, and alpha and
-beta as two more states without noise (Eq. 4.46 along a record). Each filter passes the record once.
-The truth is the posterior, which is sampled with the exact likelihood of `GridFilter` under a prior
-that is the augmented state's law at the start.
+The system is the double well dx = (alpha x + beta x^3) dt + 0.6 dW with a record of twenty seconds.
+alpha and beta are two more states without noise (Eq. 4.46 along a record). Each filter passes over
+the record once. The reference is the posterior, sampled with the exact likelihood of `GridFilter`
+under a prior equal to the initial distribution of the augmented state.
 """
 
 import time
@@ -20,11 +20,12 @@ import pymc_statespace_filters as psf
 
 DT, NOISE_VARIANCE = 0.01, 0.08
 TRUTH = {"alpha": 4.0, "beta": -4.0}
-# Off the truth by more than a deviation, so that there is something to learn. A positive beta sends
-# the state to infinity, and one such member ruins an ensemble's covariance: it is improbable here.
+# More than a standard deviation from the truth, so that there is something to learn. A positive
+# beta sends the state to infinity, and one such member ruins an ensemble's covariance: it is
+# improbable here.
 PRIOR = {"alpha": (6.0, 1.5), "beta": (-6.0, 1.5)}
 STEPS = np.arange(0, 2001, 20)
-# The record must visit both wells; seven is the first seed by which a twentieth of it is in each.
+# The record must visit both wells; seven is the first seed with a twentieth of the record in each.
 RECORD_SEED = 7
 
 
@@ -55,7 +56,7 @@ augmented = psf.StateSpaceModel(
 
 
 def sampled_posterior(settings: Study, record: np.ndarray) -> tuple[xr.Dataset, float]:
-    """Draws of the exact posterior, and the seconds of computation, which a resumed run lacks."""
+    """Return draws of the exact posterior, and the computing time (missing in a resumed run)."""
     sampling = settings.sampling("augmented")
     resumed = sampling["checkpoint"].exists()
     with pm.Model():
@@ -69,7 +70,7 @@ def sampled_posterior(settings: Study, record: np.ndarray) -> tuple[xr.Dataset, 
 
 
 def passes(filter, record: np.ndarray, seeds: range) -> tuple[list[xr.Dataset], float]:
-    """One pass over the record, for several seeds if they matter; and the seconds of one."""
+    """Pass over the record once per seed, if seeds matter; also return the seconds of one."""
     seeds = seeds if filter.noisy else seeds[:1]
 
     def one(seed: int) -> xr.Dataset:
@@ -82,7 +83,7 @@ def passes(filter, record: np.ndarray, seeds: range) -> tuple[list[xr.Dataset], 
 
 
 def summary(values: np.ndarray, weights: np.ndarray, draws: xr.DataArray) -> dict:
-    """Mean, deviation, 90 % interval and distance of a weighted sample from the posterior."""
+    """Return mean, sd, 90 % interval and distance from the posterior of a weighted sample."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order]) / np.sum(weights)
     mean = np.average(values, weights=weights)
@@ -96,7 +97,7 @@ def summary(values: np.ndarray, weights: np.ndarray, draws: xr.DataArray) -> dic
 
 
 def last_values(run: xr.Dataset, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Values and weights of a parameter at the end of the record."""
+    """Return values and weights of a parameter at the end of the record."""
     last = run.isel(time=-1).sel(state=name)
     if "particles" in last:
         return last["particles"].values, last["weights"].values
@@ -106,7 +107,7 @@ def last_values(run: xr.Dataset, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def row_of(runs: list[xr.Dataset], name: str, draws: xr.DataArray, seconds: float) -> dict:
-    """What a filter says of a parameter, over all seeds, beside its posterior."""
+    """Return a filter's results for a parameter, over all seeds, and those of its posterior."""
     several = pd.DataFrame([summary(*last_values(run, name), draws) for run in runs])
     row = several.mean().to_dict() | {"± mean": several["mean"].std(ddof=0)}
     distinct = np.nan
@@ -116,7 +117,7 @@ def row_of(runs: list[xr.Dataset], name: str, draws: xr.DataArray, seconds: floa
 
 
 def augmented_study(settings: Study, filters: dict) -> pd.DataFrame:
-    """Write the table and the picture of parameters as states."""
+    """Write the table and the figure of parameters as states."""
     simulated = psf.simulate(double_well, TRUTH, steps=STEPS, random_seed=RECORD_SEED)
     record = simulated["observations"].values
     if min(np.mean(record < -0.5), np.mean(record > 0.5)) < 0.05:
@@ -146,7 +147,7 @@ def augmented_study(settings: Study, filters: dict) -> pd.DataFrame:
 
 
 def check(table: pd.DataFrame, particles: int) -> None:
-    """Stop unless the table says what the page says."""
+    """Stop unless the table supports the claims of the page."""
     for name in TRUTH:
         found = table.loc[name]
         if found["distinct values"]["BootstrapPF"] > 0.02 * particles:

@@ -1,4 +1,4 @@
-"""Pictures of the study of hidden states: a posterior and its filters, estimates over time."""
+"""Figures of the study of hidden states: a posterior and its filters, estimates over time."""
 
 from collections.abc import Mapping
 
@@ -16,7 +16,7 @@ N_POINTS = 500
 
 
 def draw_case(title: str, exact: xr.DataArray, runs: Mapping[str, xr.Dataset]) -> Figure:
-    """The joint posterior with what each filter makes of it, and both marginals."""
+    """Plot the joint posterior, each filter's approximation, and both marginals."""
     figure = plt.figure(figsize=(8.2, 5), layout="constrained")
     above, below = figure.subfigures(2, 1)
     joints = above.subplots(1, len(runs), sharey=True)
@@ -33,8 +33,8 @@ def draw_case(title: str, exact: xr.DataArray, runs: Mapping[str, xr.Dataset]) -
 
 
 def _joint(axes: Axes, exact: xr.DataArray, run: xr.Dataset, colour: str) -> None:
-    """Points of a filter, or ellipses of its normal law, on the exact density."""
-    exact = exact[::20, ::5]  # as fine as can be seen
+    """Plot points of a filter, or ellipses of its normal distribution, on the exact density."""
+    exact = exact[::20, ::5]  # as fine as the eye can see
     density = (exact / exact.max()).transpose("alpha", "x")
     levels, shades = [*LEVELS, 1.01], {"cmap": "Greys", "vmin": -0.3, "vmax": 1.6}
     axes.contourf(exact["x"], exact["alpha"], density, levels=levels, **shades)
@@ -45,7 +45,7 @@ def _joint(axes: Axes, exact: xr.DataArray, run: xr.Dataset, colour: str) -> Non
             exact["x"], exact["alpha"], normal / normal.max(), levels=LEVELS, colors=colour
         )
         return
-    # As many points as one can see, as often as they weigh.
+    # Show a readable number of points, drawn by weight.
     weights = run["weights"].values
     chosen = np.random.default_rng(1).choice(weights.size, N_POINTS, p=weights)
     x, alpha = run["particles"].values[chosen].T
@@ -53,7 +53,7 @@ def _joint(axes: Axes, exact: xr.DataArray, run: xr.Dataset, colour: str) -> Non
 
 
 def _marginal(axes: Axes, exact: xr.DataArray, runs: Mapping[str, xr.Dataset], state: str) -> None:
-    """The density of one state: exact, normal laws, and histograms of weighted particles."""
+    """Plot the density of one state: exact, normals, and histograms of weighted particles."""
     places = exact[state].values
     marginal = exact.sum({"x", "alpha"} - {state}) / (places[1] - places[0])
     axes.fill_between(places, marginal, color="0.8", label="exact")
@@ -71,7 +71,7 @@ def _marginal(axes: Axes, exact: xr.DataArray, runs: Mapping[str, xr.Dataset], s
 def draw_estimates(
     runs: Mapping[str, list[xr.Dataset]], posterior: xr.Dataset, truth: Mapping[str, float]
 ) -> Figure:
-    """Parameters that a filter carries as states, over time; at the right their posterior."""
+    """Plot a filter's parameters over time as states, and their posterior on the right."""
     figure, axes = plt.subplots(
         len(truth), len(runs), sharex=True, sharey="row", figsize=(9, 4.6), layout="constrained"
     )
@@ -94,7 +94,7 @@ def draw_estimates(
 
 
 def _estimate(axes: Axes, runs: list[xr.Dataset], colour: str) -> None:
-    """Mean and 90 % band of the first run, and means of the others."""
+    """Plot mean and 90 % band of the first run, and means of the others."""
     first, *others = runs
     half = 1.645 * first["sd"]
     axes.fill_between(

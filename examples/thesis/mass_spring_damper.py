@@ -1,18 +1,17 @@
 """Estimate every parameter of an oscillator with three nonlinearities from noisy records.
 
-How well does a record of a worn machine part tell the laws of its forces?
-A mass hangs on springs with three faults at once: they harden (cubic), they have a gap (freeplay),
-and they take another way back than forth (hysteresis). It is driven by a known force for 30 seconds
-and its place is measured, more or less often, with more or less noise. From each of five records
-all parameters are estimated, nine of them, or seven where three stiffnesses are known to be equal
-(thesis, Section 5.3, cases 1 to 3). Besides, the forces themselves; what it costs to round their
-kinks, and what the gradient is worth that this gives; and which filters can treat a hysteresis that
-remembers its branch.
+How well does a record of a worn machine part determine its force laws? A mass is held by springs
+with three faults at once: they harden (cubic), they have a gap (freeplay), and they return along
+another path (hysteresis). It is driven by a known force for 30 seconds and its position is
+measured, with different intervals and noise. All parameters are estimated from each of five
+records: nine of them, or seven where three stiffnesses are known to be equal (thesis, Section 5.3,
+cases 1 to 3). The script also plots the forces, measures the cost of rounding their kinks and the
+value of the gradient this gives, and shows which filters can handle a hysteresis with a memory.
 
-The stiffness of one spring stands in for that of another: in the stiffnesses the posterior is a
-long, thin, bent ridge, in the forces of `oscillator_models.py` less so. The chains of the cheap
-extended Kalman filter are the longest. Those of the ensemble filters begin where they ended,
-propose as they did, and evaluate only where the extended Kalman filter lets them go.
+The stiffness of one spring can replace that of another. In the stiffnesses the posterior is a long,
+thin, bent ridge; in the forces of `oscillator_models.py` less so. The chains of the cheap extended
+Kalman filter are the longest. Those of the ensemble filters start where these ended, use the same
+proposals, and evaluate only the moves that the extended Kalman filter accepts.
 """
 
 import arviz as az
@@ -29,16 +28,16 @@ from study import Study, check, study
 import pymc_statespace_filters as psf
 
 EKF_CHAIN = 40  # times as long as those of the ensemble filters
-MOST_WEIGHTED = 2000  # draws of the EKF's posterior that a PFEnKF weighs
-PILOT_MEMBERS = 100  # where the EKF cannot go first
+MOST_WEIGHTED = 2000  # draws of the EKF's posterior to reweight with a PFEnKF
+PILOT_MEMBERS = 100  # where the EKF cannot be used first
 NUTS_CASE, NUTS_WIDTH = "case 2, sparse", 0.1
 QUICK_CASE = "case 3"
-# The case as printed: driven by 0.5 N, and without a memory.
+# The case as printed: driven by 0.5 N, without a memory.
 AS_PRINTED = Case("case 1, as printed", 0.5, 0.05, 30, seed=531)
 
 
 def sample(run: Study, case: Case) -> dict[str, xr.DataTree]:
-    """Posteriors of a case by every filter that can treat it."""
+    """Sample the posteriors of a case with every filter that can handle it."""
     ensembles = {"EnKF": psf.EnKF(run.particles), "PFEnKF": psf.PFEnKF(run.particles)}
     if run.quick:
         del ensembles["PFEnKF"]
@@ -65,11 +64,11 @@ def chains(
     length: int = 1,
     screen: psf.EKF | None = None,
 ) -> xr.DataTree:
-    """Draws of a posterior, from where the chains of the pilot ended."""
+    """Sample a posterior, starting where the chains of the pilot ended."""
     model = model_of(case, filter)
     settings = {key: length * run.sampling(name)[key] for key in ("draws", "tune")}
-    # The noise of a filter is held: another seed moves the log-likelihood by some 0.2, and a new
-    # one for each evaluation would nearly double the time of an EnKF.
+    # The noise of a filter is held fixed: another seed changes the log-likelihood by some 0.2, and
+    # a new seed for each evaluation would nearly double the time of an EnKF.
     settings |= {"refresh_noise": False, "pilot": pilot, "screen": screen}
     if pilot is not None:
         settings["stages"] = 1
@@ -77,7 +76,7 @@ def chains(
 
 
 def summary(found: dict[str, dict[str, xr.DataTree]]) -> pd.DataFrame:
-    """A row for each parameter of each posterior."""
+    """Return a row for each parameter of each posterior."""
     rows = []
     for case, trees in found.items():
         for filter, tree in trees.items():
@@ -98,7 +97,8 @@ def summary(found: dict[str, dict[str, xr.DataTree]]) -> pd.DataFrame:
                         "mean": row["mean"],
                         "sd": row["sd"],
                         "95 % HPDI": f"{row['hdi95_lb']:.2f} to {row['hdi95_ub']:.2f}",
-                        # The truth of sigma is an end of its support, and inside of nothing.
+                        # The true sigma is at the end of its support, so no interval contains it in
+                        # its interior.
                         "truth inside": "" if name == "sigma" else ("yes" if inside else "no"),
                         "means of the chains": f"{means.min():.2f} to {means.max():.2f}",
                         "R-hat": row["r_hat"],
@@ -109,10 +109,10 @@ def summary(found: dict[str, dict[str, xr.DataTree]]) -> pd.DataFrame:
 
 
 def estimates(posteriors: pd.DataFrame) -> pd.DataFrame:
-    """Mean and 95 % HPDI of each parameter of each record, by the best of its posteriors.
+    """Return mean and 95 % HPDI of each parameter of each record, by the best of its posteriors.
 
-    That is the PFEnKF's by weights, or, where there is no EKF, by its own chains. A star: the truth
-    is outside.
+    This is the reweighted one by PFEnKF or, where there is no EKF, the PFEnKF's own chains. A star
+    marks a truth outside the interval.
     """
     cells = {}
     for record, rows in posteriors.groupby(level="record", sort=False):
@@ -127,7 +127,7 @@ def estimates(posteriors: pd.DataFrame) -> pd.DataFrame:
 
 
 def mixing(posteriors: pd.DataFrame, found: dict[str, dict[str, xr.DataTree]]) -> pd.DataFrame:
-    """How well the worst parameter of each posterior is known to its chains, or its weights."""
+    """Return convergence diagnostics of the worst parameter of each posterior."""
     groups = posteriors.groupby(level=["record", "filter"], sort=False)
     table = pd.DataFrame(
         {"largest R-hat": groups["R-hat"].max(), "smallest ESS": groups["ESS"].min()}
@@ -139,12 +139,12 @@ def mixing(posteriors: pd.DataFrame, found: dict[str, dict[str, xr.DataTree]]) -
 
 
 def by_gradient(run: Study, ekf: xr.DataTree) -> xr.DataTree:
-    """NUTS on the EKF of the system with rounded kinks: a hundredth of the draws, in each chain."""
+    """Run NUTS with the EKF and rounded kinks: a hundredth of the draws, in each chain."""
     draws = max(200, run.draws // 100)
     last = ekf["posterior"].isel(draw=-1)
     start = [{name: last[name].values[chain] for name in PRIORS} for chain in range(4)]
     with pm.Model():
-        # The parameters themselves, with bounds far away: a gradient follows a bent ridge, and
+        # Use the parameters themselves, with distant bounds: a gradient follows a bent ridge, and
         # stops at a wall.
         for name, prior in PRIORS.items():
             prior(name)
@@ -153,7 +153,7 @@ def by_gradient(run: Study, ekf: xr.DataTree) -> xr.DataTree:
 
 
 def check_verdicts(rows: pd.DataFrame, posteriors: pd.DataFrame) -> None:
-    """What the page says of this study; the tables are already written."""
+    """Stop unless the claims of the page hold; the tables are already written."""
     sticks, moves = (
         np.ptp(case.record()["states"].sel(state="displacement").values[1500:])
         for case in (AS_PRINTED, CASES["case 1, memory"])

@@ -10,12 +10,12 @@ from oscillator import CASES, TRUTH, Case, oscillator, restoring_force
 import pymc_statespace_filters as psf
 
 WIDTHS = (0.02, 0.05, 0.1, 0.2, 0.4)
-N_SEEDS = 8  # of a filter with noise
+N_SEEDS = 8  # for a filter with noise
 PULLED_OUT = 2.5  # m, beyond the end of the loop, a_h + delta_h = 2 m
 
 
 def log_likelihoods(case: Case, filter, parameters, *, width=None, seed=0) -> np.ndarray:
-    """Of the record of a case at parameters that are numbers or arrays, of their shape."""
+    """Return log-likelihoods of a case's record at parameters (numbers or arrays)."""
     terms = psf.log_likelihood(
         oscillator(memory=case.memory, width=width),
         filter,
@@ -29,7 +29,7 @@ def log_likelihoods(case: Case, filter, parameters, *, width=None, seed=0) -> np
 
 
 def cost_of_rounding() -> pd.DataFrame:
-    """Errors that rounded kinks make in the force, and in the log-likelihood by EKF."""
+    """Return the errors of rounded kinks in the force, and in the log-likelihood by EKF."""
     u = np.linspace(-2.5, 2.5, 5001)
     rows = []
     for width in WIDTHS:
@@ -49,10 +49,10 @@ def cost_of_rounding() -> pd.DataFrame:
 
 
 def at_the_truth(particles: int) -> pd.DataFrame:
-    """Log-likelihood of every record by every filter, and of one that demands a memory.
+    """Return log-likelihoods of every record by every filter, and of one that needs a memory.
 
-    Let go at 2.5 m the mass of case 1 swings to the other end of the loop, or not quite: whether
-    it has changed its branch there must be learnt from what follows.
+    Released at 2.5 m, the mass of case 1 swings to the other end of the loop, or nearly so. Whether
+    it has changed its branch there must be inferred from what follows.
     """
     cases = dict(CASES)
     for name, case in CASES.items():
@@ -61,7 +61,7 @@ def at_the_truth(particles: int) -> pd.DataFrame:
     ensembles = (psf.EnKF(particles), psf.PFEnKF(particles), psf.BootstrapPF(particles))
     rows, point = {}, TRUTH | {"sigma": 0.05}
     for name, case in cases.items():
-        # EKF refuses a state that is either 1 or -1.
+        # EKF raises an error for a state that is either 1 or -1.
         ekf = np.nan if case.memory else log_likelihoods(case, psf.EKF(), point).item()
         row = rows[name] = {"EKF": ekf}
         for filter in ensembles:
@@ -72,12 +72,12 @@ def at_the_truth(particles: int) -> pd.DataFrame:
 
 
 def reweighted(case: Case, tree: xr.DataTree, filter, draws: int, rng) -> xr.DataTree:
-    """The posterior by a filter, from draws of that by the EKF, which lies close.
+    """Compute the posterior by a filter from draws of the nearby posterior by the EKF.
 
     So many draws, evenly spaced, are weighted by the ratio of the likelihoods (that of the filter
-    with seed 0), and each chain is drawn anew by its own weights: chains that are not alike before
-    are not alike after. The attribute ``efficiency`` is the share of the draws that this is
-    worth: next to nothing if the posteriors were not alike.
+    with seed 0), and each chain is resampled with its own weights: chains that disagree before also
+    disagree after. The attribute ``efficiency`` is the effective fraction of the draws; it is near
+    zero if the posteriors differ much.
     """
     posterior = tree["posterior"].to_dataset()
     every = max(1, posterior.sizes["chain"] * posterior.sizes["draw"] // draws)
@@ -87,7 +87,7 @@ def reweighted(case: Case, tree: xr.DataTree, filter, draws: int, rng) -> xr.Dat
     weights = np.exp(log_weights - log_weights.max())
     chains = []
     for i, shares in enumerate(weights / weights.sum(axis=1, keepdims=True)):
-        # Systematic resampling keeps the order, and with it what neighbours have in common.
+        # Systematic resampling keeps the order, and with it the similarity of neighbours.
         heights = (np.arange(shares.size) + rng.random()) / shares.size
         picked = np.minimum(np.searchsorted(np.cumsum(shares), heights), shares.size - 1)
         chains.append(posterior.isel(chain=i, draw=picked).drop_vars("draw", errors="ignore"))

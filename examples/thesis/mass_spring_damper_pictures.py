@@ -1,4 +1,4 @@
-"""The pictures of the mass-spring-damper: forces, records and posteriors."""
+"""The figures of the mass-spring-damper: forces, records and posteriors."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ COLOURS = {"EKF": "C0", "EnKF": "C1", "PFEnKF": "C2", "PFEnKF, weights": "C3"}
 
 
 def forces() -> Figure:
-    """Force against displacement, of each nonlinearity and of all (Figs. 24-28)."""
+    """Plot force against displacement, of each nonlinearity and of all (Figs. 24-28)."""
     u = np.linspace(-2.5, 2.5, 1001)
     figure, axes = plt.subplots(1, 5, figsize=(13, 3), layout="constrained", sharex=True)
     parts = {
@@ -51,7 +51,7 @@ def _loop(ax, u: np.ndarray, parameters: Mapping[str, float], colour: str, label
     ax.plot(u, up, colour, label=label)
     if not np.allclose(up, down):
         ax.plot(u, down, colour, ls="--")
-        # An arrow on each way, where neither is near the other.
+        # Draw an arrow on each branch, away from the other one.
         for force, at, ahead in ((up, 450, 20), (down, 550, -20)):
             ax.annotate(
                 "",
@@ -62,7 +62,7 @@ def _loop(ax, u: np.ndarray, parameters: Mapping[str, float], colour: str, label
 
 
 def records() -> Figure:
-    """The motions and what is measured of them (Figs. 29, 31, 33, 35)."""
+    """Plot the motions and their measurements (Figs. 29, 31, 33, 35)."""
     figure, axes = plt.subplots(
         len(CASES), 1, figsize=(9, 9), sharex=True, sharey=True, layout="constrained"
     )
@@ -83,7 +83,7 @@ def records() -> Figure:
 
 
 def posteriors(name: str, found: Mapping[str, xr.DataTree]) -> Figure:
-    """Marginal posteriors of a case by several filters; thin lines are single chains."""
+    """Plot marginal posteriors of a case by several filters; thin lines are single chains."""
     names = [*LINEAR, *(n for group in NONLINEARITIES.values() for n in group)]
     drawn = [n for n in names if not CASES[name].shared or n not in ("k_f", "k_h")]
     figure, axes = plt.subplots(-(-len(drawn) // 3), 3, figsize=(9, 6.5), layout="constrained")
@@ -103,7 +103,7 @@ def posteriors(name: str, found: Mapping[str, xr.DataTree]) -> Figure:
         ax.axvline(TRUTH[parameter], color="k", lw=1, ls="--", label="truth")
         shared = parameter == "k_l" and CASES[name].shared
         label = "k_l = k_f = k_h" if shared else parameter
-        # A chain that stood still is higher than the picture.
+        # A chain that did not move exceeds the height of the figure.
         ax.set(xlabel=f"{label} [{UNITS[parameter]}]", yticks=[], ylim=(0, 1.5 * highest))
         ax.spines[["left", "right", "top"]].set_visible(False)
     figure.legend(

@@ -2,13 +2,13 @@
 
 The thesis estimates the parameters of a mass on a spring with cubic stiffness, freeplay and
 hysteresis (Section 5.3), and ends: "Model selection is not carried out for this system due to
-extremely high computational time". Here it is carried out. Each nonlinearity is in the model or is
-not, which makes eight variants of three to nine parameters. All three were in the simulation; how
-much of that can a noisy record of the displacement tell?
+extremely high computational time". Here it is carried out. Each nonlinearity is either in the model
+or not, which makes eight variants with three to nine parameters. The simulation had all three. How
+much of that can a noisy record of the displacement show?
 
 For the records of cases 1 to 3, every variant is sampled with an extended and with an ensemble
-Kalman filter, the two best also with PF-EnKF; out of the draws come its evidence, its probability,
-the probability of each nonlinearity, and the restoring force averaged over the variants.
+Kalman filter, the two best also with PF-EnKF. The draws give its evidence, its probability, the
+probability of each nonlinearity, and the restoring force averaged over the variants.
 """
 
 import time
@@ -30,8 +30,8 @@ from study import Study, check, mixing, study
 
 import pymc_statespace_filters as psf
 
-# The first case as printed does not move enough to show anything (see `oscillator.py`), and knows
-# the three stiffnesses to be equal. Here no record knows that: all have the same eight rivals.
+# The first case as printed does not move enough to show anything (see `oscillator.py`), and takes
+# the three stiffnesses as equal. Here no record does: all have the same eight rivals.
 RECORDS = {
     "case 1": replace(CASES["case 1, T = 3"], shared=False),
     "case 2": CASES["case 2, dense"],
@@ -43,17 +43,17 @@ VARIANTS = {
     for chosen in combinations(NONLINEARITIES, size)
 }
 QUICK_RECORD = SENSITIVITY_RECORD = "case 2"
-PF_ENKF_SHARE = 5  # of the draws: it takes three to eight times as long as an EnKF
-BRIDGED = ("case 3", "cubic + hysteresis")  # by bridge sampling with the ensemble too
+PF_ENKF_SHARE = 5  # of the draws: PF-EnKF takes three to eight times as long as an EnKF
+BRIDGED = ("case 3", "cubic + hysteresis")  # also by bridge sampling with the ensemble
 
-# What they say of an evidence stands in the tables: few effective draws, large R-hat.
+# The tables show the warnings of an evidence: few effective draws, large R-hat.
 warnings.filterwarnings("ignore", category=psf.EvidenceWarning)
 
-# Chains from the prior need this long to find and learn a ridge; with the EKF that is seconds.
+# Chains from the prior need this long to find and learn a ridge; with the EKF it takes seconds.
 PILOT = {"draws": 12_500, "tune": 7500}
 QUICK_PILOT = {"draws": 1000, "tune": 2500}
 
-FORCE_PLACES = np.linspace(-1.75, 1.75, 71)  # where the mass has been
+FORCE_PLACES = np.linspace(-1.75, 1.75, 71)  # the range of the motion
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Sampled:
 
     @property
     def calls(self) -> int:
-        """Evaluations of the likelihood for the draws that are kept."""
+        """Evaluations of the likelihood for the kept draws."""
         return int(self.idata["sample_stats"]["n_evaluations"].sum())
 
 
@@ -79,10 +79,10 @@ def sample(
     bridge: bool = False,
     **sampling: Any,
 ) -> Sampled:
-    """Draws and evidence of a model; a run that was ended is taken up again.
+    """Return draws and evidence of a model; an interrupted run resumes.
 
-    What is left of an earlier run is told by folders and a file named after `place`. Seconds are
-    those of this process: where a chain was taken up, only of the rest.
+    An earlier run is identified by folders and a file named after `place`. Seconds are those of
+    this process; if a chain was resumed, those of the rest only.
     """
     started = time.process_time()
     idata = settings.sample(place, model, **sampling)
@@ -123,11 +123,11 @@ def pilots(settings: Study, record: str, width: float = 1.0) -> dict[str, Sample
 def refined(
     settings: Study, record: str, filter: psf.EnKF | psf.PFEnKF, pilot: Mapping[str, Sampled]
 ) -> dict[str, Sampled]:
-    """Sample variants by an ensemble, from where the pilots stand, and with what they learnt.
+    """Sample variants by an ensemble, with starts and proposals from the pilots.
 
-    The EKF also screens the proposals: most are refused at its price, some hundredths of the
-    ensemble's, and the chain is still right for the ensemble's likelihood. The covariance of the
-    proposals stays as it was learnt: a shorter run could only learn a worse one.
+    The EKF also screens the proposals. It rejects most of them at its own cost, some hundredths of
+    the ensemble's, and the chain is still correct for the ensemble's likelihood. The covariance of
+    the proposals is not adapted: a shorter run could only learn a worse one.
     """
     found = {}
     for variant, sampled in pilot.items():
@@ -151,7 +151,7 @@ def chib_jeliazkov(found: Mapping[str, Sampled]) -> dict[str, psf.Evidence]:
 
 
 def compared(found: Mapping[str, Sampled]) -> pd.DataFrame:
-    """Evidence and probability of the variants of one record, by one filter."""
+    """Return evidence and probability of the variants of one record, by one filter."""
     table = psf.compare_evidence(chib_jeliazkov(found))
     parameters = table["n_parameters"]
     shown = table[["log_evidence", "se", "prob", "prob_low", "prob_high"]].copy()
@@ -165,7 +165,7 @@ def compared(found: Mapping[str, Sampled]) -> pd.DataFrame:
 
 
 def overview(tables: Mapping[tuple[str, str], pd.DataFrame]) -> pd.DataFrame:
-    """A row for a variant, a column for a record and filter: log-evidence, error, probability."""
+    """Return log-evidence, error and probability: a row per variant, a column per filter."""
     columns = {
         " ".join(place): table.apply(
             lambda row: f"{row.log_evidence:.2f} ± {row.se:.2f} ({row.prob:.2f})", axis=1
@@ -176,9 +176,9 @@ def overview(tables: Mapping[tuple[str, str], pd.DataFrame]) -> pd.DataFrame:
 
 
 def shown_nonlinearities(table: pd.DataFrame) -> pd.DataFrame:
-    """Probability of each nonlinearity: the sum over the variants that have it.
+    """Return the probability of each nonlinearity: the sum over the variants that have it.
 
-    The interval is what the errors of the evidences leave open, at 95 %.
+    The 95 % interval is what the errors of the evidences leave open.
     """
     rng = np.random.default_rng(1)
     errors = rng.normal(size=(10_000, len(table))) * table["se"].to_numpy()
@@ -192,7 +192,7 @@ def shown_nonlinearities(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def forces(posterior: xr.Dataset) -> xr.DataArray:
-    """The springs' force on the way up and down, at every tenth draw."""
+    """Return the springs' force on the way up and down, at every tenth draw."""
     some = posterior.isel(draw=slice(None, None, 10))
     numbers = {name: some[name].values for name in TRUTH if name in some}
     both = [restoring_force(FORCE_PLACES, direction, numbers) for direction in (1.0, -1.0)]
@@ -202,7 +202,7 @@ def forces(posterior: xr.Dataset) -> xr.DataArray:
 
 
 def agreement(found: Mapping[str, Sampled]) -> pd.DataFrame:
-    """Evidences by the method of Chib and Jeliazkov beside those by bridge sampling."""
+    """Compare evidences by the method of Chib and Jeliazkov with those by bridge sampling."""
     rows = {}
     for variant, sampled in found.items():
         if "bridge" in sampled.evidence:
@@ -218,7 +218,7 @@ def agreement(found: Mapping[str, Sampled]) -> pd.DataFrame:
 
 
 def sampled_by_filters(settings: Study, record: str) -> dict[str, dict[str, Sampled]]:
-    """All variants by EKF and EnKF, the two best by PF-EnKF; in short, the best by EnKF."""
+    """Sample all variants by EKF and EnKF, the two best by PF-EnKF; if quick, the best by EnKF."""
     found = {"EKF": pilots(settings, record)}
 
     def best(filter: str, number: int) -> dict[str, Sampled]:
@@ -235,9 +235,9 @@ def sampled_by_filters(settings: Study, record: str) -> dict[str, dict[str, Samp
 
 
 def sensitivity(settings: Study, record: str) -> pd.DataFrame:
-    """Probability of each nonlinearity if all priors were half or twice as wide, by the EKF.
+    """Return nonlinearities' probabilities by the EKF with all priors half or twice as wide.
 
-    Sampled anew: most of these posteriors are so wide themselves that reweighting their draws
+    The posteriors are sampled again: most of them are so wide that reweighting their draws
     (`psf.prior_sensitivity`) gives no answer.
     """
     probs = {}
@@ -248,7 +248,7 @@ def sensitivity(settings: Study, record: str) -> pd.DataFrame:
 
 
 def check_verdicts(shown: Mapping[tuple[str, str], pd.DataFrame]) -> None:
-    """What the study claims; the tables are already written."""
+    """Stop unless the claims of the study hold; the tables are already written."""
     for (record, filter), table in shown.items():
         prob, by = table["prob"], f"by {filter}"
         check(f"{record} shows the cubic stiffness, {by}", prob["cubic"] > 0.9)
@@ -266,7 +266,7 @@ def main() -> None:
         for filter, found in sampled_by_filters(settings, record).items():
             tables[record, filter] = table = compared(found)
             checks[record, filter] = agreement(found)
-            if len(found) == len(VARIANTS):  # the last such filter averages
+            if len(found) == len(VARIANTS):  # the last filter whose results are averaged
                 shown[record, filter] = shown_nonlinearities(table)
                 trees = {variant: sampled.idata for variant, sampled in found.items()}
                 weights = psf.compare_evidence(chib_jeliazkov(found))

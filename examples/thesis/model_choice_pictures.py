@@ -1,4 +1,4 @@
-"""Pictures of the choice among the variants of the mass-spring-damper."""
+"""Figures of the choice among the variants of the mass-spring-damper."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ COLOURS = {"EKF": "C7", "EnKF": "C0", "PF-EnKF": "C3"}
 
 
 def plot_probabilities(tables: Mapping[tuple[str, str], pd.DataFrame]) -> Figure:
-    """The probability of each variant, a panel for a record, a bar for a filter."""
+    """Plot the probability of each variant, a panel for a record, a bar for a filter."""
     records = list(dict.fromkeys(record for record, _ in tables))
     figure, panels = plt.subplots(
         1, len(records), figsize=(4 + 3 * len(records), 4), sharey=True, squeeze=False
@@ -44,7 +44,7 @@ def _size(variant: str) -> tuple[int, str]:
 
 
 def plot_forces(averages: Mapping[str, xr.DataTree]) -> Figure:
-    """The averaged force on the way up and down, and how far it is off, with 90 % bands."""
+    """Plot the averaged force on the way up and down, and its error, with 90 % bands."""
     figure, panels = plt.subplots(
         2,
         len(averages),

@@ -1,12 +1,12 @@
 """A mass on a damped spring with three nonlinearities, and its records (thesis, Section 5.3).
 
-The mass is driven by a force that is known, and its displacement u is seen now and then:
+A known force drives the mass, and its displacement u is measured now and then:
 
     m u'' + c u' + k_l u + k_nl u^3 + freeplay(u) + hysteresis(u, u') = T cos(omega t) + sigma W(t)
 
 Two studies share this file: the parameters of this equation (`mass_spring_damper.py`), and which of
-the three nonlinearities a record shows at all (`model_choice.py`). A force whose parameters are not
-given is absent: their defaults are zero.
+the three nonlinearities a record shows (`model_choice.py`). A force whose parameters are not given
+is absent: their defaults are zero.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ import pymc_statespace_filters as psf
 
 DT, DURATION, MASS, OMEGA = 0.01, 30.0, 1.0, 1.5
 
-# The parameters that each nonlinearity brings; LINEAR ones are always there.
+# The parameters of each nonlinearity; the LINEAR ones are always present.
 LINEAR = ("k_l", "c", "sigma")
 NONLINEARITIES = {
     "cubic": ("k_nl",),
@@ -28,8 +28,8 @@ NONLINEARITIES = {
     "hysteresis": ("k_h", "a_h", "delta_h"),
 }
 
-# What made the records. The thesis does not say where the plateaus of the hysteresis begin, a_h:
-# taken well away from delta_f, so that a record can tell the two kinks apart.
+# The true values. The thesis does not say where the plateaus of the hysteresis begin, a_h: taken
+# well away from delta_f, so that a record can distinguish the two kinks.
 TRUTH = {
     "k_l": 1.0,
     "c": 0.3,
@@ -44,11 +44,11 @@ TRUTH = {
 
 
 def oscillator(*, memory: bool = False, width: float | None = None) -> psf.StateSpaceModel:
-    """The system; displacement in m, velocity in m/s, and with `memory` the hysteresis' branch.
+    """Return the system; displacement in m, velocity in m/s, with `memory` the hysteresis branch.
 
-    The force T cos(omega t) comes as an input, and the variance Gamma of the measurements as a
-    parameter, so that all cases are one system. Without `memory` the sign of the velocity chooses
-    the branch. `width` rounds the kinks (`psf.freeplay`).
+    The force T cos(omega t) is an input, and the variance Gamma of the measurements a parameter, so
+    that all cases are one system. Without `memory` the sign of the velocity selects the branch.
+    `width` rounds the kinks (`psf.freeplay`).
     """
 
     def transition(x, q, u, k_l, c, sigma, k_nl=0, k_f=0, delta_f=0, k_h=0, a_h=0, delta_h=0):
@@ -74,8 +74,9 @@ def oscillator(*, memory: bool = False, width: float | None = None) -> psf.State
         dt=DT,
         observation=lambda x: [x[0]],
         observation_noise=lambda Gamma: [[Gamma]],
-        # Nor does the thesis say how the motion begins: released at 1 m, known to a tenth of a
-        # metre and metre per second. Without spread an ensemble would be one point at sigma = 0.
+        # The thesis does not say how the motion starts either: released at 1 m, known to a tenth of
+        # a metre and metre per second. Without spread an ensemble would be a single point at sigma
+        # = 0.
         initial_mean=lambda start=1.0: [start, 0.0] + [1.0] * n_branches,
         initial_cov=np.diag([0.01, 0.01] + [0.0] * n_branches),
         states=["displacement", "velocity"] + ["branch"] * n_branches,
@@ -87,7 +88,7 @@ def oscillator(*, memory: bool = False, width: float | None = None) -> psf.State
 
 @dataclass(frozen=True)
 class Case:
-    """A record of 30 seconds: how it was made, and the model of it.
+    """A record of 30 seconds: how it is simulated, and the model of it.
 
     Attributes
     ----------
@@ -105,7 +106,7 @@ class Case:
     shared : bool
         Whether the three stiffnesses k_l, k_f, k_h are known to be equal.
     start : float
-        Displacement at which the mass is let go, in m, to a tenth of it.
+        Displacement at which the mass is released, in m, known to a tenth of it.
     """
 
     name: str
@@ -119,17 +120,17 @@ class Case:
 
     @property
     def slug(self) -> str:
-        """The name as that of a file."""
+        """The name in a form for file names."""
         return "_".join("".join(c if c.isalnum() else " " for c in self.name).split())
 
     @property
     def known(self) -> dict[str, float]:
-        """Parameters of the system that are no question."""
+        """Parameters of the system that are not estimated."""
         return {"Gamma": self.Gamma, "start": self.start}
 
     @property
     def steps(self) -> np.ndarray:
-        """Of the measurements; the first is at the start."""
+        """Steps of the measurements; the first is at the start."""
         return np.arange(0, round(DURATION / DT) + 1, self.every)
 
     @property
@@ -162,8 +163,8 @@ class Case:
 
 
 # Case 1 as printed sticks: 0.5 N do not overcome the friction of a hysteresis without memory, of
-# k_h delta_h / 2 = 0.75 N. So it stands here twice, with memory, and with the force of case 2.
-# The numbers of measurements are not printed either, but for the second record of case 2.
+# k_h delta_h / 2 = 0.75 N. So it appears here twice, with memory, and with the force of case 2. The
+# numbers of measurements are not printed either, except for the second record of case 2.
 CASES = {
     case.name: case
     for case in (
@@ -183,10 +184,10 @@ def restoring_force(
     *,
     width: float | None = None,
 ) -> np.ndarray:
-    """Force of the springs at displacements `u` on the way up (`direction` 1) or down (-1).
+    """Return the springs' force at displacements `u`, on the way up (`direction` 1) or down (-1).
 
-    `parameters` are numbers or draws, of any shape S that all share, such as a posterior; what is
-    not among them is absent. Shape S + (u.size,), in N.
+    `parameters` are numbers or draws, all of one shape S, such as a posterior; missing ones are
+    absent forces. The result has shape S + (u.size,), in N.
     """
     p = {name: np.asarray(parameters.get(name, 0.0))[..., None] for name in TRUTH}
     force = (

@@ -1,4 +1,4 @@
-"""What is not known of the mass-spring-damper, as PyMC models, in coordinates that mix."""
+"""The unknowns of the mass-spring-damper as PyMC models, in coordinates that mix."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -21,7 +21,7 @@ PRIORS = {
     "a_h": partial(pm.HalfNormal, sigma=1.0),
     "delta_h": partial(pm.HalfNormal, sigma=2.0),
 }
-FORCES = {"k_f": "slack", "k_h": "friction"}  # what a plateau takes away, in N
+FORCES = {"k_f": "slack", "k_h": "friction"}  # the force that a plateau takes away, in N
 
 
 def model_of(
@@ -30,18 +30,18 @@ def model_of(
     nonlinearities: Iterable[str] = NONLINEARITIES,
     wider: float = 1.0,
 ) -> pm.Model:
-    """The posterior of a record, with some of the nonlinearities, all of them if not told.
+    """Return the model of a record, with some or (by default) all of the nonlinearities.
 
-    The joint prior is that of `PRIORS`, to the letter, all so many times as wide. But what a record
-    tells is not k_l, k_f and k_h: it is their sum, the stiffness far out, and the force that a
+    The joint prior is exactly that of `PRIORS`, scaled by the given width. But a record does not
+    determine k_l, k_f and k_h. It determines their sum, the stiffness far out, and the force that a
     plateau takes away, stiffness times length. In the k's the posterior is a hyperbola and a sharp
-    edge on which chains creep; in these it is a hill. A normal prior of k is one of k * length,
-    given the length.
+    edge, on which chains mix slowly; in these coordinates it has a single hill. A normal prior of k
+    is one of k * length, given the length.
 
     Where the three stiffnesses are known to be equal there is one variable for them, k_l.
 
-    Without a transformation a bound is a place like others to a random walk, not at minus infinity.
-    The lengths are transformed to logarithms, for the k's are divided by them.
+    Without a transformation, a bound is an ordinary point to a random walk, not at minus infinity.
+    The lengths are transformed to logarithms, because the k's are divided by them.
     """
     bounds = {"default_transform": None}
     sigma = {name: wider * prior.keywords["sigma"] for name, prior in PRIORS.items()}
@@ -50,7 +50,7 @@ def model_of(
             PRIORS[name](name, sigma=sigma[name], **bounds)
         if "cubic" in nonlinearities:
             PRIORS["k_nl"]("k_nl", sigma=sigma["k_nl"])
-        plateaus = {}  # the length of each by its stiffness
+        plateaus = {}  # the length of each, by its stiffness
         if "freeplay" in nonlinearities:
             plateaus["k_f"] = PRIORS["delta_f"]("delta_f", sigma=sigma["delta_f"])
         if "hysteresis" in nonlinearities:
@@ -65,7 +65,7 @@ def model_of(
             for name, length in plateaus.items():
                 force = pm.HalfNormal(FORCES[name], sigma[name] * length, **bounds)
                 k_of_plateaus += pm.Deterministic(name, force / length)
-            # k_l itself is half-normal: k_far is that, moved by the other stiffnesses.
+            # k_l itself is half-normal: k_far has that prior, shifted by the other stiffnesses.
             k_far = pm.TruncatedNormal(
                 "k_far", k_of_plateaus, sigma["k_l"], lower=k_of_plateaus, **bounds
             )

@@ -1,4 +1,4 @@
-"""What the studies have in common: the command line, chains, and a folder for what is found."""
+"""The common parts of the studies: the command line, chains, and a folder for the results."""
 
 import argparse
 import hashlib
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import pymc_statespace_filters as psf
 
 matplotlib.use("Agg")
-# A study says what it finds in tables; PyMC would say once a chain what it is about to do.
+# A study reports in tables; PyMC would announce every chain.
 logging.getLogger("pymc").setLevel(logging.ERROR)
 
 CHAINS = 4
@@ -36,14 +36,14 @@ class Study:
     Attributes
     ----------
     out : Path
-        The folder of the run; what is in it is taken up again by the next.
+        The folder of the run; the next run resumes from its contents.
     draws : int
-        Draws kept of one posterior, of all chains together.
+        Kept draws of one posterior, of all chains together.
     particles : int
         Members of an ensemble, or particles.
     seed : int
     quick : bool
-        Whether this is the short form, which leaves out what takes long.
+        Whether this is the short form, which omits what takes long.
     """
 
     out: Path
@@ -53,7 +53,7 @@ class Study:
     quick: bool
 
     def sampling(self, name: str) -> dict[str, Any]:
-        """The keyword arguments of `sample_dram` and `run_models`; `name` is that of the folder."""
+        """Return keyword arguments of `sample_dram` and `run_models`; `name` names the folder."""
         draws = -(-self.draws // CHAINS)
         return {
             "draws": draws,
@@ -64,7 +64,7 @@ class Study:
         }
 
     def sample(self, name: str, model: pm.Model, **changes: Any) -> xr.DataTree:
-        """Sample a model by `psf.sample_dram`; `changes` of its arguments go before `sampling`."""
+        """Sample a model by `psf.sample_dram`; `changes` override the arguments of `sampling`."""
         settings = self.sampling(name) | changes
         return _whole(psf.sample_dram(model=model, **settings), settings)
 
@@ -77,29 +77,29 @@ class Study:
         return {of: _whole(draws, settings) for of, draws in found.items()}
 
     def evidence(self, name: str, draws: xr.DataTree, model: pm.Model) -> psf.Evidence:
-        """Estimate an evidence, or read what an earlier run found for the same draws."""
+        """Estimate an evidence, or read what an earlier run computed for the same draws."""
 
         def find() -> dict[str, Any]:
             with warnings.catch_warnings():
-                # What is doubtful the result says itself, for a table.
+                # The result itself reports its doubts, in a table.
                 warnings.simplefilter("ignore", psf.EvidenceWarning)
                 return asdict(psf.chib_jeliazkov(draws, model, random_seed=self.seed))
 
         return psf.Evidence(**self.kept(name, draws, find))
 
     def kept(self, name: str, draws: xr.DataTree, find: Callable[[], Any]) -> Any:
-        """What `find` returns, or what it returned for the same draws in an earlier run."""
+        """Return what `find` returns, or its result for the same draws from an earlier run."""
         drawn = hashlib.sha256(draws["sample_stats"]["lp"].values.tobytes()).hexdigest()
         path = self.out / "evidence" / f"{name} {drawn[:8]}.json"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_suffix(".part")
             unfinished.write_text(json.dumps(find()))
-            os.replace(unfinished, path)  # appears as a whole, whenever a run is ended
+            os.replace(unfinished, path)  # written as a whole, even if the run is interrupted
         return json.loads(path.read_text())
 
     def table(self, name: str, table: pd.DataFrame, digits: int = 2) -> None:
-        """Write a table as CSV in full, and as Markdown with so many digits after the point."""
+        """Write a table as CSV in full, and as Markdown with this many digits after the point."""
         table.to_csv(self.out / f"{name}.csv")
         cells = table.reset_index() if any(table.index.names) else table
         rows = [cells.columns, ["---"] * cells.shape[1]]
@@ -108,13 +108,13 @@ class Study:
         (self.out / f"{name}.md").write_text("\n".join(lines) + "\n")
 
     def picture(self, name: str, figure: Figure) -> None:
-        """Write a picture as PNG."""
+        """Write a figure as PNG."""
         figure.savefig(self.out / f"{name}.png", dpi=110)
         plt.close(figure)
 
 
 def _whole(draws: xr.DataTree, settings: Mapping[str, Any]) -> xr.DataTree:
-    """End the study if Ctrl-C has ended its chains: what is left of them is no result."""
+    """Stop the study if Ctrl-C ended its chains: incomplete chains are not a result."""
     sizes = draws["posterior"].sizes if "posterior" in draws else {}
     if any(sizes.get(dim[:-1]) != settings[dim] for dim in ("chains", "draws")):
         raise SystemExit("The chains were interrupted; the same command goes on from here.")
@@ -122,7 +122,7 @@ def _whole(draws: xr.DataTree, settings: Mapping[str, Any]) -> xr.DataTree:
 
 
 def mixing(draws: xr.DataTree) -> dict[str, float]:
-    """The largest R-hat and the smallest effective number of draws of all parameters."""
+    """Return the largest R-hat and the smallest effective sample size of all parameters."""
     return {
         "R-hat": float(az.rhat(draws["posterior"].to_dataset()).to_array().max()),
         "effective draws": float(az.ess(draws["posterior"].to_dataset()).to_array().min()),
@@ -130,7 +130,7 @@ def mixing(draws: xr.DataTree) -> dict[str, float]:
 
 
 def check(claim: str, holds: bool) -> None:
-    """End the study with the claim if it does not hold."""
+    """Stop the study with the claim as the message if it does not hold."""
     if not holds:
         raise SystemExit(f"This should hold and does not: {claim}.")
 
@@ -144,7 +144,7 @@ def _cell(value: Any, digits: int) -> str:
 def study(
     description: str, name: str, *, draws: int, particles: int, quick: tuple[int, int]
 ) -> Study:
-    """The settings that the command line asks for.
+    """Return the settings from the command line.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def study(
     name : str
         The study's folder.
     draws, particles : int
-        Without options: those of the thesis.
+        The defaults, those of the thesis.
     quick : tuple of int
         Draws and particles of the short form.
     """
@@ -186,7 +186,7 @@ def study(
 
 
 def _at_least(least: int) -> Callable[[str], int]:
-    """A type of whole numbers for an argument parser."""
+    """Return a type of whole numbers for an argument parser."""
 
     def number(text: str) -> int:
         if not text.strip().lstrip("+-").isdecimal() or int(text) < least:

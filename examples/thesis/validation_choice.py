@@ -1,4 +1,4 @@
-"""Which of the rivals is chosen, on how many of the records, from how many measurements on."""
+"""How often each of the rivals is chosen, and from how many measurements on."""
 
 import numpy as np
 import pandas as pd
@@ -8,12 +8,12 @@ EXPONENT = 3.0  # alpha of the thesis's correction J^(-k alpha / 2), k the numbe
 
 
 def corrected(log_evidences: xr.DataArray) -> xr.DataArray:
-    """Log-evidences with the correction; `psf.DimensionCorrection` for arrays with k and J."""
+    """Apply the correction to log-evidences: `psf.DimensionCorrection` for arrays with k and J."""
     return log_evidences - EXPONENT / 2 * log_evidences["k"] * np.log(log_evidences["J"])
 
 
 def chosen(log_evidences: xr.DataArray) -> pd.DataFrame:
-    """Percentage of the records on which a model has the largest evidence, for every J."""
+    """Return the percentage of records on which a model has the largest evidence, for every J."""
     best = log_evidences.argmax("model")
     return pd.DataFrame({
         model: 100 * (best == i).mean("record").to_series()
@@ -22,10 +22,10 @@ def chosen(log_evidences: xr.DataArray) -> pd.DataFrame:
 
 
 def crossings(log_evidences: dict[str, xr.DataArray]) -> pd.DataFrame:
-    """From how many measurements on M1 is chosen on most records.
+    """Return the number of measurements from which M1 is chosen on most records.
 
-    With flat priors of density one, with the correction, and with Uniform priors on the same
-    supports, which divide by their volume.
+    The columns are flat priors of density one, the same with the correction, and Uniform priors on
+    the same supports, which divide by their volume.
     """
     rows = {}
     for name, found in log_evidences.items():

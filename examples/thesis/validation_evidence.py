@@ -1,7 +1,7 @@
 """Exact evidences of the four models of the validation under flat priors, by quadrature.
 
 The likelihood of a linear Gaussian system is Gaussian in a_1, so its integral over the support of
-a_1 is known from three evaluations. What is left, over sigma and a_2, is done on a grid.
+a_1 follows from three evaluations. The rest, over sigma and a_2, is integrated on a grid.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from scipy.special import log_ndtr, logsumexp
 
 Array = NDArray[np.float64]
 
-# The a_1 of the three evaluations: wide enough that their differences are not rounding errors.
+# The a_1 of the three evaluations, far enough apart that their differences exceed rounding error.
 A1_STEP = 10.0
 
 
@@ -32,7 +32,7 @@ class Rule(NamedTuple):
 
 
 def gauss_legendre(n: int, low: float, high: float, power: int) -> Rule:
-    """Gauss-Legendre for u, where the variable is u^power: nodes are close together about zero."""
+    """Return Gauss-Legendre for u, where the variable is u^power: nodes are dense near zero."""
     left, right = np.sign([low, high]) * np.abs([low, high]) ** (1 / power)
     nodes, weights = np.polynomial.legendre.leggauss(n)
     u = (left + right) / 2 + (right - left) / 2 * nodes
@@ -43,7 +43,7 @@ def gauss_legendre(n: int, low: float, high: float, power: int) -> Rule:
 def flat_evidences(
     log_likelihood: Callable[[Array, Array, Array], Array], sigma: Rule, a1_bound: float, a2: Rule
 ) -> Array:
-    """Log-evidences of M1 to M4 under priors of density one.
+    """Return log-evidences of M1 to M4 under priors of density one.
 
     Parameters
     ----------
@@ -75,12 +75,15 @@ def flat_evidences(
 
 
 def _integral_of_gaussian(below: Array, at_zero: Array, above: Array, bound: float) -> Array:
-    """Log-integral, from -bound to bound, of exp of a parabola known at -A1_STEP, 0, A1_STEP."""
+    """Return the log-integral, over (-bound, bound), of exp of a parabola known at 3 points.
+
+    The points are -A1_STEP, 0 and A1_STEP.
+    """
     slope = (above - below) / (2 * A1_STEP)
-    # None at all where a_1 moves nothing: two steps with 1 + a_2 dt = -1 cancel.
+    # The curvature is zero where a_1 has no effect: two steps with 1 + a_2 dt = -1 cancel.
     precision = np.maximum((2 * at_zero - above - below) / A1_STEP**2, 1e-12)
     mean, sd = slope / precision, precision**-0.5
-    # The mass between the bounds, from the tail in which it lies: no difference of two ones.
+    # Compute the mass between the bounds from the tail that contains it: no difference of ones.
     near = (-bound - np.abs(mean)) / sd
     far = (bound - np.abs(mean)) / sd
     log_mass = log_ndtr(far) + np.log1p(-np.exp(log_ndtr(near) - log_ndtr(far)))

@@ -1,4 +1,4 @@
-"""The pictures of the validation: evidences and model probabilities against the measurements."""
+"""The figures of the validation: evidences and model probabilities against the measurements."""
 
 import matplotlib.pyplot as plt
 import xarray as xr
@@ -10,7 +10,7 @@ BAND = (0.1, 0.9)
 
 
 def plot_evidences(flat: xr.DataArray, corrected: xr.DataArray) -> Figure:
-    """Fig. 10: ln evidence against J, and what is hard to see there, its difference from M1's."""
+    """Plot ln evidence against J, and its difference from M1's, which is hard to see (Fig. 10)."""
     figure, panels = plt.subplots(
         2, 2, figsize=(9, 6), layout="constrained", sharex=True, sharey="row"
     )
@@ -27,7 +27,7 @@ def plot_evidences(flat: xr.DataArray, corrected: xr.DataArray) -> Figure:
 
 
 def plot_probabilities(designs: dict[str, tuple[xr.DataArray, xr.DataArray]]) -> Figure:
-    """Model probabilities without and with correction, one row for each way to measure."""
+    """Plot model probabilities without and with correction, one row for each measurement design."""
     figure, panels = plt.subplots(
         len(designs), 2, figsize=(9, 6), layout="constrained", sharex=True, sharey=True
     )
