@@ -37,8 +37,8 @@ EARLY_ERROR = """
 from mpi4py import MPI
 if MPI.COMM_WORLD.rank == 1:
     raise FileNotFoundError("no data on this computer")
-from pymc_statespace_filters.parallel import ranks_of
-ranks_of("world").wait_for_all()
+from pymc_statespace_filters.parallel.communicator import communicator_of
+communicator_of("world").barrier()
 """
 
 

@@ -13,8 +13,8 @@ from tests.mpi.launch import ROOT, on_ranks
 
 SIZE = """
 import sys
-from pymc_statespace_filters.parallel import ranks_of
-ranks = ranks_of("world")
+from pymc_statespace_filters.parallel.communicator import communicator_of
+ranks = communicator_of("world")
 print("mpi4py" in sys.modules, ranks.size)
 """
 

@@ -9,7 +9,7 @@ from pymc_statespace_filters.sampling.particle_number.search import (
     MOST_NUMBERS,
     Row,
     choose,
-    pleasant,
+    round_up,
     search,
 )
 
@@ -30,11 +30,11 @@ def budget(law, first, target=TARGET, tail=2.0, rng=None):
 
 
 def test_pleasant_numbers_round_up_in_small_steps():
-    assert [pleasant(x) for x in (3, 10, 10.5, 11, 13, 170, 999, 1000, 4100, 61_000)] == [
+    assert [round_up(x) for x in (3, 10, 10.5, 11, 13, 170, 999, 1000, 4100, 61_000)] == [
         10, 10, 11, 11, 14, 180, 1000, 1000, 4500, 70_000,
     ]  # fmt: skip
     numbers = np.geomspace(20, 1e6, 500)
-    ratios = np.array([pleasant(x) for x in numbers]) / numbers
+    ratios = np.array([round_up(x) for x in numbers]) / numbers
     assert ratios.min() > 1.0 - 1e-9
     assert ratios.max() < 1.2
 

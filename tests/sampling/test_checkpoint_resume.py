@@ -15,8 +15,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
-from pymc_statespace_filters.sampling.run import chain_task as chain_run
-from pymc_statespace_filters.sampling.run.thread_pool import Crew
+from pymc_statespace_filters.sampling.run import chain_task
+from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
 KINDS = {
@@ -39,16 +39,16 @@ def sample_kind(kind, **changes):
 KILLED = """
 import os, sys, time, warnings
 warnings.simplefilter("ignore")
-from pymc_statespace_filters.sampling import chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from tests.sampling.test_checkpoint_resume import sample_kind
-chain_run.CHECKPOINT_SECONDS = 0.01
-made = chain_run.ChainRun._advance
+chain_task.CHECKPOINT_SECONDS = 0.01
+made = chain_task.ChainTask._advance
 def advance(self):
-    if self.done >= int(sys.argv[3]):
+    if self.n_done >= int(sys.argv[3]):
         os.write(1, b"there\\n")  # whole, whichever thread says it
-        time.sleep(0.001 * (1 + self.done % 7))
+        time.sleep(0.001 * (1 + self.n_done % 7))
     made(self)
-chain_run.ChainRun._advance = advance
+chain_task.ChainTask._advance = advance
 sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
 print("done", flush=True)
 """
@@ -95,7 +95,7 @@ SMALL = {"draws": 700, "tune": 400}
 
 @pytest.fixture
 def often(monkeypatch):
-    monkeypatch.setattr(chain_run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
 
 
 def test_a_log_torn_anywhere(small, tmp_path, often):
@@ -116,7 +116,7 @@ def test_a_log_torn_anywhere(small, tmp_path, often):
 
 def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
     first = sample_dram(small, checkpoint=tmp_path, **SMALL)
-    monkeypatch.setattr(chain_run.ChainRun, "_advance", None)
+    monkeypatch.setattr(chain_task.ChainTask, "_advance", None)
     assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
 
 
@@ -125,7 +125,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
     def seed():
         return np.random.default_rng(5) if random_seed else None
 
-    blocks, advance = itertools.count(), chain_run.ChainRun._advance
+    blocks, advance = itertools.count(), chain_task.ChainTask._advance
 
     def die(self):
         if next(blocks) == 5:
@@ -133,7 +133,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(chain_run.ChainRun, "_advance", die)
+        patch.setattr(chain_task.ChainTask, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
     assert (tmp_path / "chain-0.log").stat().st_size > 10_000
@@ -184,17 +184,17 @@ def test_a_checkpoint_of_other_data(tmp_path):
 
 def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
     asked = SMALL | {"discard_tuned_samples": False, "checkpoint": tmp_path}
-    ended, looks = Crew.ended, itertools.count()
+    finished, looks = ChainPool.finished, itertools.count()
 
-    def interrupted(crew, *others):
-        while min(run.done for run in crew.at_work.values()) < 1:
+    def interrupted(pool, *others):
+        while min(task.n_done for task in pool.running.values()) < 1:
             time.sleep(0.001)
         next(looks)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Crew, "ended", interrupted)
+    monkeypatch.setattr(ChainPool, "finished", interrupted)
     part = sample_dram(small, **asked)
-    monkeypatch.setattr(Crew, "ended", ended)
+    monkeypatch.setattr(ChainPool, "finished", finished)
     assert_identical(
         sample_dram(small, **asked), sample_dram(small, **asked | {"checkpoint": None})
     )

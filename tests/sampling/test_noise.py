@@ -41,9 +41,9 @@ def sample(step, draws, cores=1):
 class Redrawing(DRAM):
     """The common mistake: the current point's likelihood is estimated anew."""
 
-    def _stand_at(self, point):
+    def _move_to(self, point):
         self._has_started = False
-        return super()._stand_at(point)
+        return super()._move_to(point)
 
 
 def deviations(idata):

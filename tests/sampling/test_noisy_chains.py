@@ -10,7 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.state import STAGE
-from pymc_statespace_filters.sampling.run.chain import RunningChain
+from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.autoregression import autoregression
@@ -234,12 +234,11 @@ def test_the_noise_of_a_proposal_is_as_correlated_as_it_is_asked_to_be():
     settings = DRAMSettings(stages=1, correlation=0.9)
     target = Target(linear_model(psf.EnKF(30)), None, settings)
     target.prepare()
-    chain = RunningChain(target, 200, 0)
+    chain = Chain(target, np.array([1, 2], dtype=np.uint64), 200, 0)
     chain.start([np.array([0.7, -0.4])], (), np.random.default_rng(1))
-    random = target.random(np.array([1, 2], dtype=np.uint64), 0)
     before, agreements = chain.state.carried.copy(), []
     for i in range(200):
-        chain.advance(False, random, i, i, 1)
+        chain.advance(False, i, i, 1)
         if chain.draws.counts[i, STAGE]:
             agreements.append(np.corrcoef(before, chain.state.carried)[0, 1])
         else:

@@ -12,7 +12,7 @@ from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
 from pymc_statespace_filters.sampling.particle_number.search import Row
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.sampling.autoregression import autoregression
 from tests.test_readme import run_code_of
 
@@ -34,8 +34,10 @@ def exact_mode():
     """Parameters at the highest exact density on the unconstrained space."""
     model = linear_model(psf.EKF())
     point = model.initial_point()
-    held, logp = HeldVariables(model.value_vars, point), model.compile_logp()
-    best = minimize(lambda x: -logp(held.split(x)), held.join(point), method="Nelder-Mead").x
+    raveled, logp = RaveledVariables(model.value_vars, point), model.compile_logp()
+    best = minimize(
+        lambda x: -logp(raveled.unravel(x)), raveled.ravel(point), method="Nelder-Mead"
+    ).x
     return {"phi": best[0], "spread": np.exp(best[1])}
 
 

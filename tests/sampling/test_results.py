@@ -12,9 +12,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.output import deterministics as of_quantities
-from pymc_statespace_filters.sampling.output.datatree import ChainDraws, to_datatree
-from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Quantities
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.output.datatree import to_datatree
+from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Deterministics
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 
@@ -22,7 +22,7 @@ TUNE, DRAWS = 30, 40
 
 
 def held_of(model):
-    return HeldVariables(model.value_vars, model.initial_point(0))
+    return RaveledVariables(model.value_vars, model.initial_point(0))
 
 
 def rich_model():
@@ -61,7 +61,7 @@ def chains_of(tree, model):
             name: np.concatenate([ds[name][chain].to_numpy() for ds in stats_of])
             for name in stats_of[0].data_vars
         }
-        chains.append(ChainDraws(np.concatenate(columns, axis=1), stats))
+        chains.append((np.concatenate(columns, axis=1), stats))
     return chains
 
 
@@ -142,7 +142,7 @@ def normal_model():
 def some_chains(*lengths, dim=2, **stats):
     rng = np.random.default_rng(7)
     return [
-        ChainDraws(
+        (
             rng.normal(size=(n, dim)),
             {"lp": rng.normal(size=n)}
             | {k: np.broadcast_to(v, (n, *v.shape)) for k, v in stats.items()},
@@ -217,7 +217,7 @@ def test_what_is_the_same_for_all_draws_is_stored_once_a_chain():
 def checked(model, positions):
     """Quantities of a model, compared with PyMC's own function of a point."""
     held = held_of(model)
-    found = Quantities(model, held)(positions)
+    found = Deterministics(model, held)(positions)
     wanted = [v for v in model.unobserved_value_vars if not v.name.endswith("__")]
     reference = model.compile_fn(
         wanted, inputs=model.value_vars, point_fn=False, on_unused_input="ignore"
@@ -246,7 +246,7 @@ def test_quantities_of_many_blocks_with_repeated_positions():
 
 def test_a_repeated_position_is_not_evaluated_again():
     model = normal_model()
-    quantities = Quantities(model, held_of(model))
+    quantities = Deterministics(model, held_of(model))
     evaluate, seen = quantities._evaluators[0], []
 
     class Watched:
@@ -287,7 +287,7 @@ def test_numbers_are_as_stable_as_in_pm_sample():
 def test_nothing_is_compiled_for_simple_models(monkeypatch):
     monkeypatch.setattr(of_quantities, "_OneByOne", None)
     model = normal_model()
-    assert Quantities(model, held_of(model)).names == ["mu", "sigma", "ratio"]
+    assert Deterministics(model, held_of(model)).names == ["mu", "sigma", "ratio"]
 
 
 def test_one_by_one_with_and_without_machine_code(monkeypatch):
@@ -317,7 +317,7 @@ def state_space():
         pm.Deterministic("log_likelihood_of_d", pm.logp(d, data).sum())
     positions = np.random.default_rng(5).normal(0.5, 0.2, size=(2, 300, 1))
     logp = model.compile_logp()
-    chains = [ChainDraws(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
+    chains = [(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
     tree = to_datatree(
         model, held_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
     )

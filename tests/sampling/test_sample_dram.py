@@ -396,7 +396,7 @@ def test_convergence_is_judged_if_it_is_asked_for(asked, caplog):
     assert caplog.text.count("accepted 0 of") == 2
 
 
-@pytest.mark.parametrize("last", ["at_the_highest_draw", "run_convergence_checks"])
+@pytest.mark.parametrize("last", ["spread_at_highest_draw", "run_convergence_checks"])
 def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
     def interrupted(*arguments):
         raise KeyboardInterrupt

@@ -152,7 +152,7 @@ def test_held_noise_is_made_once_and_gives_what_its_seed_gives(filter):
     model = linear_model(filter)
     seeds, start = noise_seeds(model), model.initial_point(random_seed=0)
     by_seed, by_normals = (
-        LogDensity(model, model.value_vars, start, seeds, holds_noise=holds)
+        LogDensity(model, model.value_vars, start, seeds, fixed_noise=holds)
         for holds in (False, True)
     )
     made_inside = {type(n.op) for n in by_normals._function.maker.fgraph.apply_nodes}
