@@ -76,9 +76,7 @@ def disagreements(comm):
 def test_ranks_that_make_different_calls_are_told():
     zero, one = on_ranks(2, disagreements)
     assert zero == one
-    said = [
-        re.search("rank 1 of 2 was asked .* than rank 0: (.*);", text).group(1) for text in zero
-    ]
+    said = [re.search("rank 1 of 2 and rank 0 differ in (.*);", text).group(1) for text in zero]
     assert said[:6] == [
         "draws", "random_seed", "checkpoint", "gather", "ranks_per_chain", "initvals"
     ]  # fmt: skip

@@ -191,7 +191,7 @@ def test_ranks_that_differ_may_run_chains():
 
 def test_ranks_that_differ_may_not_share_a_likelihood():
     reports = [HERE, HERE | {"processor": "skylake"}]
-    words = "alike, but differ: processor znver3 on rank 0, skylake on rank 1. .*NUMBA_CPU_NAME="
+    words = "same environment, got processor znver3 on rank 0, skylake on rank 1. .*NUMBA_CPU_NAME="
     for rank in range(2):
         with pytest.raises(psf.ParallelError, match=words):
             environment.check_environments(reports, rank, in_lockstep=True)

@@ -73,14 +73,14 @@ def test_a_variance_that_does_not_fall_is_named_after_few_numbers():
     rows, suggested, reading = budget(lambda n: 30.0 + 100.0 / n, 100)
     assert len(rows) <= 3
     assert suggested is rows[-1]
-    assert "does not come down to 3.3: it is 31 with 100 particles and 30." in reading
+    assert "does not decrease to 3.3: it is 31 with 100 particles and 30." in reading
 
 
 def test_a_variance_that_falls_too_slowly_ends_at_the_largest_number():
     rows, suggested, reading = budget(lambda n: 5000.0 / n**0.5, 100)
     assert suggested is rows[-1]
     assert rows[-1].n_particles <= 64 * 250
-    assert "does not come down" in reading
+    assert "does not decrease" in reading
 
 
 def test_too_little_noise_at_ten_particles_is_no_fault():

@@ -49,7 +49,7 @@ def both_ways(model, caplog, **settings):
             "proposal_cov",
         ),
         (runaway(), {"draws": 500, "tune": 1000}, "proposals of free have become", "proper prior"),
-        (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "cut off"),
+        (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "truncated"),
     ],
 )
 def test_chains_name_themselves_and_the_cure(model, settings, found, cure, caplog):
@@ -89,7 +89,7 @@ def test_stays_are_counted_at_once_and_one_by_one(stages, longest):
     for row in range(len(stages)):
         record = record.include(draws, row)
     assert whole == record
-    assert whole.longest_stay == longest
+    assert whole.longest_dwell == longest
 
 
 def test_a_stay_of_a_fifth_of_the_draws_is_said():
@@ -97,7 +97,7 @@ def test_a_stay_of_a_fifth_of_the_draws_is_said():
     stuck = np.concatenate([moving, [1], np.zeros(205, dtype=int), [1]])
     assert closing_warning(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
     warning = closing_warning(PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck)))
-    assert "stood at one point for 206 of 1007 draws" in warning.message
+    assert "stayed at one point for 206 of 1007 draws" in warning.message
     assert "more particles" in warning.message
     # Of few draws a fifth is soon passed by chance.
     few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])

@@ -119,7 +119,9 @@ def test_in_processes_the_seeds_are_the_same(toy):
 def test_all_that_the_noise_depends_on_must_be_held(toy):
     with toy(noise_sd=1.3) as model:
         other = pm.Normal("other")
-        with pytest.raises(ModelError, match=r"noisy likelihood of d also depends on mu"):
+        with pytest.raises(
+            ModelError, match=r"vars must include mu: the noisy likelihood of d depends"
+        ):
             DRAM([other])
         DRAM([model["mu"]])
 

@@ -11,7 +11,7 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.output import deterministics as of_quantities
+from pymc_statespace_filters.sampling.output import deterministics
 from pymc_statespace_filters.sampling.output.datatree import to_datatree
 from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Deterministics
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
@@ -175,8 +175,8 @@ def test_interrupted_chains(lengths, keep_warmup, chosen, warmup, draws):
         for place, i in enumerate(chosen if n else []):
             cut = slice(start, start + n)
             mu, lp = tree[f"{group}posterior"]["mu"], tree[f"{group}sample_stats"]["lp"]
-            np.testing.assert_array_equal(mu[place], chains[i].positions[cut, 0])
-            np.testing.assert_array_equal(lp[place], chains[i].stats["lp"][cut])
+            np.testing.assert_array_equal(mu[place], chains[i][0][cut, 0])
+            np.testing.assert_array_equal(lp[place], chains[i][1]["lp"][cut])
             assert len(mu) == len(chosen)
 
 
@@ -285,13 +285,13 @@ def test_numbers_are_as_stable_as_in_pm_sample():
 
 
 def test_nothing_is_compiled_for_simple_models(monkeypatch):
-    monkeypatch.setattr(of_quantities, "_OneByOne", None)
+    monkeypatch.setattr(deterministics, "_PerPosition", None)
     model = normal_model()
     assert Deterministics(model, held_of(model)).names == ["mu", "sigma", "ratio"]
 
 
 def test_one_by_one_with_and_without_machine_code(monkeypatch):
-    monkeypatch.setattr(of_quantities, "_is_of_blocks", lambda graph: False)
+    monkeypatch.setattr(deterministics, "_is_vectorizable", lambda graph: False)
     model = normal_model()
     with model:
         data = pm.Data("data", [1.0, 2.0])

@@ -140,7 +140,9 @@ def test_failures_come_with_the_filters_reason(filter):
 def test_a_filter_needs_all_its_parameters_held():
     with (
         linear_model(FEW) as model,
-        pytest.raises(ModelError, match=r"of d also depends on spread"),
+        pytest.raises(
+            ModelError, match=r"vars must include spread: the noisy likelihood of d depends"
+        ),
     ):
         DRAM([model["phi"]])
     with linear_model(psf.EKF()) as model:

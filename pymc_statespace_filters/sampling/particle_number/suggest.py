@@ -179,7 +179,6 @@ class _NoisyLikelihood:
     ----------
     name : str
     filter : filter
-        The model's own.
     """
 
     def __init__(self, model: Model, var_name: str | None, rng: np.random.Generator):

@@ -145,10 +145,7 @@ class Chain:
         return failures
 
     def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
-        """Measure the spread of the estimates at a point over seeds, shape (R, noisy).
-
-        The state does not change. Raises what `start` raises.
-        """
+        """Measure the spread of estimates at a point over seeds, shape (R, noisy); as `start`."""
 
         def evaluate(*arguments: Any) -> Evaluation:
             self._check_pause()
@@ -162,8 +159,7 @@ class Chain:
     def evaluate_again(self, others: Sequence[np.ndarray]) -> int:
         """Evaluate the current point and noise after other variables moved; its failure code.
 
-        If the log-density of the screen is now minus infinity, no move is accepted until the other
-        variables move again.
+        If the screen's log-density is minus infinity there, no move is accepted until they move.
         """
         self._density.correlation[...] = 1.0
         position, seeds = self.state.position.copy(), self.state.seeds.copy()

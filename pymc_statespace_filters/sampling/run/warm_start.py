@@ -43,7 +43,7 @@ def warm_started(
     """
     for name in ("initvals", "proposal_cov"):
         if getattr(request, name) is not None:
-            raise ModelError(f"{name} must be None with a pilot, which gives it")
+            raise ModelError(f"{name} must be None with a pilot, which determines it")
     if not continuous_value_vars(None, model):
         return request  # the run itself raises that there is nothing to sample
     try:
@@ -53,12 +53,12 @@ def warm_started(
     posterior = posterior_group(pilot)
     cov = _covariance(draws.reshape(-1, draws.shape[-1]))
     names = [rv.name for rv in model.free_RVs]
-    learnt = [c for c in _learnt_covs(pilot, len(cov)) if _is_plausible(c, cov)]
+    adapted = [c for c in _adapted_covs(pilot, len(cov)) if _is_plausible(c, cov)]
     # A quarter of a block is longer than the warm-up, so that the proposals never change.
     without_adaptation = replace(request.settings, adapt_every=4 * request.tune + 4)
     return request._replace(
         initvals=_starts(posterior, names, request.chains),
-        proposal_cov=_rounded(np.mean(learnt or [cov], axis=0)),
+        proposal_cov=_rounded(np.mean(adapted or [cov], axis=0)),
         settings=request.settings if adapts else without_adaptation,
     )
 
@@ -78,7 +78,7 @@ def _covariance(positions: np.ndarray) -> np.ndarray:
     return cov * 2.38**2 / dim
 
 
-def _learnt_covs(pilot: xr.DataTree, dim: int) -> list[np.ndarray]:
+def _adapted_covs(pilot: xr.DataTree, dim: int) -> list[np.ndarray]:
     """Last proposal covariance of each chain of the pilot, if it recorded any.
 
     For a curved posterior the adapted covariance is smaller than the covariance of all draws gives,
@@ -94,11 +94,11 @@ def _learnt_covs(pilot: xr.DataTree, dim: int) -> list[np.ndarray]:
     return list(last) if last.shape[1:] == (dim, dim) else []
 
 
-def _is_plausible(learnt: np.ndarray, cov: np.ndarray) -> bool:
+def _is_plausible(adapted: np.ndarray, cov: np.ndarray) -> bool:
     """Whether a proposal covariance fits the draws, in the same order and transforms."""
-    if not np.isfinite(learnt).all():
+    if not np.isfinite(adapted).all():
         return False
-    ratios = scipy.linalg.eigvalsh(learnt, cov)
+    ratios = scipy.linalg.eigvalsh(adapted, cov)
     return bool(LEAST_RATIO < ratios.min() and ratios.max() < LARGEST_RATIO)
 
 

@@ -69,7 +69,7 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
     filters = noisy_filters(model)
     if not filters:
         raise ModelError(
-            f"ranks_per_chain must be 1 for a model without a StateSpace variable whose filter has "
+            "ranks_per_chain must be 1 for a model without a StateSpace variable whose filter has "
             f"particles, got {n_ranks}"
         )
     for filter in filters.values():
@@ -91,7 +91,7 @@ class Leader:
         self._comm = comm
         self._name = next(_leader_numbers)  # a group may have a leader for each model
         self._likelihoods = likelihoods
-        self._evaluators = [shared_evaluator(*of, comm) for of in likelihoods]
+        self._evaluators = [shared_evaluator(*likelihood, comm) for likelihood in likelihoods]
         self._sent: dict[int, bytes] = {}
         self._callback = PythonCallback(self._evaluate)
 
@@ -117,9 +117,7 @@ class Leader:
     ) -> tuple[np.ndarray, np.ndarray]:
         record = _RecordArrays(steps, observed, inputs, t0)
         content = pickle.dumps(record)
-        if (
-            self._sent.get(number) != content
-        ):  # once, unless the record depends on sampled variables
+        if self._sent.get(number) != content:  # once, unless it depends on sampled variables
             self._send_record(number, record)
             self._sent[number] = content
         with deferred_interrupts() as interrupted:  # the followers wait in every allgather
@@ -182,17 +180,17 @@ def follow(comm: Communicator) -> None:
         What an evaluation raised here. It ends the whole job, as the others wait for this rank.
     """
     failure = None
-    known: dict[Any, tuple[Callable, _RecordArrays]] = {}
+    evaluators: dict[Any, tuple[Callable, _RecordArrays]] = {}
     with ignored_interrupts():
         while (message := _receive(comm)).kind != _END:
             if message.kind == _EVALUATE:
                 name, theta, seed = message.value
-                evaluate, record = known[name]
+                evaluate, record = evaluators[name]
                 _evaluate_or_abort(comm, evaluate, theta, *record, seed)
                 continue
             name, system, filter, record = message.value
             try:
-                known[name] = shared_evaluator(system, filter, comm), record
+                evaluators[name] = shared_evaluator(system, filter, comm), record
                 comm.send(message.source, _READY)
             except Exception as error:
                 failure = error
