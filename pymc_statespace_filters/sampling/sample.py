@@ -69,11 +69,11 @@ def sample_dram(
         ``tune > 0``, the best of a few draws from the prior.
     pilot : xarray.DataTree, optional
         Draws from a posterior close to the model's, such as that of the same parameters with a
-        cheaper filter. Chains start at the last draws of its chains. The proposal covariance is the
-        last one of its chains if they were sampled by DRAM, else that of the draws, and it is not
-        adapted unless ``adapt_every`` or ``adaptation`` is given. A mode that the pilot has missed
-        is missed again. With ``checkpoint`` the pilot must be the same in each call; with ``comm``
-        all ranks pass it (``gather="all"``).
+        cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is
+        the one that its chains used last, if they were sampled and adapted by DRAM, else that of
+        its draws; it is adapted only if ``adapt_every`` or ``adaptation`` is given. A mode that the
+        pilot has missed is missed again. With ``checkpoint`` the pilot must be the same in each
+        call; with ``comm`` all ranks pass it (``gather="all"``).
     progressbar : bool or str
         As in ``pm.sample``.
     discard_tuned_samples : bool
