@@ -21,7 +21,7 @@ from tests.sampling.test_dram import sample
 TUNE, DRAWS = 30, 40
 
 
-def held_of(model):
+def raveled_of(model):
     return RaveledVariables(model.value_vars, model.initial_point(0))
 
 
@@ -101,7 +101,7 @@ def assert_same(found, expected):
 def test_equals_the_tree_of_pm_sample(sampled):
     model, expected, chains = sampled
     found = to_datatree(
-        model, held_of(model), [*chains], tune=TUNE, keep_warmup=True, sampling_time=1.5
+        model, raveled_of(model), [*chains], tune=TUNE, keep_warmup=True, sampling_time=1.5
     )
     assert_same(found, expected)
     assert {"posterior", "warmup_posterior", "constant_data"} < set(found.children)
@@ -114,7 +114,7 @@ def test_warmup_is_left_out_on_request(sampled):
     model, expected, chains = sampled
     found = to_datatree(
         model,
-        held_of(model),
+        raveled_of(model),
         [*chains],
         tune=TUNE,
         keep_warmup=False,
@@ -166,7 +166,7 @@ def some_chains(*lengths, dim=2, **stats):
 def test_interrupted_chains(lengths, keep_warmup, chosen, warmup, draws):
     model, chains = normal_model(), some_chains(*lengths)
     tree = to_datatree(
-        model, held_of(model), [*chains], tune=20, keep_warmup=keep_warmup, sampling_time=1.0
+        model, raveled_of(model), [*chains], tune=20, keep_warmup=keep_warmup, sampling_time=1.0
     )
     begin = 0 if keep_warmup else 20
     for group, n, start in (("warmup_", warmup, begin), ("", draws, begin + warmup)):
@@ -187,7 +187,7 @@ def test_nothing_to_return(lengths, keep_warmup):
     with pytest.raises(ModelError, match=message):
         to_datatree(
             model,
-            held_of(model),
+            raveled_of(model),
             some_chains(*lengths),
             tune=20,
             keep_warmup=keep_warmup,
@@ -199,9 +199,9 @@ def test_what_is_the_same_for_all_draws_is_stored_once_a_chain():
     model = normal_model()
     cov = np.array([[2.0, 0.5], [0.5, 1.0]])
     first, second = some_chains(50, 50, proposal_cov=cov)
-    second.stats["proposal_cov"] = np.broadcast_to(3 * cov, (50, 2, 2))
+    second[1]["proposal_cov"] = np.broadcast_to(3 * cov, (50, 2, 2))
     arguments = {"tune": 20, "keep_warmup": True, "sampling_time": 1.0}
-    tree = to_datatree(model, held_of(model), [first, second], **arguments)
+    tree = to_datatree(model, raveled_of(model), [first, second], **arguments)
     for group, n in (("sample_stats", 30), ("warmup_sample_stats", 20)):
         found = tree[group]["proposal_cov"]
         assert found.dims == ("chain", "draw", "proposal_cov_dim_0", "proposal_cov_dim_1")
@@ -209,22 +209,22 @@ def test_what_is_the_same_for_all_draws_is_stored_once_a_chain():
         np.testing.assert_array_equal(found, expected)
         assert found.to_numpy().strides[1] == 0
     # Written out in full, the same tree.
-    for chain in (first, second):
-        chain.stats["proposal_cov"] = chain.stats["proposal_cov"].copy()
-    assert_same(tree, to_datatree(model, held_of(model), [first, second], **arguments))
+    for _, stats in (first, second):
+        stats["proposal_cov"] = stats["proposal_cov"].copy()
+    assert_same(tree, to_datatree(model, raveled_of(model), [first, second], **arguments))
 
 
 def checked(model, positions):
     """Quantities of a model, compared with PyMC's own function of a point."""
-    held = held_of(model)
-    found = Deterministics(model, held)(positions)
+    raveled = raveled_of(model)
+    found = Deterministics(model, raveled)(positions)
     wanted = [v for v in model.unobserved_value_vars if not v.name.endswith("__")]
     reference = model.compile_fn(
         wanted, inputs=model.value_vars, point_fn=False, on_unused_input="ignore"
     )
     assert list(found) == [v.name for v in wanted]
     for i in {0, 1, len(positions) // 2, len(positions) - 1}:
-        values = reference(**held.split(positions[i]))
+        values = reference(**raveled.unravel(positions[i]))
         for name, value in zip(found, values, strict=True):
             assert found[name].shape == (len(positions), *np.shape(value)), name
             assert found[name].dtype == np.asarray(value).dtype, name
@@ -246,7 +246,7 @@ def test_quantities_of_many_blocks_with_repeated_positions():
 
 def test_a_repeated_position_is_not_evaluated_again():
     model = normal_model()
-    quantities = Deterministics(model, held_of(model))
+    quantities = Deterministics(model, raveled_of(model))
     evaluate, seen = quantities._evaluators[0], []
 
     class Watched:
@@ -287,7 +287,7 @@ def test_numbers_are_as_stable_as_in_pm_sample():
 def test_nothing_is_compiled_for_simple_models(monkeypatch):
     monkeypatch.setattr(deterministics, "_PerPosition", None)
     model = normal_model()
-    assert Deterministics(model, held_of(model)).names == ["mu", "sigma", "ratio"]
+    assert Deterministics(model, raveled_of(model)).names == ["mu", "sigma", "ratio"]
 
 
 def test_one_by_one_with_and_without_machine_code(monkeypatch):
@@ -319,7 +319,7 @@ def state_space():
     logp = model.compile_logp()
     chains = [(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
     tree = to_datatree(
-        model, held_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
+        model, raveled_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
     )
     return model, tree
 
