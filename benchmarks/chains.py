@@ -72,11 +72,11 @@ def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
         work()
         return time.process_time() - start
 
-    run(**nothing), evaluations(bound.density, 1)
+    run(**nothing), evaluations(bound.native, 1)
     rounds = [
         taken(lambda: run(**long))
         - taken(lambda: run(**nothing))
-        - taken(lambda: evaluations(bound.density, n))
+        - taken(lambda: evaluations(bound.native, n))
         for _ in range(ROUNDS)
     ]
     return 1e6 * median(rounds) / n

@@ -1,1 +1,1 @@
-"""Processes and processors: MPI, communicators, cores, signals."""
+"""MPI communicators, processor cores and signals."""

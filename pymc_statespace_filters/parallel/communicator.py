@@ -1,6 +1,6 @@
-"""Ranks: the processes that mpiexec started, as the rest of the package sees them.
+"""`Communicator`: collectives, messages and groups of MPI ranks, for the rest of the package.
 
-Without a communicator there is a single rank, for which nothing is sent.
+Without MPI there is a single rank, and nothing is sent.
 """
 
 import sys
@@ -13,21 +13,21 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 
 from pymc_statespace_filters.errors import ParallelError
-from pymc_statespace_filters.parallel.allgather import Exchange
-from pymc_statespace_filters.parallel.environment import check_alike, describe_environment
-from pymc_statespace_filters.parallel.mpi import check_threads, communicator, mpi
+from pymc_statespace_filters.parallel.allgather import ColumnAllgather
+from pymc_statespace_filters.parallel.environment import check_environments, describe_environment
+from pymc_statespace_filters.parallel.mpi import check_threads, mpi, mpi_communicator
 
 Result = TypeVar("Result")
 
-# How long a rank that waits for others sleeps between two looks: a busy one takes a core.
-_NAP_SECONDS = 0.005
-# So long the others let the rank that failed speak first: the first to end may end the whole job.
-LAST_WORDS_SECONDS = 1.0
-_MOST_BYTES = 2**28  # of one message
+# Interval at which a waiting rank polls: polling without a pause takes a core.
+_POLL_SECONDS = 0.005
+# Time for the failed rank to report first, because the first rank to end may end the whole job.
+ABORT_GRACE_SECONDS = 1.0
+_MAX_BYTES = 2**28  # of one message
 
 
 class Message(NamedTuple):
-    """What a rank was sent: by whom, of what kind, and the value."""
+    """A message from another rank."""
 
     source: int
     kind: str
@@ -35,7 +35,7 @@ class Message(NamedTuple):
 
 
 class Communicator:
-    """A rank among others, with a communicator of its own; a context manager.
+    """A group of MPI ranks, as seen from one of them; a context manager.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Communicator:
     """
 
     def __init__(self, comm: Any = None):
-        # A duplicate: our messages are never taken for the user's.
+        # A duplicate, so that our messages cannot be received by the user's code.
         self._comm: Any = None if comm is None or comm.Get_size() == 1 else comm.Dup()
         self.rank: int = 0 if self._comm is None else self._comm.Get_rank()
         self.size: int = 1 if self._comm is None else self._comm.Get_size()
@@ -59,26 +59,26 @@ class Communicator:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        # After an error the others may never come here, and all must for a communicator to go.
+        # Freeing is collective, and after an error the other ranks may never get here.
         if kind is None:
             self.close()
 
     def close(self) -> None:
-        """Give the communicator back, on all ranks."""
+        """Free the communicator, on all ranks."""
         if self._comm is not None:
             for request in self._sent:
                 request.wait()
             self._comm.Free()
             self._comm = None
 
-    # All ranks at once
+    # Collectives
 
     def barrier(self) -> None:
-        """Wait until every rank is here, without keeping a core busy."""
+        """Wait for all ranks without keeping a core busy."""
         if self._comm is not None:
             request = self._comm.Ibarrier()
             while not request.Test():
-                time.sleep(_NAP_SECONDS)
+                time.sleep(_POLL_SECONDS)
 
     def allgather(self, value: Any) -> list[Any]:
         """The values of all ranks, on all of them."""
@@ -111,7 +111,7 @@ class Communicator:
         reports = self.allgather(None if failure is None else describe_error(failure))
         failed = [rank for rank, report in enumerate(reports) if report is not None]
         if failed and self.rank != failed[0]:
-            time.sleep(LAST_WORDS_SECONDS)
+            time.sleep(ABORT_GRACE_SECONDS)
         if failure is not None:
             if self._comm is not None:
                 failure.add_note(f"on rank {self.rank} of {self.size}")
@@ -122,15 +122,15 @@ class Communicator:
             )
         return result
 
-    # Messages from one rank to another
+    # Messages between two ranks
 
     def send(self, to: int, kind: str, value: Any = None) -> None:
-        """Send a message, and go on at once."""
+        """Send a message without waiting for its receipt."""
         self._sent = [request for request in self._sent if not request.Test()]
         self._sent.append(self._comm.isend((kind, value), to))
 
     def receive(self) -> Message | None:
-        """Take the next message, if there is one."""
+        """Receive the next message, if there is one."""
         if self._comm is None:
             return None
         status = mpi().Status()
@@ -138,17 +138,17 @@ class Communicator:
         return None if found is None else Message(status.source, *found.recv())
 
     def send_arrays(self, to: int, arrays: Sequence[np.ndarray]) -> None:
-        """Send contiguous arrays, and wait until they are taken."""
+        """Send contiguous arrays, and wait for their receipt."""
         for piece in _pieces(arrays):
             self._comm.Send(piece, to, _ARRAYS)
 
     def receive_arrays(self, source: int, arrays: Sequence[np.ndarray]) -> None:
-        """Fill contiguous arrays with those that a rank sends."""
+        """Receive arrays from a rank into contiguous ones."""
         for piece in _pieces(arrays):
             self._comm.Recv(piece, source, _ARRAYS)
 
     def abort(self, error: BaseException) -> None:
-        """End the whole job, saying why: others wait for this rank, which will never come."""
+        """Print the error and end the whole job, in which other ranks wait for this one."""
         print_exception(error)
         sys.stderr.flush()
         mpi().COMM_WORLD.Abort(1)
@@ -160,10 +160,10 @@ class Communicator:
 
         Returns
         -------
-        Ranks
+        Communicator
             The group of this rank.
-        Ranks or None
-            The first rank of every group, among themselves; None on the others.
+        Communicator or None
+            The first ranks of all groups; None on the other ranks.
         """
         if self._comm is None or size == 1:
             return Communicator(), Communicator(self._comm)
@@ -174,68 +174,71 @@ class Communicator:
         return group, Communicator._owning(leaders) if leads else None
 
     def node_local(self, value: Any = None) -> tuple[int, list[Any]]:
-        """Place among the ranks that share this computer's memory, and the values of all these."""
+        """Rank among those on this computer, and the values of all of them."""
         if self._comm is None:
             return 0, [value]
         local = self._comm.Split_type(mpi().COMM_TYPE_SHARED)
-        place, values = local.Get_rank(), local.allgather(value)
+        rank, values = local.Get_rank(), local.allgather(value)
         local.Free()
-        return place, values
+        return rank, values
 
     @classmethod
     def _owning(cls, comm: Any) -> "Communicator":
-        ranks = cls()
-        ranks._comm, ranks.rank, ranks.size = comm, comm.Get_rank(), comm.Get_size()
-        return ranks
+        """Wrap a communicator without duplicating it."""
+        owner = cls()
+        owner._comm, owner.rank, owner.size = comm, comm.Get_rank(), comm.Get_size()
+        return owner
 
-    # Arrays of which every rank has some columns
+    # Allgather of array columns by machine code
 
     @property
     def exchange(self) -> int:
-        """Address of the function that completes arrays, see `filters._share`; 0 for one rank."""
-        return 0 if self._comm is None else self._exchange.address
+        """Address of the function that gathers the columns of an array; 0 for one rank."""
+        return 0 if self._comm is None else self._column_allgather.address
 
     def check_exchange(self) -> None:
-        """Raise what an exchange met: it is called by machine code, which knows no exceptions."""
-        if self._comm is not None and self._exchange.error is not None:
-            error, self._exchange.error = self._exchange.error, None
+        """Raise the exception of that function, which machine code cannot raise."""
+        if self._comm is not None and self._column_allgather.error is not None:
+            error, self._column_allgather.error = self._column_allgather.error, None
             raise error
 
     @cached_property
-    def _exchange(self) -> Exchange:
-        return Exchange(self._comm)
+    def _column_allgather(self) -> ColumnAllgather:
+        return ColumnAllgather(self._comm)
 
 
 def communicator_of(comm: Any, *, in_lockstep: bool = True) -> Communicator:
-    """The ranks of a communicator, all of which call this.
+    """Make a `Communicator` of the argument ``comm``, on all its ranks.
 
     Parameters
     ----------
     comm : None, "world", or mpi4py.MPI.Intracomm
-        "world" are all ranks that mpiexec started, or this process alone without mpiexec.
+        "world" is all ranks that mpiexec started, or this process alone without mpiexec.
     in_lockstep : bool
-        Whether several ranks will evaluate one likelihood, for which they must be alike.
+        Whether several ranks will evaluate one likelihood, so that their environments must be
+        equal.
 
     Raises
     ------
     ModelError
         If it is something else.
     ParallelError
-        If MPI cannot be had as it was asked for, or ranks in lockstep are not alike.
+        If MPI is not available, or the environments of ranks in lockstep differ.
 
     Warns
     -----
     ParallelWarning
-        If other ranks are not alike.
+        If the environments of other ranks differ.
     """
-    ranks = Communicator(communicator(comm))
-    if ranks.size > 1:
-        check_alike(ranks.allgather(describe_environment()), ranks.rank, in_lockstep=in_lockstep)
-    return ranks
+    communicator = Communicator(mpi_communicator(comm))
+    if communicator.size > 1:
+        environments = communicator.allgather(describe_environment())
+        check_environments(environments, communicator.rank, in_lockstep=in_lockstep)
+    return communicator
 
 
 def describe_error(error: BaseException) -> str:
-    """An error in one line: its type, its message and its notes."""
+    """Describe an error in one line: type, message and notes."""
     notes = "; ".join(getattr(error, "__notes__", ()))
     return f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")
 
@@ -247,5 +250,5 @@ def _pieces(arrays: Sequence[np.ndarray]) -> "Sequence[memoryview]":
     pieces = []
     for array in arrays:
         view = memoryview(array).cast("B") if array.size else memoryview(b"")
-        pieces += [view[i : i + _MOST_BYTES] for i in range(0, len(view), _MOST_BYTES)]
+        pieces += [view[i : i + _MAX_BYTES] for i in range(0, len(view), _MAX_BYTES)]
     return pieces

@@ -1,37 +1,39 @@
-"""How many threads of machine code this process may run at once."""
+"""The processor cores that this process may use."""
 
 import os
 from collections.abc import Sequence
 from fractions import Fraction
 
 
-def core_numbers() -> set[int]:
-    """Which processors this process may use."""
+def allowed_cores() -> set[int]:
+    """Numbers of the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return os.sched_getaffinity(0)
     return set(range(os.cpu_count() or 1))
 
 
 def available_cores() -> int:
-    """How many processors this process may use."""
-    return len(core_numbers())
+    """Number of cores that this process may use."""
+    return len(allowed_cores())
 
 
-def share_of_cores(process: int, used: Sequence[set[int]]) -> int:
-    """How many processors are left to one of several processes of a computer, at least 1.
+def cores_per_process(process: int, allowed: Sequence[set[int]]) -> int:
+    """Number of cores for one of several processes on a computer, at least 1.
 
-    A launcher may bind each to processors of its own, or let all use all of them.
+    A launcher may bind each process to different cores, or let all use all of them.
 
     Parameters
     ----------
     process : int
-    used : sequence of set of int
-        For every process, the numbers of the processors that it may use.
+    allowed : sequence of set of int
+        For every process, the numbers of the cores that it may use.
 
     Examples
     --------
-    >>> share_of_cores(0, [{0, 1, 2, 3}, {4, 5, 6, 7}]), share_of_cores(0, [{0, 1, 2, 3}] * 2)
-    (4, 2)
+    >>> cores_per_process(0, [{0, 1, 2, 3}, {4, 5, 6, 7}])
+    4
+    >>> cores_per_process(0, [{0, 1, 2, 3}] * 2)
+    2
     """
-    share = sum(Fraction(1, sum(core in others for others in used)) for core in used[process])
-    return max(1, int(share))
+    fractions = (Fraction(1, sum(core in cores for cores in allowed)) for core in allowed[process])
+    return max(1, int(sum(fractions)))

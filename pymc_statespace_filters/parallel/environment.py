@@ -1,4 +1,4 @@
-"""What the bits of a result depend on besides the model: versions, and the processor."""
+"""Versions and processor of this process, on which the last bits of a result depend."""
 
 import platform
 import warnings
@@ -20,8 +20,8 @@ _PACKAGES = (
     "scipy",
 )
 _PROCESSOR = "processor"
-# Without the features of a newer processor; what they cost is less than a measurement shows.
-_CURE = (
+# Without the instructions of newer processors; no loss of speed was measured.
+_ADVICE = (
     " Ranks on different x86 processors run the same machine code if all are started with "
     "NUMBA_CPU_NAME=x86-64-v3 and an empty NUMBA_CPU_FEATURES in the environment."
 )
@@ -29,9 +29,9 @@ _CURE = (
 
 @cache
 def describe_environment() -> dict[str, str]:
-    """What this process computes with, by name."""
+    """Versions of the software and kind of the processor, by name."""
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()
-    features = f"{crc32(features.encode()):08x}"  # some hundred names
+    features = f"{crc32(features.encode()):08x}"  # some hundred names, as a checksum
     return {
         "Python": platform.python_version(),
         **{package: version(package) for package in _PACKAGES},
@@ -40,54 +40,56 @@ def describe_environment() -> dict[str, str]:
     }
 
 
-def check_alike(reports: list[dict[str, str]], rank: int, *, in_lockstep: bool) -> None:
-    """Whether all ranks compute with the same.
+def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep: bool) -> None:
+    """Check that all ranks have the same software and processor.
 
     Parameters
     ----------
     reports : list of dict
-        The surroundings of every rank.
+        The environment of every rank, by `describe_environment`.
     rank : int
-        That of this process.
+        Of this process.
     in_lockstep : bool
-        Several ranks evaluate one likelihood: they must agree to the bit. Otherwise each runs
-        chains of its own, which other bits do not make wrong.
+        Whether several ranks evaluate one likelihood, so that their results must be bitwise equal.
+        Otherwise each runs whole chains, which are correct in any environment.
 
     Raises
     ------
     ParallelError
-        If they differ and go in lockstep.
+        If they differ and are in lockstep.
 
     Warns
     -----
     ParallelWarning
-        On rank 0, if they differ and do not.
+        On rank 0, if they differ and are not in lockstep.
     """
     found = "; ".join(_differences(reports))
     if not found:
         return
-    found += "." + (_CURE if _PROCESSOR in found else "")
+    found += "." + (_ADVICE if _PROCESSOR in found else "")
     if in_lockstep:
-        raise ParallelError(f"Ranks that share a likelihood must be alike, but differ: {found}")
+        raise ParallelError(
+            f"ranks that share a likelihood must have the same environment, got {found}"
+        )
     if rank == 0:
         warnings.warn(
-            f"The ranks differ: {found} The draws of a chain then depend on which rank runs it: "
-            "they are right, but not reproducible to the bit.",
+            f"The ranks differ: {found} The draws of a chain then depend on the rank that runs it: "
+            "they are correct, but not bitwise reproducible.",
             ParallelWarning,
             stacklevel=2,
         )
 
 
 def _differences(reports: list[dict[str, str]]) -> list[str]:
-    """Who has what, of all that is not the same everywhere."""
+    """For each property that differs between ranks, its values and their ranks."""
     differences = []
     for name in reports[0]:
         holders: dict[str, list[int]] = {}
         for rank, report in enumerate(reports):
             holders.setdefault(report[name], []).append(rank)
         if len(holders) > 1:
-            held = (f"{value} on {_named(ranks)}" for value, ranks in holders.items())
-            differences.append(f"{name} {', '.join(held)}")
+            values = (f"{value} on {_named(ranks)}" for value, ranks in holders.items())
+            differences.append(f"{name} {', '.join(values)}")
     return differences
 
 

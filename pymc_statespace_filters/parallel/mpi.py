@@ -1,6 +1,6 @@
-"""The launch: from what was asked for to a communicator, or to an error that says what to do.
+"""Access to MPI: the communicator for the argument ``comm``, with advice when it cannot be had.
 
-The only file that imports mpi4py, and only where a communicator was asked for.
+The only module that imports mpi4py, and only if a communicator is asked for.
 """
 
 import os
@@ -11,13 +11,13 @@ from pymc_statespace_filters.errors import ModelError, ParallelError
 
 WORLD = "world"
 
-# How many ranks were started, as they are told by the mpiexec of Open MPI, of MPICH and its
-# relatives, of MVAPICH, and by SLURM's srun.
+# Variables with the number of ranks, set by the mpiexec of Open MPI, of MPICH and its derivatives,
+# of MVAPICH, and by SLURM's srun.
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
-# Told to a rank by any launcher that speaks PMIx.
+# Set by any launcher that uses PMIx.
 _RANKS = ("PMIX_RANK",)
-# Modules that are there if the user's script, or `python -m mpi4py`, has asked for MPI.
-_ASKED_FOR = ("mpi4py.MPI", "mpi4py.run")
+# Modules that are loaded if the user's script, or `python -m mpi4py`, uses MPI.
+_MPI_MODULES = ("mpi4py.MPI", "mpi4py.run")
 
 
 def mpi() -> Any:
@@ -32,39 +32,37 @@ def mpi() -> Any:
         from mpi4py import MPI
     except ModuleNotFoundError as error:
         raise ParallelError(
-            f"MPI was asked for, and {error.name} is not installed. "
-            "Install it by `pip install mpi4py`."
+            f"MPI needs {error.name}, which is not installed: install it by `pip install mpi4py`"
         ) from error
     except (ImportError, RuntimeError) as error:
         raise ParallelError(
-            f"mpi4py was asked for and finds no MPI library ({str(error).splitlines()[0]}). "
-            "Install one by `pip install 'pymc-statespace-filters[mpi]'` or "
-            "`apt install openmpi-bin`; on a cluster load its own first, as by "
-            "`module load openmpi`."
+            f"mpi4py finds no MPI library ({str(error).splitlines()[0]}). Install one by "
+            "`pip install 'pymc-statespace-filters[mpi]'` or `apt install openmpi-bin`; on a "
+            "cluster load its own first, as by `module load openmpi`."
         ) from error
     return MPI
 
 
-def communicator(comm: Any) -> Any:
-    """The communicator that a user means by the argument ``comm``.
+def mpi_communicator(comm: Any) -> Any:
+    """Resolve the argument ``comm`` of public functions to a communicator of mpi4py.
 
     Parameters
     ----------
     comm : None, "world", or mpi4py.MPI.Intracomm
-        "world" are all ranks that were started together, or this process alone if it was started
-        neither by mpiexec nor by ``python -m mpi4py``: then mpi4py is not imported.
+        "world" is all ranks that were started together, or this process alone if it was started
+        neither by mpiexec nor by ``python -m mpi4py``, in which case mpi4py is not imported.
 
     Returns
     -------
     mpi4py.MPI.Intracomm or None
-        None is this process alone.
+        None stands for this process alone.
 
     Raises
     ------
     ModelError
         If it is something else, or a communicator that was freed.
     ParallelError
-        If MPI cannot be had, or was started in a way by which no rank sees the others.
+        If MPI is not available, or the launcher belongs to another MPI.
     """
     if comm is None:
         return None
@@ -75,63 +73,61 @@ def communicator(comm: Any) -> Any:
     loaded = sys.modules.get("mpi4py.MPI")
     if loaded is not None and isinstance(comm, loaded.Comm) and not comm:
         raise ModelError(
-            "comm must be a communicator that this rank belongs to, got MPI.COMM_NULL: "
-            "it was freed, or made by a Split that leaves this rank out."
+            "comm must be a communicator that this rank belongs to, got MPI.COMM_NULL: it was "
+            "freed, or made by a Split without this rank"
         )
     if loaded is None or not isinstance(comm, loaded.Intracomm):
         raise ModelError(
-            f"comm must be None, {WORLD!r} or an intracommunicator of mpi4py, got {comm!r}."
+            f"comm must be None, {WORLD!r} or an intracommunicator of mpi4py, got {comm!r}"
         )
     if not loaded.Is_initialized() or loaded.Is_finalized():
         when = "was already finalized" if loaded.Is_initialized() else "is not initialized"
-        raise ParallelError(
-            f"MPI {when}: comm cannot be used outside of MPI.Init and MPI.Finalize."
-        )
-    _check_that_ranks_meet(loaded)
+        raise ParallelError(f"comm must be used between MPI.Init and MPI.Finalize, but MPI {when}")
+    _check_launcher(loaded)
     return comm
 
 
 def check_threads() -> None:
-    """Threads of this process must be allowed to call MPI at the same time.
+    """Check that several threads of this process may call MPI at once.
 
     Raises
     ------
     ParallelError
-        If they are not.
+        If they may not.
     """
     loaded = mpi()
     if loaded.Query_thread() < loaded.THREAD_MULTIPLE:
         raise ParallelError(
             "Ranks that share a chain need an MPI that several threads may call at once "
-            "(MPI_THREAD_MULTIPLE), and it was started for fewer. Leave `mpi4py.rc.threads` and "
-            "`mpi4py.rc.thread_level`, or the variables MPI4PY_RC_THREADS and "
-            "MPI4PY_RC_THREAD_LEVEL, as mpi4py has them; if that is how they are, use "
-            "another MPI library, or ranks_per_chain=1."
+            "(MPI_THREAD_MULTIPLE), but it was initialized for a lower thread level. Leave "
+            "`mpi4py.rc.threads` and `mpi4py.rc.thread_level`, or the variables MPI4PY_RC_THREADS "
+            "and MPI4PY_RC_THREAD_LEVEL, at their defaults; if they are, use another MPI library, "
+            "or ranks_per_chain=1."
         )
 
 
 def _was_launched() -> bool:
     return (
-        any(module in sys.modules for module in _ASKED_FOR)
+        any(module in sys.modules for module in _MPI_MODULES)
         or any(name in os.environ for name in _RANKS)
-        or any(size > 1 for size in _announced_sizes().values())
+        or any(size > 1 for size in _launched_sizes().values())
     )
 
 
-def _announced_sizes() -> dict[str, int]:
+def _launched_sizes() -> dict[str, int]:
     return {name: int(os.environ[name]) for name in _SIZES if os.environ.get(name, "").isdigit()}
 
 
-def _check_that_ranks_meet(loaded: Any) -> None:
-    """Each would take itself for the only one, and do all the work."""
+def _check_launcher(loaded: Any) -> None:
+    """Detect a launcher and MPI mismatch, in which every rank sees a world of size 1."""
     if loaded.COMM_WORLD.Get_size() > 1:
         return
-    for name, size in _announced_sizes().items():
+    for name, size in _launched_sizes().items():
         if size > 1:
             library, _ = loaded.get_vendor()
             raise ParallelError(
                 f"{size} ranks were started together ({name}={size}), but none sees the others: "
                 f"mpi4py uses {library}, and the launcher belongs to another MPI. Start the ranks "
-                f"by the mpiexec of {library} (`python -m mpi4py --mpi-library` says where that "
-                "is), or by `srun --mpi=pmix`, or install mpi4py for the launcher's MPI."
+                f"by the mpiexec of {library} (`python -m mpi4py --mpi-library` prints its path), "
+                "or by `srun --mpi=pmix`, or install mpi4py for the launcher's MPI."
             )

@@ -1,4 +1,4 @@
-"""Ctrl-C where an exception at any moment would do harm: among ranks that wait for each other."""
+"""Handling of Ctrl-C where an exception could leave ranks waiting for each other."""
 
 import signal
 from collections.abc import Iterator
@@ -8,24 +8,24 @@ from typing import Any
 
 
 @contextmanager
-def noticed_interrupts() -> Iterator[Event]:
-    """Set an event at an interrupt, and go on.
+def deferred_interrupts() -> Iterator[Event]:
+    """Set an event at an interrupt instead of raising.
 
-    Python would raise between any two steps: after a message was taken, and before what it says is
-    done. Outside of the main thread nothing is ever interrupted.
+    Python could raise between receiving a message and handling it. Threads other than the main one
+    are never interrupted.
     """
     interrupted = Event()
 
-    def notice(*_: Any) -> None:
+    def handle(*_: Any) -> None:
         interrupted.set()
 
-    with _handled_by(notice):
+    with _handled_by(handle):
         yield interrupted
 
 
 @contextmanager
-def interrupts_left_to_another_rank() -> Iterator[None]:
-    """Go on at an interrupt: it may reach all ranks, and one of them tells the others to stop."""
+def ignored_interrupts() -> Iterator[None]:
+    """Ignore interrupts: they may reach all ranks, and one of them stops the others."""
     with _handled_by(signal.SIG_IGN):
         yield
 

@@ -20,7 +20,6 @@ from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,
-    PythonCallback,
 )
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
@@ -34,7 +33,6 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 __all__ = [
     "AutoregressiveNoise",
     "CallbackLikelihoods",
-    "PythonCallback",
     "autoregressive_noise",
     "smooth_filters",
     "with_filter",

@@ -1,4 +1,4 @@
-"""Samplers: they know a model's log-density and its noise seeds, and no filter."""
+"""Samplers of a model's log-density and noise seeds, independent of its filters."""
 
 from pymc_statespace_filters.sampling.particle_number.suggest import suggest_particles
 from pymc_statespace_filters.sampling.sample import run_models, sample_dram

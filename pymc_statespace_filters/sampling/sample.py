@@ -1,4 +1,4 @@
-"""``sample_dram`` and ``run_models``: whole chains in machine code, with ``pm.sample``'s result."""
+"""``sample_dram`` and ``run_models``: whole chains in machine code, results as of ``pm.sample``."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -11,11 +11,9 @@ from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import folder_name
-from pymc_statespace_filters.sampling.run.driver import How, sample_models
-from pymc_statespace_filters.sampling.run.model_task import Asked
-from pymc_statespace_filters.sampling.run.warm_start import with_head_start
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.system.checks import is_integer
+from pymc_statespace_filters.sampling.run.driver import sample_models
+from pymc_statespace_filters.sampling.run.request import ExecutionOptions, sampling_request
+from pymc_statespace_filters.sampling.run.warm_start import warm_started
 
 
 @overload
@@ -49,55 +47,54 @@ def sample_dram(
     gather: str = "root",
     **dram_settings: Any,
 ) -> DataTree | None:
-    """Sample a model by delayed rejection adaptive Metropolis, each chain whole in machine code.
+    """Sample a model by delayed rejection adaptive Metropolis, with whole chains in machine code.
 
-    The same transitions as ``pm.sample(step=psf.DRAM())``, without Python between one draw and the
-    next: a draw costs what its likelihood costs. Chains run in threads, and on several machines
-    with MPI.
+    The transitions are those of ``pm.sample(step=psf.DRAM())``, without Python between the draws: a
+    draw costs as much as its likelihood. Chains run in threads, and with MPI on several machines.
 
     Parameters
     ----------
     draws, tune : int
-        Iterations of each chain that are kept, and of warm-up before them, in which the proposals
-        are learnt.
+        Iterations of each chain that are kept, and of the warm-up before them, during which the
+        proposals are adapted.
     chains : int
     cores : int, optional
-        Threads, on each rank. Default: as many as there are processors, at most one for each chain.
-        The draws do not depend on it.
+        Threads on each rank. Default: the number of available processors, at most the number of
+        chains. The draws do not depend on it.
     model : pymc.Model, optional
         Default: the model of the ``with`` block. All its free variables must be continuous.
     random_seed : int or numpy.random.Generator, optional
     initvals : dict, or sequence of dict, optional
-        Starting values, for all chains or for each, as in ``pm.sample``. Default: with
+        Initial values, for all chains or for each, as in ``pm.sample``. Default: with
         ``tune > 0``, the best of a few draws from the prior.
     pilot : xarray.DataTree, optional
-        Draws of a posterior that lies close: that of the same parameters with a cheaper filter.
-        Chains begin where its chains ended. They propose as these did in the end, if they were of
-        DRAM and had learnt it, else by the covariance of the draws; the warm-up learns no more
-        unless ``adapt_every`` or ``adaptation`` is given. A mode that the pilot has not found is
-        not found so. With ``checkpoint`` the pilot must be the same each time; with
-        ``comm`` all ranks give it (``gather="all"``).
+        Draws from a posterior close to the model's, such as that of the same parameters with a
+        cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is
+        the one that its chains used last, if they were sampled and adapted by DRAM, else that of
+        its draws; it is adapted only if ``adapt_every`` or ``adaptation`` is given. A mode that the
+        pilot has missed is missed again. With ``checkpoint`` the pilot must be the same in each
+        call; with ``comm`` all ranks pass it (``gather="all"``).
     progressbar : bool or str
         As in ``pm.sample``.
     discard_tuned_samples : bool
-        Whether to leave out the warm-up; else it is kept in groups ``warmup_posterior`` and
+        Whether to leave out the warm-up; otherwise it is in the groups ``warmup_posterior`` and
         ``warmup_sample_stats``.
     compute_convergence_checks : bool
-        As in ``pm.sample``: whether R-hat and effective sample sizes are judged at the end, which
-        takes long for many draws. What the chains themselves have met is said regardless.
+        As in ``pm.sample``: whether R-hat and effective sample sizes are checked at the end, which
+        takes long for many draws. Warnings about single chains are given in any case.
     checkpoint : str or path, optional
-        A folder, in which the chains are stored every few seconds. If the process ends, in whatever
-        way, the same call goes on from there, and gives to the bit what it would have given. With
-        ``comm``, all ranks must see it.
+        A folder in which the chains are stored every few seconds. If the process ends for any
+        reason, the same call resumes the run and returns bitwise the same draws as an uninterrupted
+        one. With ``comm``, the folder must be visible to all ranks.
     comm : mpi4py.MPI.Comm or "world", optional
-        Ranks over which the chains are spread; all of them make this call. "world" are all that
-        ``mpiexec`` started, and this process alone if there was no ``mpiexec``. The draws do not
+        Ranks over which the chains are distributed; all of them make this call. "world" is all
+        ranks started by ``mpiexec``, or this process alone without ``mpiexec``. The draws do not
         depend on the number of ranks.
     ranks_per_chain : int
-        So many ranks evaluate the likelihoods of a chain together, each on its own part of the
-        particles: for likelihoods of seconds.
+        Number of ranks that evaluate the likelihoods of a chain together, each on its part of the
+        particles; for likelihoods that take seconds.
     gather : {"root", "all"}
-        Which ranks get the result.
+        Ranks that get the result.
     **dram_settings
         Settings of `DRAM`: ``stages``, ``stage_scale``, ``adaptation``, ``adapt_every``,
         ``proposal_cov``, ``refresh_noise``, ``screen``, ``screen_power``, ``correlation``.
@@ -105,10 +102,10 @@ def sample_dram(
     Returns
     -------
     xarray.DataTree
-        As ``pm.sample`` returns it; None on ranks that do not get it. After Ctrl-C, what was drawn
+        As returned by ``pm.sample``; None on ranks that do not get it. After Ctrl-C, the draws made
         until then. The attributes ``exact`` (whether the chains target the posterior itself,
-        without the bias of a filter), ``refresh_noise`` and ``correlation`` say what the draws are;
-        ``log_likelihood_variance``, of a run of 600 iterations or more with a noisy likelihood, is
+        without the bias of a filter), ``refresh_noise`` and ``correlation`` describe the target.
+        ``log_likelihood_variance``, for runs of at least 600 iterations with a noisy likelihood, is
         the variance of the estimated log-likelihood over 12 noise seeds at the draw of highest
         density.
 
@@ -118,8 +115,8 @@ def sample_dram(
         If an argument is not as described, a free variable is discrete, the log-density draws
         random numbers of its own, or no starting point with finite log-density is found.
     DataMismatchError
-        If the checkpoint is of a run with other arguments, another model or other data, if ranks
-        differ in these, or if the pilot does not have the parameters of the model.
+        If the checkpoint belongs to a run with other arguments, another model or other data, if
+        ranks differ in these, or if the pilot does not have the parameters of the model.
     ParallelError
         If another rank has failed; the message names the rank, the chain and the error.
 
@@ -138,14 +135,16 @@ def sample_dram(
     model = modelcontext(model)
     if not isinstance(model, Model):
         raise ModelError(f"model must be a pymc.Model, got {model!r}")
-    asked = _asked(
+    request = sampling_request(
         draws, tune, chains, random_seed, initvals, not discard_tuned_samples, dram_settings
     )
     if pilot is not None:
         adapts = not dram_settings.keys().isdisjoint({"adapt_every", "adaptation"})
-        asked = with_head_start(asked, model, pilot, adapts=adapts)
-    how = How(cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather)
-    trees = sample_models({"": model}, asked, how, [] if checkpoint is None else [checkpoint])
+        request = warm_started(request, model, pilot, adapts=adapts)
+    options = ExecutionOptions(
+        cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
+    )
+    trees = sample_models({"": model}, request, options, [] if checkpoint is None else [checkpoint])
     return None if trees is None else trees[""]
 
 
@@ -179,22 +178,22 @@ def run_models(
     gather: str = "root",
     **dram_settings: Any,
 ) -> dict[str, DataTree] | None:
-    """Sample several models at once, as `sample_dram` samples one.
+    """Sample several models in one run, each as by `sample_dram`.
 
-    All chains of all models share the threads, and with MPI the ranks: a free one takes the next
-    chain, of the dearest model first.
+    The chains of all models share the threads, and with MPI the ranks: an idle thread takes the
+    next chain, most expensive model first.
 
     Parameters
     ----------
     models : mapping of str to pymc.Model
     draws, tune, chains, cores, random_seed, initvals
         As in `sample_dram`, for every model. A model's draws are those of `sample_dram` with the
-        same seed, whatever the other models.
+        same seed and do not depend on the other models.
     progressbar, discard_tuned_samples, compute_convergence_checks
         As in `sample_dram`.
     checkpoint : str or path, optional
-        A folder, in which each model has one of its own. If the process ends, in whatever way, the
-        same call goes on from there.
+        A folder with a subfolder for each model. If the process ends for any reason, the same call
+        resumes the run.
     comm, ranks_per_chain, gather
         As in `sample_dram`.
     **dram_settings
@@ -203,7 +202,7 @@ def run_models(
     Returns
     -------
     dict of str to xarray.DataTree
-        As `sample_dram` returns them; None on ranks that do not get them.
+        As returned by `sample_dram`; None on ranks that do not get them.
 
     Raises
     ------
@@ -224,60 +223,19 @@ def run_models(
     {'narrow': (4, 200), 'wide': (4, 200)}
     """
     if not isinstance(models, Mapping) or not models:
-        raise ModelError(f"models={models!r}: expected a mapping from names to pymc.Model")
+        raise ModelError(
+            f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
+        )
     for name, model in models.items():
         if not isinstance(name, str) or not name:
-            raise ModelError(f"models: {name!r} is no name: expected a text")
+            raise ModelError(f"names of models must be non-empty strings, got {name!r}")
         if not isinstance(model, Model):
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
-    asked = _asked(
+    request = sampling_request(
         draws, tune, chains, random_seed, initvals, not discard_tuned_samples, dram_settings
     )
-    how = How(cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather)
-    folders = [] if checkpoint is None else [Path(checkpoint, folder_name(n)) for n in models]
-    return sample_models(models, asked, how, folders)
-
-
-def _asked(
-    draws: int,
-    tune: int,
-    chains: int,
-    random_seed: Any,
-    initvals: Any,
-    keeps_warmup: bool,
-    dram_settings: dict[str, Any],
-) -> Asked:
-    """Check what is asked for, apart from the model."""
-    for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
-        if not is_integer(value) or value < least:
-            raise ModelError(f"{name}={value!r}: expected an integer, at least {least}")
-    if draws + tune * keeps_warmup == 0:
-        raise ModelError(
-            f"draws={draws}, tune={tune}, discard_tuned_samples={not keeps_warmup}: nothing would "
-            f"be kept; for the warm-up alone say discard_tuned_samples=False"
-        )
-    proposal_cov = dram_settings.pop("proposal_cov", None)
-    return Asked(
-        draws,
-        tune,
-        chains,
-        _entropy(random_seed),
-        random_seed is not None,
-        initvals,
-        keeps_warmup,
-        proposal_cov,
-        DRAMSettings.of(dram_settings),
+    options = ExecutionOptions(
+        cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
     )
-
-
-def _entropy(random_seed: object) -> list[int]:
-    """Turn what PyMC takes for a seed into the entropy of a run."""
-    if random_seed is None:
-        return np.random.SeedSequence().generate_state(4).tolist()
-    if isinstance(random_seed, np.random.Generator):
-        return random_seed.integers(2**32, size=4).tolist()
-    if not is_integer(random_seed) or random_seed < 0:
-        raise ModelError(
-            f"random_seed={random_seed!r}: expected None, a non-negative integer or a Generator"
-        )
-    return [int(random_seed)]
+    folders = [] if checkpoint is None else [Path(checkpoint, folder_name(name)) for name in models]
+    return sample_models(models, request, options, folders)

@@ -1,7 +1,7 @@
 """DRAM, delayed rejection adaptive Metropolis, as a PyMC step method.
 
-The mathematics is in ``delayed_rejection`` and ``adaptation``, an iteration in ``chain``; this page
-is the glue to PyMC.
+The formulas are in `kernel.delayed_rejection` and `kernel.adaptation`, an iteration in
+`kernel.transition`; this module connects them to PyMC.
 """
 
 from collections.abc import Sequence
@@ -17,24 +17,24 @@ from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.progress import stat_values, step_columns
-from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_key
-from pymc_statespace_filters.sampling.kernel.state import Random, State
-from pymc_statespace_filters.sampling.output import sample_stats as statistics
-from pymc_statespace_filters.sampling.output.warnings import Record, closing_warning
-from pymc_statespace_filters.sampling.run.chain import RunningChain
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key
+from pymc_statespace_filters.sampling.kernel.state import ChainState
+from pymc_statespace_filters.sampling.output import sample_stats
+from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
+from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
 
 @dataclass_state
 class DRAMState(StepMethodState):
-    """What PyMC stores of a chain: with it, the chain goes on as if never interrupted."""
+    """The state of a chain that PyMC stores: the chain continues from it with the same draws."""
 
     tune: bool
-    _state: State | None
+    _state: ChainState | None
     _key: np.ndarray
     _iteration: int
-    _record: Record
+    _statistics: PhaseStatistics
     _n_draws: int
     _disperse: bool
     settings: DRAMSettings = field(metadata={"frozen": True})
@@ -43,52 +43,52 @@ class DRAMState(StepMethodState):
 class DRAM(BlockedStep):
     """Delayed rejection adaptive Metropolis, for likelihoods with and without noise.
 
-    A Gaussian random walk on the unconstrained space whose covariance is learnt during warm-up
-    (thesis, Eqs. 3.27-3.29) and then frozen; where a proposal is rejected, closer ones may follow
+    A Gaussian random walk on the unconstrained space whose covariance is adapted during warm-up
+    (thesis, Eqs. 3.27-3.29) and then frozen; after a rejected proposal, closer ones may follow
     (Eqs. 3.30-3.32). It needs no gradient, evaluates the model exactly once for each proposal, and
-    is right where the likelihood is only estimated: the estimate that let a point in stays with it
-    and is never drawn again.
+    is exact for an estimated likelihood: the estimate with which a point was accepted is kept, and
+    is not computed again.
 
     Parameters
     ----------
     vars : list of variables, optional
         Continuous variables to sample. Default: all free variables of the model.
     stages : int or (int, int), default (2, 1)
-        Proposals tried in an iteration, or a pair: while tuning, afterwards. 1 is plain
-        random-walk Metropolis-Hastings. Further stages help a chain out of a bad start; once the
+        Maximal number of proposals in an iteration, or a pair: while tuning, afterwards. 1 is
+        random-walk Metropolis-Hastings. Further stages help a chain to leave a bad start; once the
         covariance is good they rarely pay for their evaluations.
     stage_scale : float, default 0.2
         Stage k proposes ``N(y, stage_scale^(2 (k - 1)) C)`` around the current point y.
     adaptation : {"chain", "continuous"}, default "chain"
-        How the covariance C is learnt: in blocks, each proposing with what the blocks before taught
-        (the thesis's scheme), or at every iteration (Haario et al. 2001). Both stop with tuning.
+        When the covariance C is updated: after blocks of iterations (the thesis's scheme), or at
+        every iteration (Haario et al. 2001). Both stop with tuning.
     adapt_every : int, default 100
         Iterations in a block.
     proposal_cov : array_like, shape (d, d), optional
         Covariance of the first proposals, on the unconstrained space, in the order of ``vars``.
         Default: the prior's variances, times 2.38^2 / d.
     refresh_noise : bool, default True
-        Whether each proposal of each stage gets a noise seed of its own. The chain then targets
-        prior times expected likelihood: the exact posterior if the estimate is unbiased. False
-        holds the model's seed: common random numbers, a deterministic target that carries that
-        seed's error. Without a noisy likelihood it makes no difference.
+        Whether each proposal of each stage gets its own noise seed. The chain then targets prior
+        times expected likelihood: the exact posterior if the estimate is unbiased. False fixes the
+        model's seed (common random numbers): the target is deterministic, with the error of that
+        seed. Without a noisy likelihood it makes no difference.
     screen : filter, optional
-        A cheap filter for the same systems. Moves are made on its likelihood, delayed rejection and
-        all; only where one ends the model's own is evaluated, and decides (surrogate transition).
-        A filter with noise is used on the noise of the model's seed. The chain is right
-        for any screen that is possible wherever the posterior is.
+        A cheap filter for the same systems. Moves, with delayed rejection, are made on its
+        likelihood; the model's own is evaluated only at their end points and decides on them
+        (surrogate transition). A filter with noise uses the model's seed. The chain is exact for
+        any screen whose density is positive wherever the posterior's is.
     screen_power : float, default 0.5
-        In (0, 1]: tempers the likelihood of the screen, which else vetoes good points where it is
-        wrong by many nats.
+        Exponent, in (0, 1], that tempers the likelihood of the screen. Untempered it rejects good
+        points where it is wrong by many nats.
     correlation : float, optional
-        In (0, 1): each proposal has the noise of the current point, moved by an autoregression, in
-        place of noise of its own (Deligiannidis et al. 2018). Particle filters then resample in
-        the order of the states. Needs ``stages=1`` and no noisy screen: with a second proposal the
-        densities of the noise would not cancel.
+        In (0, 1): the noise of each proposal is an autoregression on the noise of the current point
+        (Deligiannidis et al. 2018). Particle filters then resample in the order of the states. It
+        needs ``stages=1`` and a screen without noise: with a second proposal the densities of the
+        noise would not cancel.
     model : pymc.Model, optional
         Default: the model of the ``with`` block.
     initial_point, compile_kwargs, rng, blocked
-        What PyMC passes to any step method; the first is not used.
+        Passed by PyMC to any step method; the first is not used.
 
     Raises
     ------
@@ -100,37 +100,37 @@ class DRAM(BlockedStep):
     Notes
     -----
     PyMC starts all chains of a step method at one point. The first iteration of warm-up moves each
-    to a draw from the prior at which the log-density is finite (under a flat prior, to the model's
-    starting point plus U(-1, 1)), unless ``tune=0`` or starting values were given. Where another
-    step method has moved, the current point is evaluated again, with its own seeds.
+    to a draw from the prior with finite log-density (under a flat prior, to the model's initial
+    point plus U(-1, 1)), unless ``tune=0`` or initial values were given. After a move of another
+    step method the current point is evaluated again, with its own seeds.
 
-    ``sample_stats`` holds for each draw
+    ``sample_stats`` contains for each draw
 
     ``accepted``, ``stage``, ``accept_rate``
-        1 where the chain moved, else 0; by which stage (0: none); and the share of iterations that
-        moved since warm-up or sampling began
+        1 if a proposal was accepted, else 0; of which stage (0: none); and the fraction of
+        iterations with an accepted proposal since the beginning of warm-up or sampling
     ``accept``
-        probability of accepting the first stage's proposal
+        acceptance probability of the first stage's proposal
     ``lp``
-        log-density on the unconstrained space, as estimated when the chain came to the point
+        log-density on the unconstrained space, as estimated when the point was accepted
     ``d_seed``
-        for each noisy variable "d", the noise seed behind that estimate; if the noise is moved
-        there is none, and ``correlation`` says by how much
+        for each noisy variable "d", the noise seed of that estimate; for correlated noise there is
+        ``correlation`` instead
     ``proposal_cov``, ``scaling``
         covariance of the first stage's proposals, shape (d, d), unless other step methods move
         continuous variables; and the geometric mean of its standard deviations
     ``n_evaluations``, ``n_failed``, ``failure``
-        evaluations of the model; how many failed, so that the point counts as impossible; and the
-        last one's reason, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity
+        evaluations of the model; how many failed, so that the proposal was rejected; and the last
+        failure code, a key of ``inspection.FAILURES`` or -1: NaN or plus infinity
     ``n_effective``
-        with a noisy likelihood: the smallest effective number of particles behind ``lp``
+        with a noisy likelihood: the smallest effective number of particles of the estimate ``lp``
     ``n_screened``, ``n_screen_failed``
         with a screen: its evaluations, and how many failed
     ``exact``
         whether the chain targets the posterior itself, without the bias of a filter
 
-    A chain that stood still after warm-up, or whose evaluations often failed, says so when it ends,
-    through PyMC's logger.
+    PyMC's logger warns at the end of a chain that hardly moved after warm-up, or whose evaluations
+    often failed.
 
     References
     ----------
@@ -161,16 +161,15 @@ class DRAM(BlockedStep):
     _progressbar_config = staticmethod(step_columns)
     _make_progressbar_update_functions = staticmethod(lambda: (stat_values,))
 
-    # Of the chain now running, as in DRAMState.
+    # Of the current chain, as in DRAMState.
     _has_started: bool
-    _chain: RunningChain | None
-    _block: tuple[int, Random] | None
+    _chain: Chain | None
     _key: np.ndarray
     _iteration: int
-    _record: Record
+    _statistics: PhaseStatistics
     _n_draws: int
     _disperse: bool
-    # The dictionary last returned: if it comes back, nothing has changed since.
+    # The dictionary last returned: if PyMC passes it again, nothing has changed since.
     _point: dict[str, np.ndarray] | None
 
     def __init__(
@@ -204,48 +203,46 @@ class DRAM(BlockedStep):
             screen_power,
         )
         self._target = Target(model, vars, self.settings, proposal_cov, compile_kwargs)
-        self.vars = list(self._target.held.variables)
+        self.vars = list(self._target.raveled.variables)
         self.blocked = blocked
         self.rng = get_random_generator(rng)
-        self.stats_dtypes = [statistics.dtypes(self._target)]
-        self.stats_dtypes_shapes = statistics.dtypes_shapes(self._target)
+        self.stats_dtypes = [sample_stats.dtypes(self._target)]
+        self.stats_dtypes_shapes = sample_stats.dtypes_shapes(self._target)
         self._reset(tune=0, draws=0)
 
     def __getstate__(self) -> dict:
-        """Leave the machine code behind: another process takes its own."""
-        return self.__dict__ | {"_chain": None, "_block": None, "_has_started": False}
+        """Leave out the machine code, which another process loads itself."""
+        return self.__dict__ | {"_chain": None, "_has_started": False}
 
     def setup_chain(self, rng: RandomGenerator, tune: int, draws: int) -> None:
-        """Begin a chain afresh, as PyMC asks for once per chain."""
+        """Begin a new chain, once per chain of PyMC."""
         super().setup_chain(rng, tune, draws)
         self._reset(tune, draws)
 
     def stop_tuning(self) -> None:
         """Freeze the proposals."""
         super().stop_tuning()
-        self._record = Record()
+        self._statistics = PhaseStatistics()
 
     def step(self, point: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[dict]]:
         """Make one iteration from a point of the model."""
-        running, codes = self._stand_at(point)
-        index, first = divmod(self._iteration, BLOCK)
-        if self._block is None or self._block[0] != index:
-            self._block = index, self._target.random(self._key, index)
-        running.advance(self.tune, self._block[1], first, 0, 1)
+        chain, failures = self._move_to(point)
+        chain.advance(self.tune, self._iteration, 0, 1)
         self._iteration += 1
-        running.add_evaluations(codes)
-        self._record = self._record.include(running.draws, 0)
-        is_last = not self.tune and self._record.iterations == self._n_draws
-        stats = statistics.of_draws(self._target, running.draws, 0)
-        stats["accept_rate"] = self._record.accept_rate
-        stats[statistics.WARNING] = self._closing_warning() if is_last else None
+        chain.add_evaluations(failures)
+        self._statistics = self._statistics.include(chain.draws, 0)
+        is_last = not self.tune and self._statistics.iterations == self._n_draws
+        stats = sample_stats.of_draws(self._target, chain.draws, 0)
+        stats["accept_rate"] = self._statistics.accept_rate
+        stats[sample_stats.WARNING] = self._closing_warning() if is_last else None
         if stats["accepted"] or self._point is None:
-            self._point = point | self._target.held.split(running.state.position.copy())
+            self._point = point | self._target.raveled.unravel(chain.state.position.copy())
         return self._point, [stats]
 
     def _closing_warning(self) -> SamplerWarning | None:
-        # PyMC does not tell a step method which chain it makes.
-        return closing_warning(self._record, self._target.growth(self._running.proposal_cov))
+        # Without the number of the chain, which PyMC does not pass to a step method.
+        growth = self._target.growth(self._prepared_chain.state.proposal_cov)
+        return closing_warning(self._statistics, growth)
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0
@@ -253,51 +250,52 @@ class DRAM(BlockedStep):
         self._has_started = False
         self._key = draw_key(self.rng)
         self._iteration = 0
-        self._record = Record()
+        self._statistics = PhaseStatistics()
         self._n_draws = draws
         self._disperse = tune > 0
         self._point = None
-        self._block = None
 
-    def _stand_at(self, point: dict[str, np.ndarray]) -> tuple[RunningChain, tuple[int, ...]]:
-        """Bring the chain to a point; it and the failure codes of the evaluations that took."""
-        running = self._running
+    def _move_to(self, point: dict[str, np.ndarray]) -> tuple[Chain, tuple[int, ...]]:
+        """Bring the chain to a point; also the failure codes of the evaluations made."""
+        chain = self._prepared_chain
         if self._has_started and point is self._point:
-            return running, ()
+            return chain, ()
         self._point = None
         target = self._target
-        position = target.held.join(point)
+        position = target.raveled.ravel(point)
         others = [np.array(point[name]) for name in target.density.others]
-        if not self._has_started or not np.array_equal(position, running.state.position):
-            start = [position]
+        if not self._has_started or not np.array_equal(position, chain.state.position):
+            candidates = [position]
             if self._disperse:
-                start = target.starts.candidates(position, self.rng)
+                candidates = target.prior_draws.candidates(position, self.rng)
             self._disperse = False
-            codes = running.start(start, others, self.rng)
+            failures = chain.start(candidates, others, self.rng)
             self._has_started = True
-            return running, codes
-        if all(map(np.array_equal, others, running.others)):
-            return running, ()
-        # The noisy parts depend on none of the others: the same noise gives the same estimate.
-        return running, (running.evaluate_again(others),)
+            return chain, failures
+        if all(map(np.array_equal, others, chain.others)):
+            return chain, ()
+        # The noisy terms depend on none of the others: the same noise gives the same estimate.
+        return chain, (chain.evaluate_again(others),)
 
     @property
-    def _running(self) -> RunningChain:
-        """The chain's machinery, with the data as they are when it is first asked for."""
+    def _prepared_chain(self) -> Chain:
+        """The chain, made on first use from the data as they are then."""
         if self._chain is None:
             self._target.prepare()
-            self._chain = RunningChain(self._target, 1, 1)
+            self._chain = Chain(self._target, self._key, 1, 1)
         return self._chain
 
     @property
-    def _state(self) -> State | None:
-        """A copy of where the chain stands; None before its first point."""
+    def _state(self) -> ChainState | None:
+        """A copy of the state; None before the first point."""
         if not self._has_started:
             return None
-        return State(*(array.copy() for array in self._running.state))
+        return ChainState(*(array.copy() for array in self._prepared_chain.state))
 
     @_state.setter
-    def _state(self, state: State | None) -> None:
+    def _state(self, state: ChainState | None) -> None:
         self._has_started = state is not None
-        if state is not None:
-            self._running.adopt(state)
+        if state is None:
+            self._chain = None  # a chain made before has another key
+        else:
+            self._prepared_chain.load_state(state)

@@ -14,7 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.run import chain_task as chain_run
+from pymc_statespace_filters.sampling.run import chain_task
 from tests.sampling.test_sample_dram import state_space_model
 
 CHAINS = 3
@@ -73,14 +73,14 @@ def resumed(**settings):
 
 def long_run(folder: str, seconds: str = "0") -> None:
     """Store it often, and after every block of iterations wait for so long to be killed."""
-    made = chain_run.ChainRun._advance
+    made = chain_task.ChainTask._advance
 
     def advance(self):
         made(self)
         time.sleep(float(seconds))
 
-    chain_run.ChainRun._advance = advance
-    chain_run.CHECKPOINT_SECONDS = 0.02
+    chain_task.ChainTask._advance = advance
+    chain_task.CHECKPOINT_SECONDS = 0.02
     tree = resumed(checkpoint=Path(folder, "run"), comm="world")
     if tree is not None:
         draws = {name: tree["posterior"][name].values for name in tree["posterior"].data_vars}

@@ -11,7 +11,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.run.chain_task import ChainRun
+from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from tests.mpi.launch import on_ranks
 
 
@@ -29,12 +29,12 @@ def ends(comm):
 
     with pytest.MonkeyPatch.context() as patch:
         if comm.rank == 0:
-            patch.setattr(ChainRun, "run", _fails_when_others_are_done)
+            patch.setattr(ChainTask, "run", _fails_when_others_are_done)
         with pytest.raises((ArithmeticError, psf.ParallelError)) as caught:
             psf.sample_dram(**quick, progressbar=False, gather="all")
     heard.append(str(caught.value))
 
-    made, told = ChainRun._advance, []
+    made, told = ChainTask._advance, []
 
     def advance_and_interrupt(run):
         made(run)
@@ -44,7 +44,7 @@ def ends(comm):
         time.sleep(0.05)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ChainRun, "_advance", advance_and_interrupt)
+        patch.setattr(ChainTask, "_advance", advance_and_interrupt)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         tree = psf.sample_dram(
             10**5, tune=0, **call, progressbar=False, proposal_cov=[[1.0]], gather="all"

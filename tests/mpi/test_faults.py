@@ -37,8 +37,8 @@ EARLY_ERROR = """
 from mpi4py import MPI
 if MPI.COMM_WORLD.rank == 1:
     raise FileNotFoundError("no data on this computer")
-from pymc_statespace_filters.parallel import ranks_of
-ranks_of("world").wait_for_all()
+from pymc_statespace_filters.parallel.communicator import communicator_of
+communicator_of("world").barrier()
 """
 
 
@@ -76,9 +76,7 @@ def disagreements(comm):
 def test_ranks_that_make_different_calls_are_told():
     zero, one = on_ranks(2, disagreements)
     assert zero == one
-    said = [
-        re.search("rank 1 of 2 was asked .* than rank 0: (.*);", text).group(1) for text in zero
-    ]
+    said = [re.search("rank 1 of 2 and rank 0 differ in (.*);", text).group(1) for text in zero]
     assert said[:6] == [
         "draws", "random_seed", "checkpoint", "gather", "ranks_per_chain", "initvals"
     ]  # fmt: skip

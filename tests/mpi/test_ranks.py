@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters import ParallelError
-from pymc_statespace_filters.parallel import communicator as parallel
+from pymc_statespace_filters.parallel import communicator
 from pymc_statespace_filters.parallel.communicator import communicator_of
 from tests.mpi.launch import on_ranks
 
@@ -31,7 +31,7 @@ def fail_on_the_last(comm):
     try:
         communicator_of(comm).run_collectively(function)
     except (LookupError, ParallelError) as error:
-        return parallel.describe_error(error)
+        return communicator.describe_error(error)
 
 
 def messages(comm):
@@ -49,7 +49,7 @@ def messages(comm):
 
 def arrays(comm):
     """Of all shapes, in pieces that are smaller than they are."""
-    parallel._MOST_BYTES = 40
+    communicator._MAX_BYTES = 40
     sent = [
         np.arange(12.0).reshape(3, 4),
         np.empty((0, 2)),

@@ -66,7 +66,7 @@ def test_draws_do_not_depend_on_who_evaluates():
             for what, values in of_groups.items():
                 np.testing.assert_array_equal(values, expected[what], str(what))
         nothing, blocks, groups, moved = said
-        assert "nothing to spread" in nothing
+        assert "a model without a StateSpace variable whose filter has particles" in nothing
         assert "64" in blocks
-        assert "4 ranks are not whole groups of 3" in groups
+        assert "ranks_per_chain=3 with 4 ranks" in groups
         assert "correlation=0.9" in moved

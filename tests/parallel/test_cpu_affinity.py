@@ -5,16 +5,16 @@ import os
 import pytest
 
 from pymc_statespace_filters.parallel.cpu_affinity import (
+    allowed_cores,
     available_cores,
-    core_numbers,
-    share_of_cores,
+    cores_per_process,
 )
 
 
 def test_this_process():
-    assert available_cores() == len(core_numbers()) >= 1
+    assert available_cores() == len(allowed_cores()) >= 1
     if hasattr(os, "sched_getaffinity"):
-        assert core_numbers() == os.sched_getaffinity(0)
+        assert allowed_cores() == os.sched_getaffinity(0)
 
 
 @pytest.mark.parametrize(
@@ -30,4 +30,4 @@ def test_this_process():
     ],
 )
 def test_shares(used, shares):
-    assert [share_of_cores(i, used) for i in range(len(used))] == shares
+    assert [cores_per_process(i, used) for i in range(len(used))] == shares

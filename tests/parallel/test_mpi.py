@@ -7,9 +7,9 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.parallel import environment as surroundings
-from pymc_statespace_filters.parallel import mpi as launch
-from pymc_statespace_filters.parallel.mpi import communicator
+from pymc_statespace_filters.parallel import environment
+from pymc_statespace_filters.parallel import mpi as mpi_module
+from pymc_statespace_filters.parallel.mpi import mpi_communicator
 
 LAUNCHERS = (
     "OMPI_COMM_WORLD_SIZE",
@@ -74,8 +74,8 @@ def loaded(monkeypatch):
 
 
 def test_nothing_is_imported_for_a_process_alone():
-    assert communicator(None) is None
-    assert communicator("world") is None
+    assert mpi_communicator(None) is None
+    assert mpi_communicator("world") is None
     assert "mpi4py" not in sys.modules
 
 
@@ -87,28 +87,28 @@ def test_the_world_is_that_of_mpi_wherever_something_has_launched_it(name, loade
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     else:
         monkeypatch.setenv(name, "4")
-    monkeypatch.setattr(launch, "mpi", lambda: sys.modules.setdefault("mpi4py.MPI", mpi))
-    assert communicator("world") is mpi.COMM_WORLD
+    monkeypatch.setattr(mpi_module, "mpi", lambda: sys.modules.setdefault("mpi4py.MPI", mpi))
+    assert mpi_communicator("world") is mpi.COMM_WORLD
 
 
 def test_a_step_of_one_task_is_no_launch(monkeypatch):
     monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "1")
-    assert communicator("world") is None
+    assert mpi_communicator("world") is None
 
 
 @pytest.mark.parametrize("comm", ["wrold", 91, b"world", Intracomm(2)])
 def test_another_type_is_refused_without_mpi(comm):
     with pytest.raises(psf.ModelError, match=r"comm must be None, 'world' or an intracomm.*, got "):
-        communicator(comm)
+        mpi_communicator(comm)
     assert "mpi4py" not in sys.modules
 
 
 def test_other_objects_of_mpi_are_refused(loaded):
     loaded()
     with pytest.raises(psf.ModelError, match="intracommunicator"):
-        communicator(Comm(2))
+        mpi_communicator(Comm(2))
     with pytest.raises(psf.ModelError, match=r"got MPI.COMM_NULL: it was freed, or"):
-        communicator(Comm(0))
+        mpi_communicator(Comm(0))
 
 
 @pytest.mark.parametrize(
@@ -121,14 +121,14 @@ def test_other_objects_of_mpi_are_refused(loaded):
 def test_mpi_must_be_running(loaded, state, words):
     mpi = loaded(**state)
     with pytest.raises(psf.ParallelError, match=words):
-        communicator(mpi.COMM_WORLD)
+        mpi_communicator(mpi.COMM_WORLD)
 
 
 def test_mpi4py_is_missing(monkeypatch):
     monkeypatch.setenv("PMI_SIZE", "2")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
     with pytest.raises(psf.ParallelError, match="pip install mpi4py"):
-        communicator("world")
+        mpi_communicator("world")
 
 
 @pytest.mark.parametrize("error", [RuntimeError, ImportError])
@@ -143,7 +143,7 @@ def test_the_library_is_missing(monkeypatch, error):
     monkeypatch.setitem(sys.modules, "mpi4py", Package("mpi4py"))
     cures = r"\(cannot load MPI library\).*filters\[mpi\]'.*apt install.*module load"
     with pytest.raises(psf.ParallelError, match=cures):
-        communicator("world")
+        mpi_communicator("world")
 
 
 @pytest.mark.parametrize("variable", LAUNCHERS[:-1])
@@ -153,22 +153,22 @@ def test_a_launcher_of_another_mpi(variable, comm, loaded, monkeypatch):
     monkeypatch.setenv(variable, "4")
     words = rf"4 ranks were started together \({variable}=4\), but none sees .*Open MPI"
     with pytest.raises(psf.ParallelError, match=words):
-        communicator(comm)
+        mpi_communicator(comm)
 
 
 def test_a_small_communicator_of_a_large_world_is_no_wrong_launch(loaded, monkeypatch):
     loaded(world=4)
     monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "4")
     alone = Intracomm(1)
-    assert communicator(alone) is alone
+    assert mpi_communicator(alone) is alone
 
 
 def test_threads_that_may_not_call_mpi(loaded):
     loaded(threads=3)
-    launch.check_threads()
+    mpi_module.check_threads()
     loaded(threads=1)
     with pytest.raises(psf.ParallelError, match=r"MPI_THREAD_MULTIPLE.*ranks_per_chain=1"):
-        launch.check_threads()
+        mpi_module.check_threads()
 
 
 HERE = {"numba": "0.68.0", "numpy": "2.4", "processor": "znver3"}
@@ -176,22 +176,22 @@ HERE = {"numba": "0.68.0", "numpy": "2.4", "processor": "znver3"}
 
 def test_ranks_that_are_alike():
     with warnings.catch_warnings(action="error"):
-        surroundings.check_alike([HERE] * 3, 0, in_lockstep=True)
-    assert surroundings.describe_environment()["processor"]
+        environment.check_environments([HERE] * 3, 0, in_lockstep=True)
+    assert environment.describe_environment()["processor"]
 
 
 def test_ranks_that_differ_may_run_chains():
     reports = [HERE, HERE | {"numba": "0.61.2"}, HERE]
     words = "The ranks differ: numba 0.68.0 on ranks 0, 2, 0.61.2 on rank 1. The draws"
     with pytest.warns(psf.ParallelWarning, match=words):
-        surroundings.check_alike(reports, 0, in_lockstep=False)
+        environment.check_environments(reports, 0, in_lockstep=False)
     with warnings.catch_warnings(action="error"):
-        surroundings.check_alike(reports, 1, in_lockstep=False)
+        environment.check_environments(reports, 1, in_lockstep=False)
 
 
 def test_ranks_that_differ_may_not_share_a_likelihood():
     reports = [HERE, HERE | {"processor": "skylake"}]
-    words = "alike, but differ: processor znver3 on rank 0, skylake on rank 1. .*NUMBA_CPU_NAME="
+    words = "same environment, got processor znver3 on rank 0, skylake on rank 1. .*NUMBA_CPU_NAME="
     for rank in range(2):
         with pytest.raises(psf.ParallelError, match=words):
-            surroundings.check_alike(reports, rank, in_lockstep=True)
+            environment.check_environments(reports, rank, in_lockstep=True)

@@ -24,10 +24,9 @@ import pymc as pm
 import pytensor
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK
-from pymc_statespace_filters.sampling.output.deterministics import Quantities
-from pymc_statespace_filters.sampling.run.chain_task import ChainRun, Plan
-from pymc_statespace_filters.sampling.target.initvals import chain_starts
+from pymc_statespace_filters.sampling.output.deterministics import Deterministics
+from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.log_density import screening_density
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -76,7 +75,7 @@ class Setting:
     truths : callable
         From a generator to the true parameters: of the model's prior, unless it is to be wrong.
     run : type
-        The way a chain is made: ChainRun, unless it is to be wrong.
+        The way a chain is made: ChainTask, unless it is to be wrong.
     graph : callable, optional
         From the model to the log-density that is sampled, if that is to be wrong.
     """
@@ -84,7 +83,7 @@ class Setting:
     filter: Any
     dram: dict = field(default_factory=dict)
     truths: Callable[[np.random.Generator], dict] = from_the_prior
-    run: type[ChainRun] = ChainRun
+    run: type[ChainTask] = ChainTask
     graph: Callable[[pm.Model], Any] | None = None
 
 
@@ -119,12 +118,15 @@ class Replications:
             pm.Uniform("phi", -0.9, 0.9)
             pm.LogNormal("spread", np.log(0.7), 0.3)
             psf.StateSpace("d", LINEAR, setting.filter, steps=STEPS, observed=self.record)
-        settings = DRAMSettings.of(setting.dram)
+        settings = DRAMSettings.from_arguments(setting.dram)
         graph = setting.graph and setting.graph(self.model)
         self._target = Target(self.model, None, settings, graph=graph)
-        self._quantities = Quantities(self.model, self._target.held)
+        self._deterministics = Deterministics(self.model, self._target.raveled)
         seeds = [np.random.SeedSequence(0)]  # of a start that is not random
-        (self._candidates,) = chain_starts(self.model, self._target, None, seeds, disperse=True)
+        raveled, prior_draws = self._target.raveled, self._target.prior_draws
+        (self._candidates,) = chain_candidates(
+            self.model, raveled, prior_draws, None, seeds, disperse=True
+        )
         # Machine code runs in threads; what PyTensor has compiled is called by one at a time.
         self._lock = Lock()
 
@@ -135,15 +137,14 @@ class Replications:
 
     def chain(self, index, n_draws):
         """Draws by name, each (n_draws,): those of ``sample_dram(random_seed=index, chains=1)``."""
-        seeds = np.random.SeedSequence([index]).spawn(1)
-        plan = Plan(TUNE, n_draws, False, [self._start], seeds)
+        (seed,) = np.random.SeedSequence([index]).spawn(1)
         with self._lock:
             self.record.set_value(self.truth_and_record(index)[1])
             self._target.prepare()
-            run = self._setting.run(self._target, plan, 0, None)
-        run.run(Event())
+            task = self._setting.run(self._target, TUNE, n_draws, self._start, seed)
+        task.run(Event())
         with self._lock:
-            return self._quantities(run.running.draws.positions[TUNE:])
+            return self._deterministics(task.chain.draws.positions[TUNE:])
 
     def _start(self, rng):
         with self._lock:
@@ -187,18 +188,15 @@ def p_values(ranks):
     return np.array([[chi_square_p(r, N_RANKS, N_BINS), ecdf_p(r, N_RANKS)] for r in ranks.T])
 
 
-class Redrawing(ChainRun):
+class Redrawing(ChainTask):
     """The common mistake: the likelihood of the current point is estimated anew for every move."""
 
     def _advance(self):
-        if self.done < self._plan.tune:
+        if self.n_done < self._tune:
             return super()._advance()
-        running, done = self.running, self.done
-        running.start([running.state.position.copy()], (), self._rng)
-        index, first = divmod(done, BLOCK)
-        if self._block is None or self._block[0] != index:
-            self._block = index, self._target.random(self.key, index)
-        return running.advance(False, self._block[1], first, done, 1)
+        chain, done = self.chain, self.n_done
+        chain.start([chain.state.position.copy()], (), self._rng)
+        return chain.advance(False, done, done, 1)
 
 
 def from_another_prior(rng):

@@ -15,7 +15,7 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     start_adaptation,
     unpack,
 )
-from pymc_statespace_filters.sampling.run.chain_task import ChainRun, Plan
+from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
@@ -57,10 +57,9 @@ def warm_up(adapt, cov, start, first_cov, n, *, seed, stages=2):
     settings = DRAMSettings(stages=stages, adaptation=scheme)
     target = Target(model, None, settings, first_cov)
     target.prepare()
-    starts, seeds = [lambda rng: [start]], [np.random.SeedSequence(seed)]
-    run = ChainRun(target, Plan(n, 0, False, starts, seeds), 0, None)
-    run.run(Event())
-    return unpack(run.running.state.adaptation, len(start))
+    task = ChainTask(target, n, 0, lambda rng: [start], np.random.SeedSequence(seed))
+    task.run(Event())
+    return unpack(task.chain.state.adaptation, len(start))
 
 
 def correlated_target(dim, *, smallest_sd, largest_sd, correlation, seed):

@@ -9,7 +9,7 @@ from pymc_statespace_filters.sampling.particle_number.search import (
     MOST_NUMBERS,
     Row,
     choose,
-    pleasant,
+    round_up,
     search,
 )
 
@@ -30,11 +30,11 @@ def budget(law, first, target=TARGET, tail=2.0, rng=None):
 
 
 def test_pleasant_numbers_round_up_in_small_steps():
-    assert [pleasant(x) for x in (3, 10, 10.5, 11, 13, 170, 999, 1000, 4100, 61_000)] == [
+    assert [round_up(x) for x in (3, 10, 10.5, 11, 13, 170, 999, 1000, 4100, 61_000)] == [
         10, 10, 11, 11, 14, 180, 1000, 1000, 4500, 70_000,
     ]  # fmt: skip
     numbers = np.geomspace(20, 1e6, 500)
-    ratios = np.array([pleasant(x) for x in numbers]) / numbers
+    ratios = np.array([round_up(x) for x in numbers]) / numbers
     assert ratios.min() > 1.0 - 1e-9
     assert ratios.max() < 1.2
 
@@ -73,14 +73,14 @@ def test_a_variance_that_does_not_fall_is_named_after_few_numbers():
     rows, suggested, reading = budget(lambda n: 30.0 + 100.0 / n, 100)
     assert len(rows) <= 3
     assert suggested is rows[-1]
-    assert "does not come down to 3.3: it is 31 with 100 particles and 30." in reading
+    assert "does not decrease to 3.3: it is 31 with 100 particles and 30." in reading
 
 
 def test_a_variance_that_falls_too_slowly_ends_at_the_largest_number():
     rows, suggested, reading = budget(lambda n: 5000.0 / n**0.5, 100)
     assert suggested is rows[-1]
     assert rows[-1].n_particles <= 64 * 250
-    assert "does not come down" in reading
+    assert "does not decrease" in reading
 
 
 def test_too_little_noise_at_ten_particles_is_no_fault():

@@ -15,7 +15,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
 from pymc_statespace_filters.sampling.run import chain_task
-from pymc_statespace_filters.sampling.run.thread_pool import Crew
+from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
 KINDS = {
@@ -41,13 +41,13 @@ warnings.simplefilter("ignore")
 from pymc_statespace_filters.sampling.run import chain_task
 from tests.sampling.test_checkpoint_resume import sample_kind
 chain_task.CHECKPOINT_SECONDS = 0.01
-made = chain_task.ChainRun._advance
+made = chain_task.ChainTask._advance
 def advance(self):
-    if self.done >= int(sys.argv[3]):
+    if self.n_done >= int(sys.argv[3]):
         os.write(1, b"there\\n")  # whole, whichever thread says it
-        time.sleep(0.001 * (1 + self.done % 7))
+        time.sleep(0.001 * (1 + self.n_done % 7))
     made(self)
-chain_task.ChainRun._advance = advance
+chain_task.ChainTask._advance = advance
 sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
 print("done", flush=True)
 """
@@ -114,7 +114,7 @@ def test_a_segment_torn_anywhere(small, tmp_path, often):
 
 def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
     first = sample_dram(small, checkpoint=tmp_path, **SMALL)
-    monkeypatch.setattr(chain_task.ChainRun, "_advance", None)
+    monkeypatch.setattr(chain_task.ChainTask, "_advance", None)
     assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
 
 
@@ -123,7 +123,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
     def seed():
         return np.random.default_rng(5) if random_seed else None
 
-    blocks, advance = itertools.count(), chain_task.ChainRun._advance
+    blocks, advance = itertools.count(), chain_task.ChainTask._advance
 
     def die(self):
         if next(blocks) == 5:
@@ -131,7 +131,7 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(chain_task.ChainRun, "_advance", die)
+        patch.setattr(chain_task.ChainTask, "_advance", die)
         with pytest.raises(MemoryError):
             sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
     assert sum(path.stat().st_size for path in tmp_path.glob("chains.*/chain-0.*")) > 10_000
@@ -182,17 +182,17 @@ def test_a_checkpoint_of_other_data(tmp_path):
 
 def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
     asked = SMALL | {"discard_tuned_samples": False, "checkpoint": tmp_path}
-    ended, looks = Crew.ended, itertools.count()
+    finished, looks = ChainPool.finished, itertools.count()
 
-    def interrupted(crew, *others):
-        while min(run.done for run in crew.at_work.values()) < 1:
+    def interrupted(pool, *others):
+        while min(task.n_done for task in pool.running.values()) < 1:
             time.sleep(0.001)
         next(looks)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Crew, "ended", interrupted)
+    monkeypatch.setattr(ChainPool, "finished", interrupted)
     part = sample_dram(small, **asked)
-    monkeypatch.setattr(Crew, "ended", ended)
+    monkeypatch.setattr(ChainPool, "finished", finished)
     assert_identical(
         sample_dram(small, **asked), sample_dram(small, **asked | {"checkpoint": None})
     )

@@ -68,7 +68,9 @@ def test_a_pilot_that_ends_where_nothing_is_possible_is_named():
         place = pm.Normal("place", 0, 1, shape=2)
         pm.HalfNormal("sd", 1)
         pm.Potential("wall", pm.math.switch(place[0] > 10, 0.0, -np.inf))
-    with pytest.raises(ModelError, match="a pilot to sample_dram whose chains end at possible"):
+    with pytest.raises(
+        ModelError, match="a pilot of sample_dram whose chains ended at such points"
+    ):
         sample(bounded, pilot=tree())
 
 
@@ -167,8 +169,8 @@ def test_draws_of_nuts_do(model):
 @pytest.mark.parametrize(
     ("pilot", "settings", "error", "message"),
     [
-        (tree(), {"initvals": {"sd": 1.0}}, ModelError, "initvals is what the pilot gives"),
-        (tree(), {"proposal_cov": np.eye(3)}, ModelError, "proposal_cov is what the pilot gives"),
+        (tree(), {"initvals": {"sd": 1.0}}, ModelError, "initvals must be None with a pilot"),
+        (tree(), {"proposal_cov": np.eye(3)}, ModelError, "proposal_cov must be None with a pilot"),
         (3, {}, ModelError, "pilot: idata must be a DataTree"),
         (
             az.from_dict({"posterior": {"sd": SD}}),
@@ -183,9 +185,9 @@ def test_draws_of_nuts_do(model):
             DataMismatchError,
             "pilot: draws in idata must .*60 of 60 draws outside",
         ),
-        (tree(sd=np.ones_like(SD)), {}, ModelError, "lie in a plane, or stand still"),
-        (tree(place=PLACE[..., [0, 0]] * [1.0, 3.1]), {}, ModelError, "lie in a plane"),
-        (tree(sd=np.exp(PLACE @ [0.3, 0.7])), {}, ModelError, "lie in a plane"),
+        (tree(sd=np.ones_like(SD)), {}, ModelError, "constant or lie in a hyperplane"),
+        (tree(place=PLACE[..., [0, 0]] * [1.0, 3.1]), {}, ModelError, "lie in a hyperplane"),
+        (tree(sd=np.exp(PLACE @ [0.3, 0.7])), {}, ModelError, "lie in a hyperplane"),
     ],
 )
 def test_a_pilot_that_is_none_is_refused(model, pilot, settings, error, message):

@@ -8,11 +8,11 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.kernel import state as chain_arrays
-from pymc_statespace_filters.sampling.output import noise_check
-from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of
-from pymc_statespace_filters.sampling.output.noise_check import start_warning
-from pymc_statespace_filters.sampling.output.warnings import Growth, Record, closing_warning
+from pymc_statespace_filters.sampling.kernel import state
+from pymc_statespace_filters.sampling.output import likelihood_variance
+from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of, start_warning
+from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
+from pymc_statespace_filters.sampling.target.target import Growth
 from tests.sampling.test_dram import nan_beyond, sample, simple_model
 from tests.sampling.test_sample_dram import sample_dram, state_space_model
 
@@ -49,7 +49,7 @@ def both_ways(model, caplog, **settings):
             "proposal_cov",
         ),
         (runaway(), {"draws": 500, "tune": 1000}, "proposals of free have become", "proper prior"),
-        (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "cut off"),
+        (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "truncated"),
     ],
 )
 def test_chains_name_themselves_and_the_cure(model, settings, found, cure, caplog):
@@ -65,12 +65,12 @@ def test_healthy_chains_are_silent(caplog):
 
 def draws_with(stages):
     n = len(stages)
-    counts = np.zeros((n, chain_arrays.N_COUNTS), dtype=np.int64)
-    counts[:, chain_arrays.STAGE] = stages
-    counts[:, chain_arrays.N_EVALUATIONS] = 1
-    numbers = np.full((n, chain_arrays.N_NUMBERS), np.inf)
+    counts = np.zeros((n, state.N_COUNTS), dtype=np.int64)
+    counts[:, state.STAGE] = stages
+    counts[:, state.N_EVALUATIONS] = 1
+    numbers = np.full((n, state.N_NUMBERS), np.inf)
     none = np.empty((n, 0))
-    return chain_arrays.Draws(none, numbers, counts, none.astype(np.int64), np.empty((0, 1, 1)))
+    return state.Draws(none, numbers, counts, none.astype(np.int64), np.empty((0, 1, 1)))
 
 
 @pytest.mark.parametrize(
@@ -85,27 +85,27 @@ def draws_with(stages):
 )
 def test_stays_are_counted_at_once_and_one_by_one(stages, longest):
     draws = draws_with(stages)
-    whole, record = Record.of(draws, 0, len(stages)), Record()
+    whole, record = PhaseStatistics.from_draws(draws, 0, len(stages)), PhaseStatistics()
     for row in range(len(stages)):
         record = record.include(draws, row)
     assert whole == record
-    assert whole.longest_stay == longest
+    assert whole.longest_dwell == longest
 
 
 def test_a_stay_of_a_fifth_of_the_draws_is_said():
     moving = np.tile([1, 0], 400)
     stuck = np.concatenate([moving, [1], np.zeros(205, dtype=int), [1]])
-    assert closing_warning(Record.of(draws_with(moving), 0, 800)) is None
-    warning = closing_warning(Record.of(draws_with(stuck), 0, len(stuck)))
-    assert "stood at one point for 206 of 1007 draws" in warning.message
+    assert closing_warning(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
+    warning = closing_warning(PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck)))
+    assert "stayed at one point for 206 of 1007 draws" in warning.message
     assert "more particles" in warning.message
     # Of few draws a fifth is soon passed by chance.
     few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])
-    assert closing_warning(Record.of(draws_with(few), 0, len(few))) is None
+    assert closing_warning(PhaseStatistics.from_draws(draws_with(few), 0, len(few))) is None
 
 
 def test_growth_below_the_limit_is_silent():
-    record = Record.of(draws_with(np.tile([1, 0], 400)), 0, 800)
+    record = PhaseStatistics.from_draws(draws_with(np.tile([1, 0], 400)), 0, 800)
     assert closing_warning(record, Growth("x", 900.0)) is None
     assert "proposals of x" in closing_warning(record, Growth("x", 1100.0)).message
 
@@ -150,7 +150,7 @@ def test_the_spread_is_measured_where_it_says_something(filter, settings):
 def test_spreads_far_outside_are_said(caplog, monkeypatch):
     model = state_space_model(psf.BootstrapPF(20))
     quiet = sample_dram(model, draws=700)
-    monkeypatch.setattr(noise_check, "HOPELESS", 1e-3)
+    monkeypatch.setattr(likelihood_variance, "HOPELESS", 1e-3)
     monkeypatch.setattr(
         "pymc_statespace_filters.sampling.output.likelihood_variance.TOO_NOISY", 1e-3
     )
@@ -163,7 +163,7 @@ def test_spreads_far_outside_are_said(caplog, monkeypatch):
 
 
 def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch):
-    monkeypatch.setattr(noise_check, "HOPELESS", 1e-3)
+    monkeypatch.setattr(likelihood_variance, "HOPELESS", 1e-3)
     model = state_space_model(psf.BootstrapPF(3))
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         tree = sample_dram(model, draws=700, tune=0, proposal_cov=[[1e12]])
@@ -176,7 +176,7 @@ def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch)
 
 def test_a_noisy_start_may_be_left():
     noisy = 6.0 * np.random.default_rng(1).normal(size=12)
-    assert 10.0 < spread_of(noisy).variance < noise_check.HOPELESS
+    assert 10.0 < spread_of(noisy).variance < likelihood_variance.HOPELESS
     assert start_warning(spread_of(noisy), 3) is None
     message = start_warning(spread_of(3.0 * noisy), 3).message
     assert message.startswith("Chain 3, at the start:")

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from pymc_statespace_filters.parallel.signals import (
-    interrupts_left_to_another_rank,
-    noticed_interrupts,
+    deferred_interrupts,
+    ignored_interrupts,
 )
 
 
@@ -20,7 +20,7 @@ def _interrupts_arrive():
 
 
 def test_an_interrupt_is_noticed():
-    with noticed_interrupts() as interrupted:
+    with deferred_interrupts() as interrupted:
         assert not interrupted.is_set()
         signal.raise_signal(signal.SIGINT)
         assert interrupted.is_set()
@@ -29,13 +29,13 @@ def test_an_interrupt_is_noticed():
 
 
 def test_an_interrupt_is_left_to_another_rank():
-    with interrupts_left_to_another_rank():
+    with ignored_interrupts():
         signal.raise_signal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("context", [noticed_interrupts, interrupts_left_to_another_rank])
+@pytest.mark.parametrize("context", [deferred_interrupts, ignored_interrupts])
 def test_other_threads_are_never_interrupted(context):
     def inside():
         with context():

@@ -12,9 +12,9 @@ from pytensor.tensor import dscalar
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError, ParallelError
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key
-from pymc_statespace_filters.sampling.run.chain import RunningChain
-from pymc_statespace_filters.sampling.target import leader_follower as lockstep
-from pymc_statespace_filters.sampling.target.leader_follower import follow, leading
+from pymc_statespace_filters.sampling.run.chain import Chain
+from pymc_statespace_filters.sampling.target import leader_follower
+from pymc_statespace_filters.sampling.target.leader_follower import follow, release_followers
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -54,22 +54,22 @@ def run_chain(target):
     target.prepare()
     rng = np.random.default_rng(5)
     key = draw_key(rng)
-    running = RunningChain(target, ITERATIONS, 0)
-    running.start(target.starts.candidates(np.zeros(2), rng), (), rng)
-    random, half = target.random(key, 0), ITERATIONS // 2
-    running.advance(True, random, 0, 0, half)
-    running.advance(False, random, half, half, ITERATIONS - half)
+    chain = Chain(target, key, ITERATIONS, 0)
+    chain.start(target.prior_draws.candidates(np.zeros(2), rng), (), rng)
+    half = ITERATIONS // 2
+    chain.advance(True, 0, 0, half)
+    chain.advance(False, half, half, ITERATIONS - half)
     if not target.settings.refresh_noise:
-        return running.draws, running.state
-    spread = running.seed_spread(np.zeros(2), np.arange(10).reshape(5, 2))
-    return running.draws, running.state, spread
+        return chain.draws, chain.state
+    spread = chain.seed_spread(np.zeros(2), np.arange(10).reshape(5, 2))
+    return chain.draws, chain.state, spread
 
 
 def led(ranks, lead, *arguments):
     """What ``lead(*arguments)`` gives on the first of the ranks; the others follow."""
     if ranks.rank > 0:
         return follow(ranks)
-    with leading(ranks):
+    with release_followers(ranks):
         return lead(*arguments)
 
 
@@ -83,7 +83,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_chain_is_that_of_one_rank(name):
-    settings = DRAMSettings.of({"adapt_every": 10} | SETTINGS[name])
+    settings = DRAMSettings.from_arguments({"adapt_every": 10} | SETTINGS[name])
     alone = run_chain(Target(MODEL, None, settings))
 
     def call(ranks):
@@ -106,7 +106,7 @@ def test_a_group_of_one_is_no_group():
         target = Target(MODEL, None, DRAMSettings(refresh_noise=False), group=ranks)
         target.prepare()
         density = target.density.bind()
-        return density(np.zeros(2), (), target.held_seeds), density.leader
+        return density(np.zeros(2), (), target.fixed_seeds), target.density._leader
 
     (value, leader), *_ = on_ranks(1, call)
     assert np.isfinite(value.log_density)
@@ -208,7 +208,7 @@ class Unlucky(RuntimeError):
 
 def fail_on(rank, monkeypatch, *, at_call=3):
     """Let a rank raise in the midst of its evaluations, where the others need it."""
-    distributed_evaluator = lockstep.distributed_evaluator
+    distributed_evaluator = leader_follower.distributed_evaluator
 
     def failing(system, filter, ranks):
         evaluate, calls = distributed_evaluator(system, filter, ranks), []
@@ -221,13 +221,13 @@ def fail_on(rank, monkeypatch, *, at_call=3):
 
         return evaluate_or_fail
 
-    monkeypatch.setattr(lockstep, "distributed_evaluator", failing)
+    monkeypatch.setattr(leader_follower, "distributed_evaluator", failing)
 
 
 def test_followers_that_do_not_hear_are_not_left_behind(monkeypatch):
     """The leader's error in the midst of an evaluation, in which the followers wait for it."""
     fail_on(0, monkeypatch)
-    monkeypatch.setattr(lockstep, "_ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(leader_follower, "_ANSWER_SECONDS", 0.2)
     aborted = []
 
     def call(ranks):
@@ -288,14 +288,14 @@ def test_followers_hear_of_the_leaders_error():
 
 def test_a_follower_that_cannot_is_named_and_not_waited_for(monkeypatch):
     """All raise in time: the follower what it met, the leader who it was."""
-    distributed_evaluator = lockstep.distributed_evaluator
+    distributed_evaluator = leader_follower.distributed_evaluator
 
     def unable(system, filter, ranks):
         if ranks.rank == 1 and filter == PARTICLES:
             raise Unlucky("no compiler")
         return distributed_evaluator(system, filter, ranks)
 
-    monkeypatch.setattr(lockstep, "distributed_evaluator", unable)
+    monkeypatch.setattr(leader_follower, "distributed_evaluator", unable)
     leader, first, second = outcomes(3, evaluate_ten)
     assert isinstance(leader, ParallelError)
     assert "rank 1 of the 3" in str(leader)
@@ -327,8 +327,16 @@ def test_a_wrong_record_is_the_leaders_matter_and_can_be_mended():
 @pytest.mark.parametrize(
     ("model", "settings", "message"),
     [
-        (MODEL, {"correlation": 0.9, "stages": 1}, r"correlation=0.9: .* ranks_per_chain=1"),
-        (two_records(psf.EKF(), psf.EKF()), {}, r"ranks_per_chain=4: the model has no .* members"),
+        (
+            MODEL,
+            {"correlation": 0.9, "stages": 1},
+            r"ranks_per_chain must be 1 with correlation=0.9, got 4",
+        ),
+        (
+            two_records(psf.EKF(), psf.EKF()),
+            {},
+            r"ranks_per_chain must be 1 for a model without .* particles, got 4",
+        ),
         (MODEL, {}, r"EnKF.* 3 of 4 ranks"),
         (two_records(psf.EKF(), psf.PFEnKF(200)), {}, r"PFEnKF.* 3 of 4 ranks"),
     ],
@@ -339,4 +347,4 @@ def test_what_cannot_be_shared_is_said_before_anything_is_sent(model, settings, 
         rank, size = 0, 4
 
     with pytest.raises(ModelError, match=message):
-        Target(model, None, DRAMSettings.of(settings), group=Four())
+        Target(model, None, DRAMSettings.from_arguments(settings), group=Four())

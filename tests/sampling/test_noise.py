@@ -41,9 +41,9 @@ def sample(step, draws, cores=1):
 class Redrawing(DRAM):
     """The common mistake: the current point's likelihood is estimated anew."""
 
-    def _stand_at(self, point):
+    def _move_to(self, point):
         self._has_started = False
-        return super()._stand_at(point)
+        return super()._move_to(point)
 
 
 def deviations(idata):
@@ -119,7 +119,9 @@ def test_in_processes_the_seeds_are_the_same(toy):
 def test_all_that_the_noise_depends_on_must_be_held(toy):
     with toy(noise_sd=1.3) as model:
         other = pm.Normal("other")
-        with pytest.raises(ModelError, match=r"noisy likelihood of d also depends on mu"):
+        with pytest.raises(
+            ModelError, match=r"vars must include mu: the noisy likelihood of d depends"
+        ):
             DRAM([other])
         DRAM([model["mu"]])
 

@@ -12,7 +12,7 @@ from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
 from pymc_statespace_filters.sampling.particle_number.search import Row
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.sampling.autoregression import autoregression
 from tests.test_readme import run_code_of
 
@@ -34,8 +34,10 @@ def exact_mode():
     """Parameters at the highest exact density on the unconstrained space."""
     model = linear_model(psf.EKF())
     point = model.initial_point()
-    held, logp = HeldVariables(model.value_vars, point), model.compile_logp()
-    best = minimize(lambda x: -logp(held.split(x)), held.join(point), method="Nelder-Mead").x
+    raveled, logp = RaveledVariables(model.value_vars, point), model.compile_logp()
+    best = minimize(
+        lambda x: -logp(raveled.unravel(x)), raveled.ravel(point), method="Nelder-Mead"
+    ).x
     return {"phi": best[0], "spread": np.exp(best[1])}
 
 
@@ -80,7 +82,7 @@ def test_one_of_two_noisy_variables_is_tuned_on_its_own_noise():
     """The spread is to the rounding what it is where the other variable has no noise."""
     few, at = psf.BootstrapPF(4), np.array([0.6, -0.2])
     spreads = [
-        particle_budget._Bench(model, "a", np.random.default_rng(1)).spread(30, at, 40)
+        particle_budget._NoisyLikelihood(model, "a", np.random.default_rng(1)).spread(30, at, 40)
         for model in (two_records(few, few), two_records(few, psf.EKF()))
     ]
     np.testing.assert_allclose(spreads[0].variance, spreads[1].variance, rtol=1e-9)
@@ -100,11 +102,15 @@ def test_the_table_is_a_function_of_the_seed():
 
 
 def test_models_without_noise_have_nothing_to_tune():
-    with pytest.raises(ModelError, match=r"there is no number of particles to tune"):
+    with pytest.raises(
+        ModelError, match=r"must have a StateSpace variable with a noisy likelihood"
+    ):
         psf.suggest_particles(linear_model(psf.EKF()))
     with pm.Model() as model:
         pm.Normal("x")
-    with pytest.raises(ModelError, match=r"no StateSpace variable with a noisy likelihood"):
+    with pytest.raises(
+        ModelError, match=r"must have a StateSpace variable with a noisy likelihood"
+    ):
         psf.suggest_particles(model)
 
 
@@ -112,13 +118,13 @@ def test_models_without_noise_have_nothing_to_tune():
     "target", [(3.3, 1.0), (0.0, 1.0), (1.0,), 2.0, (1, 2, 3), "ab", (1, None)]
 )
 def test_bad_targets(target):
-    with pytest.raises(ModelError, match=r"target=.*: expected two positive numbers"):
+    with pytest.raises(ModelError, match=r"target must be two positive numbers, .* got "):
         psf.suggest_particles(linear_model(psf.BootstrapPF(20)), target=target)
 
 
 def test_other_bad_arguments():
     model = linear_model(psf.BootstrapPF(20))
-    with pytest.raises(ModelError, match=r"var_name='phi': expected .* noisy filter, 'd'"):
+    with pytest.raises(ModelError, match=r"var_name must be .* noisy filter, 'd', got 'phi'"):
         psf.suggest_particles(model, var_name="phi")
     with pytest.raises(ModelError, match=r"model must be a pymc.Model, got 'd'"):
         psf.suggest_particles("d")
@@ -133,9 +139,9 @@ def test_other_bad_arguments():
 def test_a_reading_is_a_warning_and_the_table_is_there(monkeypatch):
     noisy = SeedSpread(100, -1.0, 40.0, 30.0, 50.0, 0)
     rows = [Row(20, noisy, np.nan, 3, 1e-3), Row(200, noisy, np.nan, 1, 1e-2)]
-    monkeypatch.setattr(particle_budget._Bench, "points", lambda self: (None, []))
+    monkeypatch.setattr(particle_budget._NoisyLikelihood, "points", lambda self: (None, []))
     monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: rows)
-    with pytest.warns(FilterWarning, match=r"d: the variance .* does not come down to 3.3"):
+    with pytest.warns(FilterWarning, match=r"d: the variance .* does not decrease to 3.3"):
         table = psf.suggest_particles(linear_model(psf.BootstrapPF(20)))
     assert table.attrs == {"n_particles": 200}
     assert list(table["suggested"]) == [False, True]
@@ -149,7 +155,7 @@ def test_a_variance_that_stays_warns_and_leaves_a_table():
     with pm.Model() as model:
         pm.Normal("phi", 0.5, 0.5)
         psf.StateSpace("d", system, psf.BootstrapPF(10), steps=[1, 2, 3], observed=[3.0, -2.0, 4.0])
-    with pytest.warns(FilterWarning, match=r"d: the variance .* does not come down to 3.3"):
+    with pytest.warns(FilterWarning, match=r"d: the variance .* does not decrease to 3.3"):
         table = psf.suggest_particles(model, random_seed=1)
     assert table.attrs["n_particles"] == table.index[-1]
     assert table["variance_centre"].iloc[-1] > 3.3

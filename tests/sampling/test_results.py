@@ -11,18 +11,18 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.output import deterministics as of_quantities
-from pymc_statespace_filters.sampling.output.datatree import ChainDraws, to_datatree
-from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Quantities
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.output import deterministics
+from pymc_statespace_filters.sampling.output.datatree import to_datatree
+from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Deterministics
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
 
 TUNE, DRAWS = 30, 40
 
 
-def held_of(model):
-    return HeldVariables(model.value_vars, model.initial_point(0))
+def raveled_of(model):
+    return RaveledVariables(model.value_vars, model.initial_point(0))
 
 
 def rich_model():
@@ -61,7 +61,7 @@ def chains_of(tree, model):
             name: np.concatenate([ds[name][chain].to_numpy() for ds in stats_of])
             for name in stats_of[0].data_vars
         }
-        chains.append(ChainDraws(np.concatenate(columns, axis=1), stats))
+        chains.append((np.concatenate(columns, axis=1), stats))
     return chains
 
 
@@ -101,7 +101,7 @@ def assert_same(found, expected):
 def test_equals_the_tree_of_pm_sample(sampled):
     model, expected, chains = sampled
     found = to_datatree(
-        model, held_of(model), [*chains], tune=TUNE, keep_warmup=True, sampling_time=1.5
+        model, raveled_of(model), [*chains], tune=TUNE, keep_warmup=True, sampling_time=1.5
     )
     assert_same(found, expected)
     assert {"posterior", "warmup_posterior", "constant_data"} < set(found.children)
@@ -114,7 +114,7 @@ def test_warmup_is_left_out_on_request(sampled):
     model, expected, chains = sampled
     found = to_datatree(
         model,
-        held_of(model),
+        raveled_of(model),
         [*chains],
         tune=TUNE,
         keep_warmup=False,
@@ -142,7 +142,7 @@ def normal_model():
 def some_chains(*lengths, dim=2, **stats):
     rng = np.random.default_rng(7)
     return [
-        ChainDraws(
+        (
             rng.normal(size=(n, dim)),
             {"lp": rng.normal(size=n)}
             | {k: np.broadcast_to(v, (n, *v.shape)) for k, v in stats.items()},
@@ -166,7 +166,7 @@ def some_chains(*lengths, dim=2, **stats):
 def test_interrupted_chains(lengths, keep_warmup, chosen, warmup, draws):
     model, chains = normal_model(), some_chains(*lengths)
     tree = to_datatree(
-        model, held_of(model), [*chains], tune=20, keep_warmup=keep_warmup, sampling_time=1.0
+        model, raveled_of(model), [*chains], tune=20, keep_warmup=keep_warmup, sampling_time=1.0
     )
     begin = 0 if keep_warmup else 20
     for group, n, start in (("warmup_", warmup, begin), ("", draws, begin + warmup)):
@@ -175,8 +175,8 @@ def test_interrupted_chains(lengths, keep_warmup, chosen, warmup, draws):
         for place, i in enumerate(chosen if n else []):
             cut = slice(start, start + n)
             mu, lp = tree[f"{group}posterior"]["mu"], tree[f"{group}sample_stats"]["lp"]
-            np.testing.assert_array_equal(mu[place], chains[i].positions[cut, 0])
-            np.testing.assert_array_equal(lp[place], chains[i].stats["lp"][cut])
+            np.testing.assert_array_equal(mu[place], chains[i][0][cut, 0])
+            np.testing.assert_array_equal(lp[place], chains[i][1]["lp"][cut])
             assert len(mu) == len(chosen)
 
 
@@ -187,7 +187,7 @@ def test_nothing_to_return(lengths, keep_warmup):
     with pytest.raises(ModelError, match=message):
         to_datatree(
             model,
-            held_of(model),
+            raveled_of(model),
             some_chains(*lengths),
             tune=20,
             keep_warmup=keep_warmup,
@@ -199,9 +199,9 @@ def test_what_is_the_same_for_all_draws_is_stored_once_a_chain():
     model = normal_model()
     cov = np.array([[2.0, 0.5], [0.5, 1.0]])
     first, second = some_chains(50, 50, proposal_cov=cov)
-    second.stats["proposal_cov"] = np.broadcast_to(3 * cov, (50, 2, 2))
+    second[1]["proposal_cov"] = np.broadcast_to(3 * cov, (50, 2, 2))
     arguments = {"tune": 20, "keep_warmup": True, "sampling_time": 1.0}
-    tree = to_datatree(model, held_of(model), [first, second], **arguments)
+    tree = to_datatree(model, raveled_of(model), [first, second], **arguments)
     for group, n in (("sample_stats", 30), ("warmup_sample_stats", 20)):
         found = tree[group]["proposal_cov"]
         assert found.dims == ("chain", "draw", "proposal_cov_dim_0", "proposal_cov_dim_1")
@@ -209,22 +209,22 @@ def test_what_is_the_same_for_all_draws_is_stored_once_a_chain():
         np.testing.assert_array_equal(found, expected)
         assert found.to_numpy().strides[1] == 0
     # Written out in full, the same tree.
-    for chain in (first, second):
-        chain.stats["proposal_cov"] = chain.stats["proposal_cov"].copy()
-    assert_same(tree, to_datatree(model, held_of(model), [first, second], **arguments))
+    for _, stats in (first, second):
+        stats["proposal_cov"] = stats["proposal_cov"].copy()
+    assert_same(tree, to_datatree(model, raveled_of(model), [first, second], **arguments))
 
 
 def checked(model, positions):
     """Quantities of a model, compared with PyMC's own function of a point."""
-    held = held_of(model)
-    found = Quantities(model, held)(positions)
+    raveled = raveled_of(model)
+    found = Deterministics(model, raveled)(positions)
     wanted = [v for v in model.unobserved_value_vars if not v.name.endswith("__")]
     reference = model.compile_fn(
         wanted, inputs=model.value_vars, point_fn=False, on_unused_input="ignore"
     )
     assert list(found) == [v.name for v in wanted]
     for i in {0, 1, len(positions) // 2, len(positions) - 1}:
-        values = reference(**held.split(positions[i]))
+        values = reference(**raveled.unravel(positions[i]))
         for name, value in zip(found, values, strict=True):
             assert found[name].shape == (len(positions), *np.shape(value)), name
             assert found[name].dtype == np.asarray(value).dtype, name
@@ -246,7 +246,7 @@ def test_quantities_of_many_blocks_with_repeated_positions():
 
 def test_a_repeated_position_is_not_evaluated_again():
     model = normal_model()
-    quantities = Quantities(model, held_of(model))
+    quantities = Deterministics(model, raveled_of(model))
     evaluate, seen = quantities._evaluators[0], []
 
     class Watched:
@@ -285,13 +285,13 @@ def test_numbers_are_as_stable_as_in_pm_sample():
 
 
 def test_nothing_is_compiled_for_simple_models(monkeypatch):
-    monkeypatch.setattr(of_quantities, "_OneByOne", None)
+    monkeypatch.setattr(deterministics, "_PerPosition", None)
     model = normal_model()
-    assert Quantities(model, held_of(model)).names == ["mu", "sigma", "ratio"]
+    assert Deterministics(model, raveled_of(model)).names == ["mu", "sigma", "ratio"]
 
 
 def test_one_by_one_with_and_without_machine_code(monkeypatch):
-    monkeypatch.setattr(of_quantities, "_is_of_blocks", lambda graph: False)
+    monkeypatch.setattr(deterministics, "_is_vectorizable", lambda graph: False)
     model = normal_model()
     with model:
         data = pm.Data("data", [1.0, 2.0])
@@ -317,9 +317,9 @@ def state_space():
         pm.Deterministic("log_likelihood_of_d", pm.logp(d, data).sum())
     positions = np.random.default_rng(5).normal(0.5, 0.2, size=(2, 300, 1))
     logp = model.compile_logp()
-    chains = [ChainDraws(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
+    chains = [(p, {"lp": np.array([logp({"phi": x[0]}) for x in p])}) for p in positions]
     tree = to_datatree(
-        model, held_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
+        model, raveled_of(model), [*chains], tune=100, keep_warmup=False, sampling_time=1.0
     )
     return model, tree
 

@@ -13,17 +13,18 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling.run import model_task as model_run
-from pymc_statespace_filters.sampling.run.model_task import Asked, ModelRun
-from pymc_statespace_filters.sampling.run.thread_pool import Crew, Job
+from pymc_statespace_filters.sampling.run import model_task
+from pymc_statespace_filters.sampling.run.model_task import ModelTask
+from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
 
 
-def asked():
-    return Asked(50, 50, 2, [1], True, None, False, None, DRAMSettings.of({}))
+def request():
+    return SamplingRequest(50, 50, 2, [1], True, None, False, None, DRAMSettings.from_arguments({}))
 
 
 def normal_model(sd=1.0):
@@ -45,36 +46,38 @@ def test_each_model_as_if_alone(models):
 
 
 def test_the_dearest_chains_begin(models, monkeypatch):
-    order, start = [], Crew.start
+    order, start = [], ChainPool.start
     monkeypatch.setattr(
-        Crew, "start", lambda crew, job, run: (order.append(job), start(crew, job, run))
+        ChainPool, "start", lambda pool, *of: (order.append(of[0]), start(pool, *of))[1]
     )
     psf.run_models(models, **SETTINGS)
-    assert order == [Job(1, 0), Job(1, 1), Job(0, 0), Job(0, 1)]
+    assert order == [2, 3, 0, 1]
 
 
 def test_a_cost_is_measured_on_arrays_that_live(models):
     """With what they read gone, these evaluations called whatever address came in its place."""
-    run = ModelRun(models["dear/one"], asked())
-    bind, seen = run.prepare().density.bind, []
+    task = ModelTask(models["dear/one"], request())
+    bind, seen = task.prepare().density.bind, []
 
     def watched():
         bound = bind()
         seen.append(weakref.ref(bound))
         return bound
 
-    run.prepare().density.bind = watched
+    task.prepare().density.bind = watched
     alive = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model_run, "evaluate", lambda density: alive.append(seen[-1]() is not None))
-        assert run.cost() > 0.0
+        patch.setattr(model_task, "evaluate", lambda density: alive.append(seen[-1]() is not None))
+        assert task.cost() > 0.0
     assert alive == [True] * 3
 
 
 def test_threads_are_shared_by_all_models(models, monkeypatch):
-    at_once, ended = [], Crew.ended
+    at_once, finished = [], ChainPool.finished
     monkeypatch.setattr(
-        Crew, "ended", lambda crew, *of: (at_once.append(len(crew.at_work)), ended(crew, *of))[1]
+        ChainPool,
+        "finished",
+        lambda pool, *of: (at_once.append(len(pool.running)), finished(pool, *of))[1],
     )
     psf.run_models(models, cores=3, **SETTINGS)
     assert max(at_once) == 3
@@ -82,23 +85,23 @@ def test_threads_are_shared_by_all_models(models, monkeypatch):
 
 def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
     expected = psf.run_models(models, **SETTINGS)
-    asked = SETTINGS | {"checkpoint": tmp_path, "cores": 2}
+    settings = SETTINGS | {"checkpoint": tmp_path, "cores": 2}
 
-    def interrupted(crew, *others):
-        while min(run.done for run in crew.at_work.values()) < 100:
+    def interrupted(pool, *others):
+        while min(task.n_done for task in pool.running.values()) < 100:
             time.sleep(0.001)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Crew, "ended", interrupted)
+        patch.setattr(ChainPool, "finished", interrupted)
         with pytest.raises(ModelError, match="nothing to return"):  # of the model not begun
-            psf.run_models(models, **asked)
+            psf.run_models(models, **settings)
     assert [len(list(folder.glob("*.log"))) for folder in sorted(tmp_path.iterdir())] == [2, 2]
-    trees = psf.run_models(models, **asked)
+    trees = psf.run_models(models, **settings)
     for name in models:
         assert_identical(trees[name], expected[name])
     with pytest.raises(DataMismatchError, match="draws: "):
-        psf.run_models(models, **asked | {"draws": 60})
+        psf.run_models(models, **settings | {"draws": 60})
 
 
 def test_messages_name_the_model(caplog):
@@ -128,7 +131,7 @@ def test_a_result_takes_less_than_twice_its_memory(monkeypatch):
 
     settings = SETTINGS | {"draws": 40_000, "chains": 4}
     psf.sample_dram(model=model, **SETTINGS)
-    monkeypatch.setattr(model_run, "run_convergence_checks", before_the_checks)
+    monkeypatch.setattr(model_task, "run_convergence_checks", before_the_checks)
     tracemalloc.start()
     try:
         tree = psf.sample_dram(model=model, **settings)
@@ -157,10 +160,10 @@ def test_an_error_names_chain_and_model(models):
 @pytest.mark.parametrize(
     ("models", "message"),
     [
-        ([normal_model()], "expected a mapping"),
-        ({}, r"models=\{\}: expected a mapping"),
-        ({1: normal_model()}, "1 is no name"),
-        ({"": normal_model()}, "'' is no name"),
+        ([normal_model()], "models must be a non-empty mapping"),
+        ({}, r"models must be a non-empty mapping .* got \{\}"),
+        ({1: normal_model()}, "names of models must be .* got 1"),
+        ({"": normal_model()}, "names of models must be .* got ''"),
         ({"a": "b"}, r"models\['a'\] must be a pymc.Model, got 'b'"),
     ],
 )
@@ -172,11 +175,11 @@ def test_bad_models(models, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gather": "some"}, "gather='some'"),
-        ({"ranks_per_chain": 0}, "ranks_per_chain=0"),
-        ({"ranks_per_chain": 2}, "ranks_per_chain=2 without comm"),
-        ({"cores": 0}, "cores=0"),
-        ({"draws": -1}, "draws=-1"),
+        ({"gather": "some"}, "gather must be .* got 'some'"),
+        ({"ranks_per_chain": 0}, "ranks_per_chain must be .* got 0"),
+        ({"ranks_per_chain": 2}, "ranks_per_chain=2 needs comm"),
+        ({"cores": 0}, "cores must be .* got 0"),
+        ({"draws": -1}, "draws must be .* got -1"),
     ],
 )
 def test_bad_settings(settings, message):

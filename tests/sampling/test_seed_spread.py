@@ -10,7 +10,7 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import (
     acceptance_share,
     seed_spread,
     spread_of,
-    spread_warning,
+    variance_advice,
 )
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.noisy_toy import noisy_model
@@ -96,23 +96,23 @@ def test_acceptance_share_is_that_of_a_chain_on_the_noise_alone(variance):
 
 @pytest.mark.parametrize("variance", [0.0, 0.05, 1.0, 3.3, 10.0])
 def test_nothing_is_said_of_a_fair_spread(variance):
-    assert spread_warning(of_variance(variance), "at the start", 0) is None
+    assert variance_advice(of_variance(variance), "at the start", 0) is None
 
 
 def test_too_much_noise_names_chain_place_and_cure():
-    text = spread_warning(of_variance(40.0 * MIDDLE), "at the start", 3)
+    text = variance_advice(of_variance(40.0 * MIDDLE), "at the start", 3)
     assert text.startswith("Chain 3, at the start: ")
     assert "variance of 72.7 over 50 noise seeds" in text
     assert ": 40 times as many" in text
 
 
 def test_too_little_noise_names_the_factor_to_be_saved():
-    text = spread_warning(of_variance(MIDDLE / 250.0), "at the highest-density draw", 1)
+    text = variance_advice(of_variance(MIDDLE / 250.0), "at the highest-density draw", 1)
     assert text.startswith("Chain 1, at the highest-density draw: ")
     assert "250 times fewer" in text
 
 
 def test_estimates_that_fail_are_named():
-    text = spread_warning(of_variance(1.0, n=10, n_failed=20), "at the start", 0)
+    text = variance_advice(of_variance(1.0, n=10, n_failed=20), "at the start", 0)
     assert "failed for 20 of 30 noise seeds" in text
-    assert "failed for 8 of 8" in spread_warning(spread_of(np.full(8, -np.inf)), "here", 0)
+    assert "failed for 8 of 8" in variance_advice(spread_of(np.full(8, -np.inf)), "here", 0)

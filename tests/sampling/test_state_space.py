@@ -140,7 +140,9 @@ def test_failures_come_with_the_filters_reason(filter):
 def test_a_filter_needs_all_its_parameters_held():
     with (
         linear_model(FEW) as model,
-        pytest.raises(ModelError, match=r"of d also depends on spread"),
+        pytest.raises(
+            ModelError, match=r"vars must include spread: the noisy likelihood of d depends"
+        ),
     ):
         DRAM([model["phi"]])
     with linear_model(psf.EKF()) as model:
@@ -152,7 +154,7 @@ def test_held_noise_is_made_once_and_gives_what_its_seed_gives(filter):
     model = linear_model(filter)
     seeds, start = noise_seeds(model), model.initial_point(random_seed=0)
     by_seed, by_normals = (
-        LogDensity(model, model.value_vars, start, seeds, holds_noise=holds)
+        LogDensity(model, model.value_vars, start, seeds, fixed_noise=holds)
         for holds in (False, True)
     )
     made_inside = {type(n.op) for n in by_normals._function.maker.fgraph.apply_nodes}

@@ -1,1 +1,1 @@
-"""One iteration of a chain, in machine code."""
+"""Iterations of a chain in machine code: proposal, acceptance, adaptation."""

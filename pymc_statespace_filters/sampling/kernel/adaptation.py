@@ -1,31 +1,30 @@
-"""Adaptation of a Gaussian random walk: what the proposal covariance learns from the chain.
+"""Adaptation of the proposal covariance of a Gaussian random walk to the chain.
 
 Two schemes:
 
 ``"chain"``, the thesis's burn-in (Eqs. 3.27-3.29 and Fig. 4)
-    The warm-up is a succession of blocks of ``adapt_every`` iterations, each proposing with
-    ``(2.38^2 / d) COV`` of what came before it, plus a small multiple of the identity. A block that
-    accepts next to nothing tells nothing about the covariance: the scale shrinks instead.
+    The warm-up is divided into blocks of ``adapt_every`` iterations, each proposing with
+    ``(2.38^2 / d) COV`` of earlier iterations, plus a small multiple of the identity. A block that
+    accepts almost nothing says nothing about the covariance; the proposals are scaled down instead.
 ``"continuous"``, adaptive Metropolis (Haario, Saksman and Tamminen 2001)
-    The same covariance renewed at every iteration, once a first block has shown that the chain
-    moves.
+    The same covariance, updated at every iteration after the first block in which the chain moved.
 
-The state is a few small arrays, views of one vector. Machine code changes them in place with
-`learn`. Adaptation must stop before draws are kept: whoever drives it simply stops calling.
+The state is a few small arrays, views of one vector, that `learn` changes in place. Adaptation must
+stop before draws are kept: the caller then no longer calls `learn`.
 
 Differences from the sources
-    * "What came before" is the last block for the first two blocks and from then on the latest half
-      to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance does
-      not rest on one block alone, which is poor once d is more than a few.
-    * A covariance from few accepted moves is blended with the covariance in use before, which
+    * "Earlier iterations" are the last block for the first two blocks and from then on the latest
+      half to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance
+      is not estimated from one block alone, which is poor once d is more than a few.
+    * A covariance from few accepted moves is averaged with the covariance in use before, which
       counts as d/5 moves. So a direction not explored yet keeps a proposal of sensible size.
-    * The scale shrinks in degrees: to a fifth where a block moves next to nowhere, to a half where
-      the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted. Between
-      the two lies the acceptance at which pseudo-marginal chains work best.
-    * After several stalls in a row the first covariance is back: with a noisy likelihood a chain
-      can sit on a lucky estimate, which no shrinking mends, and must still be able to leave.
-    * Before the first block that moves, a quarter of a block without a single acceptance already
-      shrinks the scale: a starting covariance is a guess.
+    * The scale is reduced in steps: to a fifth after a block that accepts almost nothing, to a half
+      if the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted.
+      Between the two lies the acceptance at which pseudo-marginal chains work best.
+    * After several stalls in a row the first covariance is restored: with a noisy likelihood a
+      chain can stay at an overestimate, however small its proposals, and must be able to leave.
+    * Before the first block with moves, a quarter of a block without a single acceptance already
+      reduces the scale, because the first covariance is a guess.
 
 References
 ----------
@@ -53,26 +52,26 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     N,
 )
 
-# Share of a block's iterations that must move at all, by any stage, to teach a covariance.
+# Fraction of a block's iterations that must move, by any stage, for a covariance.
 LEAST_MOVED = 0.02
-# Below the first, the first stage's share of acceptances halves the scale; above the second, the
-# scale is 1 again.
+# Acceptance rates of the first stage: below the first the scale is halved, above the second it is
+# 1 again.
 LOW_ACCEPTANCE, FAIR_ACCEPTANCE = 0.05, 0.10
-# Factors of the proposals' standard deviation when next to nothing moved, and when little did.
+# Factors of the proposals' standard deviation after almost no moves, and after few.
 STALLED, SHRINK = 0.2, 0.5
-# Stalls in a row that shrink the proposals; the next one starts anew.
+# Stalls in a row that reduce the scale; the next one resets the adaptation.
 MOST_STALLS = 6
 # Weight of the covariance in use before, in accepted moves for each dimension.
 PRIOR_MOVES = 0.2
 # The multiple of the identity, relative to the mean variance.
 JITTER = 1e-8
 
-# For functions that compiled functions alone call: what Python needs takes as long to compile.
+# For functions called only by compiled ones: the wrappers for Python double the compile time.
 _internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class AdaptationSettings(NamedTuple):
-    """What does not change while a chain runs.
+    """Settings that are constant while a chain runs.
 
     Attributes
     ----------
@@ -91,15 +90,16 @@ def learn(
     position: np.ndarray,
     stage: int,
 ) -> None:
-    """Take in one iteration of warm-up, under the scheme ``"continuous"`` or ``"chain"``, in place.
+    """Adapt to one iteration of warm-up, in place.
 
     Parameters
     ----------
     settings : AdaptationSettings
     continuous : bool
+        The scheme: ``"continuous"`` or ``"chain"``.
     state : AdaptationState
     position : ndarray, shape (d,)
-        Where the chain stands after the iteration.
+        Of the chain after the iteration.
     stage : int
         The stage whose proposal was accepted, 0 if none was.
     """
@@ -116,7 +116,7 @@ def learn(
         _learn_covariance(state)
 
 
-# The helpers below are written as loops, which compile several times faster than array expressions.
+# The functions below use loops, which compile several times faster than array expressions.
 
 
 @_internal
@@ -133,7 +133,7 @@ def _scale_into(target: np.ndarray, matrix: np.ndarray, factor: float) -> None:
 
 @_internal
 def _include(moments: Moments, n: float, mean: np.ndarray) -> None:
-    """Count in a piece that does not scatter (Chan, Golub and LeVeque)."""
+    """Add n iterations at one position (Chan, Golub and LeVeque)."""
     before, old = moments.counts[N], moments.mean
     total = max(1.0, before + n)
     for i in range(mean.size):
@@ -147,7 +147,7 @@ def _include(moments: Moments, n: float, mean: np.ndarray) -> None:
 
 @_internal
 def _merge(moments: Moments, other: Moments) -> None:
-    """Make moments those of two pieces together."""
+    """Add the moments of another piece of the chain."""
     dim = other.mean.size
     for i in range(dim):
         for j in range(dim):
@@ -177,7 +177,7 @@ def _has_stalled(settings: AdaptationSettings, numbers: np.ndarray, block: np.nd
 
 @_internal
 def _forget_block(state: AdaptationState) -> None:
-    """Forget the stalled block, propose closer by; after too many stalls forget everything."""
+    """Discard a stalled block and reduce the scale; after too many stalls reset everything."""
     numbers = state.numbers
     _clear(state.block)
     if numbers[N_STALLS] < MOST_STALLS:
@@ -195,7 +195,7 @@ def _forget_block(state: AdaptationState) -> None:
 
 @_internal
 def _close_block(state: AdaptationState) -> None:
-    """File a complete block and let its acceptance move the scale."""
+    """Merge a complete block, and set the scale by its acceptance rate."""
     numbers, block = state.numbers, state.block.counts
     if block[FIRST] < LOW_ACCEPTANCE * block[N]:
         numbers[SCALE] *= SHRINK
@@ -223,7 +223,7 @@ def _replace(moments: Moments, other: Moments) -> None:
 
 @_internal
 def _learn_covariance(state: AdaptationState) -> None:
-    """Proposal covariance, thesis Eqs. 3.28-3.29, blended with the one in use before."""
+    """Proposal covariance, thesis Eqs. 3.28-3.29, averaged with the one in use before."""
     moments = _copy_of_moments(state.older)
     _merge(moments, state.recent)
     if state.block.counts[N] > 0.0:
@@ -241,14 +241,14 @@ def _learn_covariance(state: AdaptationState) -> None:
     for i in range(dim):
         cov[i, i] += JITTER * mean_variance
     chol = _cholesky(cov)
-    if 0.0 < chol[dim - 1, dim - 1] < np.inf:  # else the draws have overflowed (or NaN)
+    if 0.0 < chol[dim - 1, dim - 1] < np.inf:  # else the draws have overflowed or are NaN
         _scale_into(state.cov, cov, 1.0)
         _scale_into(state.chol, chol, 1.0)
 
 
 @_internal
 def _cholesky(cov: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor, NaN on and after the first column that has none."""
+    """Lower Cholesky factor, NaN from the first column without one."""
     dim = cov.shape[0]
     chol = np.zeros((dim, dim))
     for j in range(dim):

@@ -1,4 +1,4 @@
-"""What the adaptation of a chain has learnt, as views of one vector that can be stored."""
+"""The state of the adaptation, as views of one vector that can be stored."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,12 @@ N, MOVED, FIRST = range(3)
 
 
 class Moments(NamedTuple):
-    """Running moments of a piece of chain: what a covariance needs and no more.
+    """Running moments of a piece of a chain, for its covariance.
 
     Attributes
     ----------
     counts : ndarray, shape (3,)
-        Iterations; how many moved; and how many of these by the first stage.
+        Iterations; those that moved; those that moved by the first stage.
     mean : ndarray, shape (d,)
         Mean of the positions.
     scatter : ndarray, shape (d, d)
@@ -34,14 +34,14 @@ class Moments(NamedTuple):
 
 
 class AdaptationState(NamedTuple):
-    """What the adaptation has learnt so far.
+    """State of the adaptation.
 
     Attributes
     ----------
     numbers : ndarray, shape (3,)
-        Cell SCALE: factor, at most 1, by which low acceptance holds the standard deviations of the
-        proposals below ``2.38 / sqrt(d)`` times those of the draws. N_BLOCKS: complete blocks that
-        taught a covariance. N_STALLS: blocks in a row that moved next to nowhere.
+        Cell SCALE: factor, at most 1, of the standard deviations of the proposals relative to
+        ``2.38 / sqrt(d)`` times those of the draws, reduced at low acceptance. N_BLOCKS: complete
+        blocks that were used for a covariance. N_STALLS: blocks in a row with almost no moves.
     cov : ndarray, shape (d, d)
         Proposal covariance of the first stage, all factors included.
     chol : ndarray, shape (d, d)
@@ -49,10 +49,10 @@ class AdaptationState(NamedTuple):
     base : ndarray, shape (d, d)
         The proposal covariance when the block began.
     first_cov : ndarray, shape (d, d)
-        The proposal covariance that the chain began with.
+        The first proposal covariance of the chain.
     block, recent, older : Moments
-        The block now running; the complete blocks since their number was last a power of two; and
-        those between the power of two before that and it.
+        The current block; the complete blocks since their number was last a power of two; and
+        those between the previous two powers of two.
     """
 
     numbers: np.ndarray
@@ -71,7 +71,7 @@ class AdaptationState(NamedTuple):
 
 
 def start_adaptation(cov: np.ndarray) -> AdaptationState:
-    """Make the state of a chain that has not moved yet.
+    """Make the initial state.
 
     Parameters
     ----------
@@ -91,13 +91,13 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
 
 
 def packed_size(dim: int) -> int:
-    """Numbers that a state of dimension d is packed into."""
+    """Length of a packed state of dimension d."""
     return 3 + 4 * dim**2 + 3 * (3 + dim + dim**2)
 
 
 @register_jitable
 def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
-    """See a vector of `packed_size` numbers as a state: views, which change with it."""
+    """View a vector of length `packed_size` as a state."""
     square, n_moments = dim * dim, 3 + dim + dim * dim
     at = 3 + 4 * square
     return AdaptationState(
@@ -113,7 +113,7 @@ def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
 
 
 def pack(state: AdaptationState, packed: np.ndarray) -> None:
-    """Write a state into a vector of `packed_size` numbers: plain data, to be stored."""
+    """Write a state into a vector of length `packed_size`."""
     for mine, given in zip(unpack(packed, len(state.cov)), state, strict=True):
         if isinstance(given, Moments):
             for my_part, part in zip(mine, given, strict=True):

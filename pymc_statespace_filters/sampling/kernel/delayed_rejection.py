@@ -1,6 +1,6 @@
 """Delayed rejection: the acceptance probability of any number of stages, in logs.
 
-A chain stands at ``y``. The first proposal ``z_1`` is rejected, so a second, ``z_2``, is made, that
+Let a chain be at ``y``. The first proposal ``z_1`` is rejected, so a second, ``z_2``, is made, that
 may depend on both; and so on. The probability of accepting the i-th that keeps the chain reversible
 is (thesis, Eq. 3.32)::
 
@@ -10,8 +10,8 @@ is (thesis, Eq. 3.32)::
     N_i = pi(z_i) q_1(z_i, z_{i-1}) q_2(z_i, z_{i-1}, z_{i-2}) ... q_i(z_i .. y)
                   [1 - alpha_1(z_i, z_{i-1})] ... [1 - alpha_{i-1}(z_i .. z_1)]
 
-Every factor belongs to a contiguous part of the path ``z_0 = y, z_1, .. z_i``, walked forwards or
-backwards, and N_i is D_i of the path walked backwards. So one table over the parts says it all:
+Every factor belongs to a contiguous part of the path ``z_0 = y, z_1, .. z_i``, in forward or
+backward direction, and N_i is D_i of the reversed path. So one table over the parts is enough:
 with s and e the first and last point of a part, ``log_q[s, e]`` is the log-density of proposing z_e
 as the stage ``|e - s|`` from z_s over the points between them, and ``log_acceptance`` fills the
 table of log alpha from the short parts to the long ones. Nothing is assumed of the proposals: they
@@ -36,17 +36,17 @@ def log_acceptance(log_pi: np.ndarray, log_q: np.ndarray, stage: int) -> float:
     """Log-probability of accepting the proposal of a stage, thesis Eq. 3.32.
 
     A path that cannot occur (a point of zero probability, a proposal of zero density, an earlier
-    proposal that would surely have been accepted) has the log-density minus infinity and needs no
-    care by the caller. If the path is impossible in both directions, the ratio is 0/0 and the
+    proposal accepted with certainty) has the log-density minus infinity and needs no special
+    treatment by the caller. If the path is impossible in both directions, the ratio is 0/0 and the
     proposal is rejected.
 
     Parameters
     ----------
     log_pi : ndarray, shape (stage + 1,) or longer
-        Log-density of the target at z_0 .. z_stage, up to a constant. Minus infinity is a value;
-        NaN and plus infinity are not.
+        Log-density of the target at z_0 .. z_stage, up to a constant. May be minus
+        infinity, but not NaN or plus infinity.
     log_q : ndarray, shape (stage + 1, stage + 1) or larger
-        Log-density of the proposals, ``log_q[s, e]`` as this module's page defines it, up to one
+        Log-density of the proposals, ``log_q[s, e]`` as defined in the module docstring, up to one
         constant for each stage. The diagonal is not read.
     stage : int
         The stage, from 1.
@@ -126,7 +126,7 @@ def gaussian_log_acceptance(
     log_pi: np.ndarray, offsets: np.ndarray, stage_scale: float, stage: int
 ) -> float:
     """``log_acceptance`` with the proposals of ``gaussian_log_proposals``."""
-    if stage == 1:  # what nearly every iteration asks: the proposal is symmetric and cancels
+    if stage == 1:  # most calls: the symmetric proposal cancels
         return _log_ratio_to_one(log_pi[1], log_pi[0])
     return log_acceptance(log_pi, gaussian_log_proposals(offsets, stage_scale, stage), stage)
 

@@ -1,35 +1,35 @@
-"""Random numbers of a chain, drawn for many iterations at a time.
+"""Random numbers of a chain, drawn for a block of iterations at a time.
 
 One call of a generator costs microseconds whether it returns one number or a thousand. A block of
-numbers is a function of the chain's key and the block's index, so that a chain can be taken up
-again anywhere and does not depend on who runs it.
+numbers is a function of the chain's key and the block's index, so that a chain can be resumed at
+any iteration, on any rank.
 """
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.kernel.state import Random
+from pymc_statespace_filters.sampling.kernel.state import RandomBlock
 
 BLOCK = 256
 
 
-def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> Random:
+def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:
     """Draw the random numbers of iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``.
 
     Parameters
     ----------
     key : ndarray of uint64, shape (2,)
-        Belongs to the chain.
+        Of the chain.
     index : int
     n_stages, dim, n_noisy : int
-        Most stages of an iteration, dimension d, noisy variables.
+        Maximal number of stages, dimension d, number of noisy variables.
 
     Returns
     -------
-    Random
+    RandomBlock
     """
-    # Each index begins 2^128 numbers after the one before it.
+    # Consecutive indices start 2^128 numbers apart.
     rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
-    return Random(
+    return RandomBlock(
         rng.standard_normal((BLOCK, n_stages, dim)),
         -rng.standard_exponential((BLOCK, n_stages + 1)),
         draw_seeds(rng, (BLOCK, n_stages, n_noisy)),
@@ -42,10 +42,10 @@ def draw_key(rng: np.random.Generator) -> np.ndarray:
 
 
 def side_generator(key: np.ndarray) -> np.random.Generator:
-    """Make a generator of the chain's key whose numbers are in none of its blocks."""
+    """Make a generator from the chain's key that overlaps none of its blocks."""
     return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 1]))
 
 
 def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw seeds of noise, non-negative int64 of the given shape."""
+    """Draw noise seeds, non-negative int64 of the given shape."""
     return rng.integers(0, np.iinfo(np.int64).max, size=shape, dtype=np.int64)

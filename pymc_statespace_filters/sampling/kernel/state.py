@@ -1,6 +1,6 @@
-"""The plain arrays that a chain's machine code works on, and what their columns mean.
+"""Arrays that the machine code of a chain reads and writes, and the meaning of their columns.
 
-Everything here is data: it is made in Python, changed in machine code, and stored as it is.
+They are made in Python, changed in place by machine code, and stored as they are in a checkpoint.
 """
 
 from typing import NamedTuple
@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.pytensor_function import Call
+from pymc_statespace_filters.pymc_model.inspection import FAILURES
+from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 
 HEALTH_SIZE = 3
-# Reasons of a failure that no filter reports: a value that is no density, an exception.
+# Failure codes that no filter reports: a log-density of NaN or plus infinity, an exception.
 NOT_A_NUMBER, RAISED = -1, -2
 
 # Columns of a chain's numbers, and of the numbers and counts of its draws.
@@ -19,22 +21,22 @@ ACCEPTANCE, SCALING = 2, 3
 N_NUMBERS = 4
 STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED = range(6)
 N_COUNTS = 6
-# Cells by which a running chain and whoever waits for it talk.
-PAUSE, DONE = range(2)
+# Cells of the control block that a running chain shares with the main thread.
+PAUSE_REQUESTED, N_DONE = range(2)
 
 
-class Density(NamedTuple):
-    """A log-density that machine code can call.
+class NativeLogDensity(NamedTuple):
+    """A log-density as machine code calls it.
 
     Attributes
     ----------
     call : Call
         Its results are the log-density, the health of each filter, and the noise it used if the
-        chain carries that.
+        chain carries its noise.
     position : ndarray, shape (d,)
-        What the call reads.
+        Read by the call.
     seeds : ndarray of int64, shape (noisy,)
-        What the call reads too.
+        Read by the call.
     n_healths : int
     """
 
@@ -44,8 +46,8 @@ class Density(NamedTuple):
     n_healths: int
 
 
-class Settings(NamedTuple):
-    """What does not change within a phase of a chain, warm-up or sampling."""
+class PhaseSettings(NamedTuple):
+    """Settings that are constant within a phase of a chain, warm-up or sampling."""
 
     n_stages: int
     stage_scale: float
@@ -55,22 +57,24 @@ class Settings(NamedTuple):
     adapt_every: int
 
 
-class State(NamedTuple):
-    """Where a chain stands: plain arrays, changed in place.
+class ChainState(NamedTuple):
+    """The state of a chain: plain arrays, changed in place.
 
     Attributes
     ----------
     position : ndarray, shape (d,)
         On the unconstrained space.
     seeds : ndarray of int64, shape (noisy,)
-        The noise behind the estimate.
+        Noise seeds of the estimate.
     numbers : ndarray, shape (3,)
-        Log-density as it was estimated when the chain came here; smallest effective number of
-        particles behind it (infinity without noise); log-density of the screen.
+        Log-density as estimated when the point was accepted; smallest effective number of particles
+        of the estimate (infinity without noise); log-density of the screen.
     adaptation : ndarray
-        What was learnt, see `adaptation_state.unpack`.
+        State of the adaptation, see `adaptation_state.unpack`.
     carried : ndarray
-        The noise itself, where the chain moves it instead of drawing it anew.
+        The noise itself, if proposals are correlated with it.
+    key : ndarray of uint64, shape (2,)
+        Key of the chain's random numbers.
     """
 
     position: np.ndarray
@@ -78,19 +82,25 @@ class State(NamedTuple):
     numbers: np.ndarray
     adaptation: np.ndarray
     carried: np.ndarray
+    key: np.ndarray
+
+    @property
+    def proposal_cov(self) -> np.ndarray:
+        """Covariance of the first stage's proposals, shape (d, d)."""
+        return unpack(self.adaptation, self.position.size).cov
 
 
-class Random(NamedTuple):
-    """Random numbers of consecutive iterations: the first axis.
+class RandomBlock(NamedTuple):
+    """Random numbers of consecutive iterations, along the first axis.
 
     Attributes
     ----------
     normals : ndarray, shape (iterations, stages, d)
         Standard normals, for the proposals.
     log_uniforms : ndarray, shape (iterations, stages + 1)
-        Logs of uniforms for acceptance: by stage, and of a screened move.
+        Logs of uniforms for acceptance: of each stage, and of a screened move.
     seeds : ndarray of int64, shape (iterations, stages, noisy)
-        Seeds of the likelihoods' own noise.
+        Noise seeds of the estimated likelihoods.
     """
 
     normals: np.ndarray
@@ -99,7 +109,7 @@ class Random(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """What is noted down of each iteration: the first axis.
+    """Record of the iterations of a chain, along the first axis.
 
     Attributes
     ----------
@@ -108,10 +118,10 @@ class Draws(NamedTuple):
         Columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING.
     counts : ndarray of int64, shape (n, 6)
         Columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS, N_FAILED, FAILURE
-        (the last one's code), N_SCREENED, N_SCREEN_FAILED.
+        (the last failure code), N_SCREENED, N_SCREEN_FAILED.
     seeds : ndarray of int64, shape (n, noisy)
     covs : ndarray, shape (n_covs, d, d)
-        Covariance of the first stage's proposals, of the first few iterations, or of none.
+        Covariance of the first stage's proposals, in the first iterations only.
     """
 
     positions: np.ndarray
@@ -122,14 +132,14 @@ class Draws(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """What one evaluation gives.
+    """Result of one evaluation of a log-density.
 
     Attributes
     ----------
     log_density : float
-        Never NaN nor plus infinity; a failed evaluation is minus infinity.
+        Never NaN or plus infinity; minus infinity after a failure.
     failure : int
-        0, or the code of the reason: a key of ``inspection.FAILURES``, or ``NOT_A_NUMBER``.
+        0, or the failure code: a key of ``inspection.FAILURES``, or ``NOT_A_NUMBER``.
     n_effective : float
         Smallest effective number of particles in any filter, infinity without noisy filters.
     """
@@ -137,3 +147,10 @@ class Evaluation(NamedTuple):
     log_density: float
     failure: int
     n_effective: float
+
+
+def failure_reason(code: int) -> str:
+    """Describe a failure code in words."""
+    if code == NOT_A_NUMBER:
+        return "the log-density is NaN or plus infinity"
+    return FAILURES.get(code, f"failure {code}")

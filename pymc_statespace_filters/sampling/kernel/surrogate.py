@@ -1,4 +1,4 @@
-"""Surrogate transitions: a move made on a cheap density, put right for the expensive one.
+"""Surrogate transitions: a move made on a cheap density, corrected for the expensive one.
 
 Let K be any kernel reversible for a density c, here delayed rejection on a screen. From y it moves
 to z, and the chain goes there with probability (Liu 2001, section 9.4.3)::
@@ -6,8 +6,8 @@ to z, and the chain goes there with probability (Liu 2001, section 9.4.3)::
     min(1, pi(z) c(y) / (pi(y) c(z)))
 
 For z other than y, pi(y) K(y, z) times this is K(y, z) c(y) min(pi(y) / c(y), pi(z) / c(z)),
-which is symmetric in y and z: the chain is reversible for pi, however far c is from it. But where
-c is zero and pi is not, no move of K ever arrives.
+which is symmetric in y and z: the chain is reversible for pi, for any c. But points where c is zero
+and pi is not are never reached.
 
 References
 ----------
@@ -22,24 +22,24 @@ from numba import njit
 def log_surrogate_acceptance(
     log_pi_here: float, log_pi_there: float, log_c_here: float, log_c_there: float
 ) -> float:
-    """Log-probability of accepting where a kernel reversible for c has moved.
+    """Log-probability of accepting a move of a kernel reversible for c.
 
     Parameters
     ----------
     log_pi_here, log_pi_there : float
-        Log-density of the target at y and z, up to one constant. Minus infinity is a value; NaN and
-        plus infinity are not.
+        Log-density of the target at y and z, up to one constant. May be minus infinity, but not NaN
+        or plus infinity.
     log_c_here, log_c_there : float
         Log-density of the surrogate there, likewise.
 
     Returns
     -------
     float
-        In [-inf, 0]; 0/0 is taken for zero.
+        In [-inf, 0]; 0/0 counts as zero.
 
     Examples
     --------
-    The surrogate has paid for the move already:
+    The surrogate has already accounted for the change of density:
 
     >>> log_surrogate_acceptance(0.0, -1.5, 0.0, -1.5)
     0.0

@@ -1,13 +1,13 @@
-"""A chain in machine code: propose, evaluate, accept, adapt, note down, again and again.
+"""The iterations of a chain in machine code: propose, evaluate, accept, adapt, record.
 
-The step method of PyMC makes one iteration at a time with it, ``sample_dram`` as many as there are.
+PyMC's step method calls it for one iteration at a time, ``sample_dram`` for many.
 
-With a noisy likelihood every proposal of every stage has noise of its own, and the estimate of the
-current point stays as it is. The densities of the noise then cancel in Eq. 3.32, so that the chain
-is exact for prior times expected likelihood, whatever the number of stages.
+With a noisy likelihood every proposal of every stage has its own noise, and the estimate at the
+current point is kept. The densities of the noise then cancel in Eq. 3.32, so that the chain is
+exact for prior times expected likelihood, with any number of stages.
 
-With a screen the whole delayed-rejection move runs on a cheap density, and only its end point is
-put to the expensive one, once, with fresh noise (see `surrogate_transition`).
+With a screen the whole delayed-rejection move runs on a cheap density, and the expensive one is
+evaluated only at its end point, once, with fresh noise (see `surrogate`).
 
 References
 ----------
@@ -29,18 +29,18 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
-    DONE,
     FAILURE,
     HEALTH_SIZE,
     LOG_DENSITY,
     LOG_SCREEN,
+    N_DONE,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
     N_SCREEN_FAILED,
     N_SCREENED,
     NOT_A_NUMBER,
-    PAUSE,
+    PAUSE_REQUESTED,
     RAISED,
     SCALING,
     STAGE,
@@ -50,7 +50,7 @@ from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acce
 
 
 class _Move(NamedTuple):
-    """Outcome of delayed rejection; the new point, if any, is in the density's own arrays."""
+    """Result of delayed rejection; an accepted point is in the arrays of the density."""
 
     stage: int
     value: Evaluation
@@ -61,13 +61,13 @@ class _Move(NamedTuple):
 
 
 _internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-# For a function with one caller, which else would be optimised twice.
-_pasted = njit(error_model="numpy", nogil=True, inline="always")
+# For a function with one caller, which would otherwise be optimised twice.
+_inlined = njit(error_model="numpy", nogil=True, inline="always")
 
 
 @_internal
 def _copy(source, target):
-    # An assignment of slices would compile several seconds of messages about their shapes.
+    # Assigning slices would spend seconds on compiling messages about their shapes.
     for i in range(target.size):
         target[i] = source[i]
 
@@ -76,24 +76,25 @@ _SOURCES = (
     "transition.py",
     "state.py",
     "adaptation.py",
+    "adaptation_state.py",
     "delayed_rejection.py",
     "surrogate.py",
 )
 _SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
 
 
-def _kept(function):
-    """Compile for Python, once for all processes."""
+def _cached(function):
+    """Compile for Python and cache on disk for all processes."""
     key = digest(function.__name__, _SOURCE)
     return cached_on_disk(njit(function, error_model="numpy", nogil=True), key)
 
 
-@_kept
+@_cached
 def evaluate(density):
-    """Evaluate at the density's own position and seeds.
+    """Evaluate a `NativeLogDensity` at the position and seeds in its arrays.
 
-    The log-density is never NaN nor plus infinity: an evaluation that failed is minus infinity with
-    the code of its reason.
+    The log-density is never NaN or plus infinity: a failed evaluation gives minus infinity and a
+    failure code.
     """
     if not make_call(density.call):
         return Evaluation(-np.inf, RAISED, 0.0)
@@ -110,7 +111,7 @@ def evaluate(density):
 
 @_internal
 def _delayed_rejection(density, log_density, position, chol, settings, random, k):
-    """Propose stage by stage until one is accepted or all are spent (thesis, Eqs. 3.30-3.32)."""
+    """Propose stage by stage until a proposal is accepted (thesis, Eqs. 3.30-3.32)."""
     dim = position.size
     log_pi = np.empty(settings.n_stages + 1)
     log_pi[0] = log_density
@@ -142,8 +143,8 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
 
 
 @_internal
-def _stand(state, density, value, log_screen):
-    """Move to where a density was evaluated, and keep the estimate."""
+def _set_current(state, density, value, log_screen):
+    """Take the point just evaluated, and its estimate, as the current state."""
     _copy(density.position, state.position)
     _copy(density.seeds, state.seeds)
     state.numbers[LOG_DENSITY] = value.log_density
@@ -153,22 +154,22 @@ def _stand(state, density, value, log_screen):
     _copy(density.call.out[first:], state.carried)
 
 
-@_pasted
+@_inlined
 def _move(settings, target, state, chol, random, k, counts):
-    """One iteration without a screen; the probability of accepting its first proposal."""
+    """One iteration without a screen; the acceptance probability of its first proposal."""
     log_density = state.numbers[LOG_DENSITY]
     move = _delayed_rejection(target, log_density, state.position, chol, settings, random, k)
     if move.stage > 0:
-        _stand(state, target, move.value, 0.0)
+        _set_current(state, target, move.value, 0.0)
     counts[STAGE], counts[N_EVALUATIONS] = move.stage, move.n_evaluations
     counts[N_FAILED], counts[FAILURE] = move.n_failed, move.failure
     counts[N_SCREENED], counts[N_SCREEN_FAILED] = 0, 0
     return move.acceptance
 
 
-@_pasted
+@_inlined
 def _screened_move(settings, target, screen, state, chol, random, k, counts):
-    """One iteration whose moves a screen makes; the probability of accepting what it proposed."""
+    """One iteration on a screen; the probability of accepting its end point."""
     log_screen = state.numbers[LOG_SCREEN]
     move = _delayed_rejection(screen, log_screen, state.position, chol, settings, random, k)
     counts[STAGE], counts[N_EVALUATIONS] = 0, 0
@@ -187,7 +188,7 @@ def _screened_move(settings, target, screen, state, chol, random, k, counts):
         state.numbers[LOG_DENSITY], value.log_density, log_screen, move.value.log_density
     )
     if random.log_uniforms[k, settings.n_stages] < log_alpha:
-        _stand(state, target, value, move.value.log_density)
+        _set_current(state, target, value, move.value.log_density)
         counts[STAGE] = move.stage
     return np.exp(log_alpha)
 
@@ -201,18 +202,18 @@ def _scaling(chol):
     return np.exp(total / chol.shape[0])
 
 
-@_kept
-def advance(settings, target, screen, state, random, first, draws, row, n, talk):
-    """Make up to n iterations, with random numbers from ``first``, noted down from ``row``.
+@_cached
+def advance(settings, target, screen, state, random, first, draws, row, n, control):
+    """Make up to n iterations, with random numbers from row ``first``, recorded from ``row``.
 
-    It returns how many it made, and leaves the state where the last one ended: fewer than n if
-    somebody asked for a pause, or if the model raised.
+    Returns the number of iterations made: fewer than n if a pause was requested or the model
+    raised. The state is that after the last of them.
     """
     learnt = unpack(state.adaptation, state.position.size)
     adaptation = AdaptationSettings(settings.adapt_every)
     scaling = _scaling(learnt.chol)
     done = 0
-    while done < n and talk[PAUSE] == 0:
+    while done < n and control[PAUSE_REQUESTED] == 0:
         at, k = row + done, first + done
         counts, numbers = draws.counts[at], draws.numbers[at]
         if settings.screened:
@@ -235,5 +236,5 @@ def advance(settings, target, screen, state, random, first, draws, row, n, talk)
             learn(adaptation, settings.continuous, learnt, state.position, counts[STAGE])
             scaling = _scaling(learnt.chol)
         done += 1
-        talk[DONE] += 1
+        control[N_DONE] += 1
     return done

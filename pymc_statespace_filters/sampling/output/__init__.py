@@ -1,1 +1,1 @@
-"""From draws to a DataTree, statistics and warnings."""
+"""From draws to a DataTree: statistics, deterministics, warnings, progress."""

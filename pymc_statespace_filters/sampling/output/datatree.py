@@ -1,11 +1,11 @@
 """Whole chains as the DataTree that ``pm.sample`` returns.
 
-PyMC's own converter makes the tree, so that groups, dimensions, coordinates, data and attributes
-follow its conventions. It is handed traces filled in bulk, instead of draw by draw.
+PyMC's own converter makes the DataTree, so that groups, dimensions, coordinates, data and
+attributes follow its conventions. Its input is traces filled in bulk instead of draw by draw.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -16,71 +16,53 @@ from pymc.model import Model
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.output.deterministics import Quantities
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.output.deterministics import Deterministics
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
 # Groups with draws, and those with statistics of them.
 SAMPLE_STATS = {"sample_stats", "warmup_sample_stats"}
 SAMPLED = {"posterior", "warmup_posterior"} | SAMPLE_STATS
 
 
-class ChainDraws(NamedTuple):
-    """A whole chain.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n, d)
-        After each iteration, on the unconstrained space.
-    stats : dict of str to ndarray, shape (n, ...)
-        By their names in ``sample_stats``. What is the same after every iteration may come as a
-        view without a stride, as `numpy.broadcast_to` gives: it stays one.
-    """
-
-    positions: np.ndarray
-    stats: dict[str, np.ndarray]
-
-    def between(self, begin: int, end: int) -> "ChainDraws":
-        """Cut out the iterations from ``begin`` to before ``end``."""
-        cut = slice(begin, end)
-        return ChainDraws(
-            self.positions[cut], {name: values[cut] for name, values in self.stats.items()}
-        )
+# Positions of a chain, shape (n, d), and its statistics by their names in ``sample_stats``, shape
+# (n, ...). A statistic that is constant may be a view without a stride, as of `numpy.broadcast_to`.
+ChainArrays = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 def to_datatree(
     model: Model,
-    held: HeldVariables,
-    chains: list[ChainDraws],
+    raveled: RaveledVariables,
+    chains: list[ChainArrays],
     *,
     tune: int,
     keep_warmup: bool,
     sampling_time: float,
     attrs: Mapping[str, Any] | None = None,
 ) -> DataTree:
-    """Turn whole chains into what ``pm.sample`` returns.
+    """Convert whole chains to the DataTree that ``pm.sample`` returns.
 
     Parameters
     ----------
     model : pymc.Model
-    held : HeldVariables
+    raveled : RaveledVariables
         All value variables of the model, in the order of the positions.
-    chains : list of ChainDraws
-        Warm-up and draws; they are taken out of the list, so that memory holds them no longer than
-        it must. Where chains were interrupted at different iterations, those are kept, and cut to
-        one length, that give the most draws together.
+    chains : list of (positions, statistics)
+        Warm-up and draws: positions, shape (n, d), and statistics by name, shape (n, ...). The list
+        is emptied, to release memory early. If chains were interrupted at different iterations,
+        those are kept, and cut to one length, that give the most draws in all.
     tune : int
-        Iterations of warm-up, at the beginning of each chain; all of a chain that has no more.
+        Iterations of warm-up, at the beginning of each chain.
     keep_warmup : bool
-        Whether the warm-up is kept, in groups of its own.
+        Whether the warm-up is kept, in its own groups.
     sampling_time : float
         In seconds.
     attrs : mapping of str to any, optional
-        Attributes of the groups with draws and statistics, beside PyMC's.
+        Attributes of the groups with draws and statistics, in addition to PyMC's.
 
     Returns
     -------
     xarray.DataTree
-        Without a group ``posterior`` if no chain went beyond its warm-up.
+        Without a group ``posterior`` if no chain finished its warm-up.
 
     Raises
     ------
@@ -88,30 +70,42 @@ def to_datatree(
         If no iteration is to be kept.
     """
     skipped = 0 if keep_warmup else tune
-    lengths = [len(chain.positions) for chain in chains]
+    lengths = [len(positions) for positions, _ in chains]
     longest, length = _most_iterations([length - skipped for length in lengths])
     if length <= 0:
         raise ModelError(
             f"the chains ended after {', '.join(map(str, lengths))} iterations, of which {tune} "
             "are warm-up: there is nothing to return"
         )
-    kept = [chains[i].between(skipped, skipped + length) for i in longest]
+    kept = [_cut(chains[i], slice(skipped, skipped + length)) for i in longest]
     chains.clear()
-    fixed = [name for name in kept[0].stats if all(_is_fixed(c.stats[name]) for c in kept)]
-    quantities = Quantities(model, held)
-    fixed_stats = {name: np.stack([chain.stats[name][0] for chain in kept]) for name in fixed}
+    fixed = [name for name in kept[0][1] if all(_is_fixed(stats[name]) for _, stats in kept)]
+    deterministics = Deterministics(model, raveled)
+    fixed_stats = {name: np.stack([stats[name][0] for _, stats in kept]) for name in fixed}
 
-    def tree_of(chain: ChainDraws) -> DataTree:
-        varying = {name: values for name, values in chain.stats.items() if name not in fixed}
-        trace = MultiTrace([_ChainTrace(0, quantities(chain.positions), varying)])
+    def convert(positions: np.ndarray, stats: dict[str, np.ndarray]) -> DataTree:
+        varying = {name: values for name, values in stats.items() if name not in fixed}
+        trace = MultiTrace([_ChainTrace(0, deterministics(positions), varying)])
         # There is no public way: PyMC's own driver sets these.
         trace.report._n_tune = min(tune, skipped + length)
         trace.report._n_draws = skipped + length - trace.report._n_tune
         trace.report._t_sampling = sampling_time
         return pm.to_inference_data(trace, model=model, save_warmup=keep_warmup)
 
-    # One by one: PyMC's converter takes a multiple of the memory of what it converts.
-    trees = [tree_of(kept.pop(0)) for _ in longest]
+    # One by one: PyMC's converter needs a multiple of the memory of its input.
+    tree = _concatenated([convert(*kept.pop(0)) for _ in longest], attrs or {})
+    for name, values in fixed_stats.items():
+        _add_fixed(tree, name, values)
+    return tree
+
+
+def _cut(chain: ChainArrays, rows: slice) -> ChainArrays:
+    positions, stats = chain
+    return positions[rows], {name: values[rows] for name, values in stats.items()}
+
+
+def _concatenated(trees: list[DataTree], attrs: Mapping[str, Any]) -> DataTree:
+    """One DataTree from one for each chain."""
     tree = trees[0]
     for group in SAMPLED.intersection(tree.children):
         parts = [of_chain[group].to_dataset() for of_chain in trees]
@@ -119,20 +113,18 @@ def to_datatree(
             del of_chain[group]
         whole = xr.concat(parts, "chain", combine_attrs="override")
         tree[group] = DataTree(whole.assign_coords(chain=np.arange(len(parts))))
-        tree[group].attrs.update(attrs or {})
-    for name, values in fixed_stats.items():
-        _add_fixed(tree, name, values)
+        tree[group].attrs.update(attrs)
     return tree
 
 
 class _ChainTrace(IBaseTrace):
-    """A whole chain, as PyMC's converter wants to see it.
+    """A whole chain as a trace, the input of PyMC's converter.
 
     Parameters
     ----------
     chain : int
     values : dict of str to ndarray, shape (n, ...)
-        Of the variables.
+        Values of the variables.
     stats : dict of str to ndarray, shape (n, ...)
     """
 
@@ -168,10 +160,7 @@ class _ChainTrace(IBaseTrace):
 
 
 def _most_iterations(lengths: Sequence[int]) -> tuple[list[int], int]:
-    """Choose chains, and one length for them, so that the most iterations remain.
-
-    The choice that ``pm.sample`` makes among interrupted chains.
-    """
+    """Choose chains and a common length that keep the most iterations, as ``pm.sample`` does."""
     by_length = sorted(range(len(lengths)), key=lambda i: -lengths[i])
     together = [(rank + 1) * lengths[i] for rank, i in enumerate(by_length)]
     last = int(np.argmax(together))
@@ -183,7 +172,7 @@ def _is_fixed(values: np.ndarray) -> bool:
 
 
 def _add_fixed(tree: DataTree, name: str, values: np.ndarray) -> None:
-    """Add a statistic that is the same for all draws of a chain, stored once a chain."""
+    """Add a statistic that is constant within a chain, stored once per chain."""
     for group in SAMPLE_STATS.intersection(tree.children):
         n_draws = tree[group].sizes["draw"]
         shape = (len(values), n_draws, *values.shape[1:])

@@ -1,9 +1,9 @@
-"""The named quantities of a PyMC model at many positions: constrained values and Deterministics.
+"""Constrained values and Deterministics of a PyMC model at many positions.
 
-Whole chains have many positions, and most models compute little of them: transforms back to the
-user's scale, ratios, sums. NumPy computes such quantities for thousands of positions at once, with
-nothing to compile, in nanoseconds for each. The rest (loops and likelihoods within Deterministics,
-triangular matrices) comes from one compiled function of the position, called for each.
+Most models compute simple functions of a position: transforms to the user's scale, ratios, sums.
+`vectorize_graph` and NumPy evaluate these for thousands of positions at once, in nanoseconds each
+and without compiling. The others (loops and likelihoods within Deterministics, triangular matrices)
+are evaluated by one compiled function, called for each position.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,13 +40,13 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.type import TensorType, tensor
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
-# Positions in a block: its intermediate results stay in the processor's cache.
+# Positions in a block, whose intermediate results stay in the processor's cache.
 BLOCK = 4096
 
-# Operations that NumPy does for a block in one call, besides its ufuncs.
-OF_BLOCKS = (
+# Operations that NumPy applies to a block in one call, in addition to its ufuncs.
+VECTORIZED_OPS = (
     Alloc,
     CAReduce,
     CumOp,
@@ -60,42 +60,42 @@ OF_BLOCKS = (
     ViewOp,
 )
 
-# Operations on truth values of which NumPy makes what machine code makes.
-OF_TRUTH_VALUES = (AND, OR, Invert, Switch)
+# Operations on booleans for which NumPy and machine code agree.
+BOOLEAN_OPS = (AND, OR, Invert, Switch)
 
 
 @node_rewriter([Elemwise])
-def _two_at_a_time(fgraph: FunctionGraph, node: Apply) -> list[Variable] | None:
-    """Make sums and products of two: of more, NumPy has no ufunc."""
+def _binary_sums_and_products(fgraph: FunctionGraph, node: Apply) -> list[Variable] | None:
+    """Split n-ary sums and products into binary ones, for which NumPy has ufuncs."""
     op, spec = node.op, node.op.nfunc_spec
     if spec is None or spec[1] != 2 or len(node.inputs) == 2:
         return None
-    # Of the result's type from the start: two small integers may make one that is too large.
+    # Start with the dtype of the result: two small integers may overflow theirs.
     start = constant(op.scalar_op.identity, dtype=node.outputs[0].dtype)
     return [reduce(op, node.inputs, start)]
 
 
-# All of PyTensor's usual rewrites for stable numbers, without those for compiled loops.
-BY_NUMPY = Mode(
+# PyTensor's usual rewrites, without those for compiled loops.
+NUMPY_MODE = Mode(
     "py", RewriteDatabaseQuery(include=("fast_run",), exclude=("fusion", "inplace"))
-).register((in2out(_two_at_a_time), 100.0))
+).register((in2out(_binary_sums_and_products), 100.0))
 
 
 class _Evaluator(Protocol):
-    """Some of the quantities: positions, shape (n, d), to arrays of shape (n, ...)."""
+    """Evaluates some of the variables: positions, shape (n, d), to arrays of shape (n, ...)."""
 
     names: list[str]
 
     def __call__(self, positions: np.ndarray) -> list[np.ndarray]: ...
 
 
-class Quantities:
-    """What a trace holds of a position, for all positions of a chain at a call.
+class Deterministics:
+    """The variables of a trace, evaluated at all positions of a chain.
 
     Parameters
     ----------
     model : pymc.Model
-    held : HeldVariables
+    raveled : RaveledVariables
         All value variables of the model.
 
     Attributes
@@ -104,14 +104,14 @@ class Quantities:
         In the order in which ``pm.sample`` has them.
     """
 
-    def __init__(self, model: Model, held: HeldVariables):
+    def __init__(self, model: Model, raveled: RaveledVariables):
         wanted = get_default_varnames(model.unobserved_value_vars, include_transformed=False)
         self.names = [variable.name for variable in wanted]
-        in_blocks = _InBlocks([v for v in wanted if _is_of_blocks(v)], held)
-        rest = [v for v in wanted if v.name not in in_blocks.names]
-        self._evaluators: list[_Evaluator] = [in_blocks]
+        vectorized = _Vectorized([v for v in wanted if _is_vectorizable(v)], raveled)
+        rest = [v for v in wanted if v.name not in vectorized.names]
+        self._evaluators: list[_Evaluator] = [vectorized]
         if rest:
-            self._evaluators.append(_OneByOne(rest, held))
+            self._evaluators.append(_PerPosition(rest, raveled))
 
     def __call__(self, positions: np.ndarray) -> dict[str, np.ndarray]:
         """Evaluate.
@@ -119,7 +119,7 @@ class Quantities:
         Parameters
         ----------
         positions : ndarray, shape (n, d)
-            One that repeats the one before, as after a rejection, costs nothing.
+            Repeated rows, as after a rejection, are evaluated once.
 
         Returns
         -------
@@ -135,24 +135,26 @@ class Quantities:
         return {name: values[name] for name in self.names}
 
 
-class _InBlocks:
-    """Quantities by NumPy, thousands of positions at once; it leaves out what NumPy cannot.
+class _Vectorized:
+    """Evaluates by NumPy, a block of positions at a time; skips variables that NumPy cannot.
 
-    Mind that NumPy's functions may differ from those of machine code in the last bit.
+    NumPy's functions may differ from those of machine code in the last bit.
     """
 
-    def __init__(self, wanted: Sequence[TensorVariable], held: HeldVariables):
-        point = held.split(np.zeros(held.dim))
-        self._shapes = [point[v.name].shape for v in held.variables]
-        self._ends = np.cumsum([point[v.name].size for v in held.variables])[:-1]
+    def __init__(self, wanted: Sequence[TensorVariable], raveled: RaveledVariables):
+        point = raveled.unravel(np.zeros(raveled.dim))
+        self._shapes = [point[v.name].shape for v in raveled.variables]
+        self._ends = np.cumsum([point[v.name].size for v in raveled.variables])[:-1]
         blocks = [
             tensor(dtype=v.dtype, shape=(None, *shape))
-            for v, shape in zip(held.variables, self._shapes, strict=True)
+            for v, shape in zip(raveled.variables, self._shapes, strict=True)
         ]
         graphs = _without_views(
-            vectorize_graph(list(wanted), dict(zip(held.variables, blocks, strict=True)))
+            vectorize_graph(list(wanted), dict(zip(raveled.variables, blocks, strict=True)))
         )
-        kept = [(v, graph) for v, graph in zip(wanted, graphs, strict=True) if _is_of_blocks(graph)]
+        kept = [
+            (v, graph) for v, graph in zip(wanted, graphs, strict=True) if _is_vectorizable(graph)
+        ]
         self.names = [v.name for v, _ in kept]
         self._dtypes = [block.dtype for block in blocks]
         # A constant has no axis for the positions.
@@ -160,7 +162,7 @@ class _InBlocks:
         self._function = compile_pymc(
             blocks,
             [graph for _, graph in kept],
-            mode=BY_NUMPY,
+            mode=NUMPY_MODE,
             on_unused_input="ignore",
             trust_input=True,
         )
@@ -188,13 +190,13 @@ class _InBlocks:
         ]
 
 
-class _OneByOne:
-    """Quantities by machine code, a call for each position."""
+class _PerPosition:
+    """Evaluates by machine code, one call for each position."""
 
-    def __init__(self, wanted: Sequence[Variable], held: HeldVariables):
+    def __init__(self, wanted: Sequence[Variable], raveled: RaveledVariables):
         self.names = [v.name for v in wanted]
-        point = held.split(np.zeros(held.dim))
-        outputs, joined = join_nonshared_inputs(point, list(wanted), held.variables)
+        point = raveled.unravel(np.zeros(raveled.dim))
+        outputs, joined = join_nonshared_inputs(point, list(wanted), raveled.variables)
         self._dtypes = [output.dtype for output in outputs]
         self._function = compile_pymc([joined], outputs, on_unused_input="ignore", trust_input=True)
         self._dtype = joined.dtype
@@ -212,38 +214,39 @@ class _OneByOne:
         return results
 
     def _machine_code(self) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
-        """Leave out what PyTensor does around its machine code, as long as that is nothing."""
+        """Call the jitted function directly when PyTensor's wrapper has no state to update."""
         function = self._function
-        renewed = len(function.maker.fgraph.outputs) > len(self.names)  # as generators are
-        if renewed or not hasattr(function.vm, "jit_fn"):  # the latter in a mode without numba
+        has_updates = len(function.maker.fgraph.outputs) > len(self.names)  # of generators
+        if has_updates or not hasattr(function.vm, "jit_fn"):  # no jit_fn: a mode without numba
             return function
         machine_code = function.vm.jit_fn
         data = [cell.storage[0] for cell in function.input_storage[1:]]
         return lambda position: machine_code(position, *data)
 
 
-def _is_of_blocks(graph: Variable) -> bool:
-    """Whether NumPy does all that is behind a quantity in few calls for a block."""
+def _is_vectorizable(graph: Variable) -> bool:
+    """Whether NumPy evaluates a graph in a few calls per block."""
     return all(
-        isinstance(v.type, TensorType | ScalarType) and (v.owner is None or _is_of_block(v.owner))
+        isinstance(v.type, TensorType | ScalarType)
+        and (v.owner is None or _is_vectorized_op(v.owner))
         for v in ancestors([graph])
     )
 
 
-def _is_of_block(node: Apply) -> bool:
+def _is_vectorized_op(node: Apply) -> bool:
     op = node.op
     if isinstance(op, Elemwise):
-        # NumPy's sum of two truth values is a truth value, machine code may count.
+        # NumPy's sum of two booleans is a boolean, machine code may count.
         is_counting = any(v.dtype == "bool" for v in node.inputs)
-        # Without a ufunc of NumPy's or SciPy's, PyTensor would go from number to number.
+        # Without a ufunc of NumPy or SciPy, PyTensor would loop over the elements in Python.
         return op.nfunc_spec is not None and (
-            isinstance(op.scalar_op, OF_TRUTH_VALUES) or not is_counting
+            isinstance(op.scalar_op, BOOLEAN_OPS) or not is_counting
         )
-    return isinstance(op, OF_BLOCKS)
+    return isinstance(op, VECTORIZED_OPS)
 
 
 def _without_views(graphs: list[Variable]) -> list[Variable]:
-    """Take out the views by which PyMC names Deterministics: batched, they are loops in Python."""
+    """Remove the views by which PyMC names Deterministics: vectorized, they loop in Python."""
     graph = FunctionGraph(outputs=graphs, clone=False)
     for node in graph.toposort():
         if isinstance(node.op, Blockwise) and isinstance(node.op.core_op, ViewOp):

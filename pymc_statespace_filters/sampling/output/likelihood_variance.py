@@ -1,10 +1,13 @@
-"""How far the estimates of one likelihood scatter over noise seeds, and what that does to a chain.
+"""Variance of an estimated log-likelihood over noise seeds, and its effect on a chain.
 
-Let the log-likelihood at a point be estimated with a variance v. If the errors are Gaussian, a
-chain that keeps its estimates lets through the share ``2 Phi(-sqrt(v / 2)) = erfc(sqrt(v) / 2)``
-of the moves that it would make with an exact likelihood (the error of the kept estimate is drawn
-from N(v/2, v), that of a new one from N(-v/2, v)): 48 % at v = 1, 20 % at v = 3.3, 2.5 % at v = 10.
-The noise costs moves, and particles cost time; per unit of time the best v lies between 1 and 3.3.
+Let the log-likelihood at a point be estimated with variance v. If the errors are Gaussian, a chain
+that keeps its estimates accepts the fraction ``2 Phi(-sqrt(v / 2)) = erfc(sqrt(v) / 2)`` of the
+moves that it would accept with an exact likelihood (the error of the kept estimate is distributed
+as N(v/2, v), that of a new one as N(-v/2, v)): 48 % at v = 1, 20 % at v = 3.3, 2.5 % at v = 10.
+Noise costs moves, and particles cost time; per unit of time the best v lies between 1 and 3.3.
+
+`sample_dram` measures the variance twice: at each start, and after the run at the draw of highest
+density.
 
 References
 ----------
@@ -19,37 +22,51 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from pymc.stats.convergence import SamplerWarning
 from scipy.stats import t as student_t
 
-from pymc_statespace_filters.sampling.kernel.state import Evaluation
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds, side_generator
+from pymc_statespace_filters.sampling.kernel.state import LOG_DENSITY, Draws, Evaluation
+from pymc_statespace_filters.sampling.output.warnings import sampler_warning
+from pymc_statespace_filters.sampling.target.target import Target
 
-# The variances between which a chain gains most for its time, and the middle of their logs.
+# The variances between which a chain gains most per unit of time, and their geometric mean.
 TARGET = (1.0, 3.3)
 MIDDLE = math.sqrt(TARGET[0] * TARGET[1])
-# Above the first a chain makes fewer than one in forty of its moves and waits long on estimates
-# that came out high; below the second the noise costs an eighth of the moves, while a thirtieth of
-# the particles would do.
+# Above the first a chain makes fewer than one in forty of its moves and stays long at
+# overestimates; below the second the noise costs an eighth of the moves, while a thirtieth of the
+# particles would suffice.
 TOO_NOISY, TOO_QUIET = 10.0, 0.05
 
 # Two-sided probability of the intervals.
 _CONFIDENCE = 0.95
-# Fewer estimates than this say nothing of their variance.
+# Fewest estimates from which a variance is computed.
 _FEWEST = 3
+
+# Estimates at a point in a run: enough to know their variance within a factor of two or three.
+N_SEEDS = 12
+# Iterations of a chain from which these estimates are 2 % of its evaluations at most.
+LEAST_ITERATIONS = 600
+# In the tail, where a start may lie, estimates vary more, and most chains leave it during warm-up.
+# At this variance the noise alone accepts one move in ten thousand, and a warm-up ends before.
+HOPELESS = 30.0
+# Iterations without a single move after which the warning about the start is given.
+N_STUCK = 100
 
 
 class SeedSpread(NamedTuple):
-    """Estimates of the log-density at one point, over noise seeds.
+    """Moments of the estimates of the log-density at one point, over noise seeds.
 
     Attributes
     ----------
     n : int
-        Estimates that are finite; the moments are theirs.
+        Number of finite estimates, of which the moments are taken.
     mean, variance : float
-        Minus infinity and infinity where fewer than three are finite.
+        Minus infinity and infinity if fewer than three are finite.
     variance_low, variance_high : float
         A 95 % interval for the variance.
     n_failed : int
-        Estimates that are minus infinity.
+        Number of estimates that are minus infinity.
     """
 
     n: int
@@ -71,7 +88,7 @@ def seed_spread(
     Parameters
     ----------
     log_density : callable
-        ``(position, others, seeds) -> Evaluation``, such as `BoundDensity`.
+        ``(position, others, seeds) -> Evaluation``, such as `BoundLogDensity`.
     position : ndarray, shape (d,)
     others : sequence of ndarray
     seeds : ndarray of int64, shape (R, noisy)
@@ -86,10 +103,10 @@ def seed_spread(
 
 
 def spread_of(estimates: np.ndarray) -> SeedSpread:
-    """Summarise estimates (R,), of which some may be minus infinity.
+    """Summarise estimates, shape (R,), some of which may be minus infinity.
 
-    The interval comes from the jackknife of the log-variance: log estimates of a likelihood are
-    skewed, and the chi-square interval of Gaussian numbers would be too short.
+    The interval is the jackknife interval of the log-variance: estimates of a log-likelihood are
+    skewed, and the chi-square interval for Gaussian samples would be too short.
     """
     finite = estimates[np.isfinite(estimates)]
     n, n_failed = finite.size, estimates.size - finite.size
@@ -101,7 +118,7 @@ def spread_of(estimates: np.ndarray) -> SeedSpread:
     if variance == 0.0:
         return SeedSpread(n, mean, 0.0, 0.0, 0.0, n_failed)
     without_one = squares.sum() - squares * n / (n - 1)
-    if without_one.min() <= 1e-12 * squares.sum():  # a single estimate makes all of the spread
+    if without_one.min() <= 1e-12 * squares.sum():  # all of the variance is due to one estimate
         return SeedSpread(n, mean, variance, 0.0, np.inf, n_failed)
     error = math.sqrt((n - 1) * np.log(without_one).var())
     factor = math.exp(min(700.0, student_t.ppf(0.5 + 0.5 * _CONFIDENCE, n - 1) * error))
@@ -109,22 +126,22 @@ def spread_of(estimates: np.ndarray) -> SeedSpread:
 
 
 def acceptance_share(variance: float) -> float:
-    """Share of an exact likelihood's moves that noise of this variance lets through.
+    """Fraction of an exact likelihood's accepted moves that noise of this variance accepts.
 
-    Exact for Gaussian errors where the noise alone decides, and then a lower bound: the acceptance
-    with the noise is at least this times the acceptance without.
+    Exact for Gaussian errors if the exact likelihood accepts every move; otherwise a lower bound:
+    the acceptance rate with noise is at least this times the rate without.
     """
     return math.erfc(0.5 * math.sqrt(variance))
 
 
-def spread_warning(spread: SeedSpread, where: str, chain: int) -> str | None:
-    """Say what to do if the spread is far outside the range in which chains work best.
+def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
+    """Advise the user if the variance is far outside the range in which chains work best.
 
     Parameters
     ----------
     spread : SeedSpread
     where : str
-        Where it was measured: "at the start".
+        Where it was measured, such as "at the start".
     chain : int
 
     Returns
@@ -142,23 +159,81 @@ def spread_warning(spread: SeedSpread, where: str, chain: int) -> str | None:
         share = acceptance_share(spread.variance)
         return (
             f"{found} has a variance of {spread.variance:.3g} over {spread.n} noise seeds. "
-            f"The noise lets through some {share:.1g} of the moves of an exact likelihood, and the "
-            "chain waits long on estimates that came out high. The variance falls about as one "
-            f"over the number of particles: {_rounded(spread.variance / MIDDLE)} times as many "
-            f"would bring it between {TARGET[0]:g} and {TARGET[1]:g}; psf.suggest_particles(model) "
-            "finds the number."
+            f"The chain accepts about {share:.1g} of the moves that it would accept with an exact "
+            "likelihood, and stays long at overestimates. The variance is about proportional to "
+            f"1/N for N particles: {_rounded(spread.variance / MIDDLE)} times as many would bring "
+            f"it between {TARGET[0]:g} and {TARGET[1]:g}; psf.suggest_particles(model) finds the "
+            "number."
         )
     if 0.0 < spread.variance < TOO_QUIET:
         return (
             f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
-            f"With some {_rounded(MIDDLE / spread.variance)} times fewer particles it would lie "
-            f"between {TARGET[0]:g} and {TARGET[1]:g} and the chain would be faster for its time; "
-            "psf.suggest_particles(model) finds the number."
+            f"With about {_rounded(MIDDLE / spread.variance)} times fewer particles it would lie "
+            f"between {TARGET[0]:g} and {TARGET[1]:g} and the chain would gain more per unit of "
+            "time; psf.suggest_particles(model) finds the number."
         )
     return None
 
 
+def is_measured(target: Target, n_iterations: int) -> bool:
+    """Whether a run measures the variance: with fresh noise, and unless it is short."""
+    noisy = target.seed_names and target.settings.refresh_noise
+    return bool(noisy) and n_iterations >= LEAST_ITERATIONS
+
+
+def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
+    """Warn that the noise at a start is such that a chain may never leave it."""
+    if not HOPELESS < spread.variance < np.inf:
+        return None
+    return sampler_warning(
+        f"Chain {chain}, at the start: the estimated log-likelihood has a variance of "
+        f"{spread.variance:.3g} over {spread.n} noise seeds. The chain accepts about "
+        f"{acceptance_share(spread.variance):.1g} of the moves that it would accept with an exact "
+        "likelihood: it has not left the start yet and may never do so. Start elsewhere "
+        "(initvals), or give the filter more particles; psf.suggest_particles(model) finds the "
+        "number."
+    )
+
+
+def spread_at_highest_draw(
+    draws: Sequence[Draws],
+    tune: int,
+    measure: Callable[[np.ndarray, np.ndarray], SeedSpread],
+    keys: Sequence[np.ndarray],
+) -> tuple[SeedSpread, SamplerWarning | None]:
+    """Measure the variance at the draw of highest density of all chains.
+
+    The estimate there is an overestimate, but the point is typical of the centre.
+
+    Parameters
+    ----------
+    draws : sequence of Draws
+        Of each chain, with its warm-up.
+    tune : int
+        Iterations of warm-up, which are left out.
+    measure : callable
+        ``(position, seeds) -> SeedSpread``.
+    keys : sequence of ndarray
+        Keys of the chains' random numbers.
+
+    Returns
+    -------
+    SeedSpread
+    SamplerWarning or None
+        If the variance is far outside the range in which chains work best.
+    """
+    densities = [of_chain.numbers[tune:, LOG_DENSITY] for of_chain in draws]
+    chain = int(np.argmax([of_chain.max() for of_chain in densities]))
+    row = tune + int(densities[chain].argmax())
+    shape = N_SEEDS, draws[chain].seeds.shape[1]
+    # From the chain's key, which a checkpoint stores: a resumed run measures the same.
+    seeds = draw_seeds(side_generator(keys[chain]), shape)
+    spread = measure(draws[chain].positions[row], seeds)
+    message = variance_advice(spread, "at its highest draw", chain)
+    return spread, None if message is None else sampler_warning(message)
+
+
 def _rounded(factor: float) -> str:
-    """A factor in two digits, without an exponent."""
+    """Format a factor with two digits, without an exponent."""
     digits = 1 - math.floor(math.log10(factor))
     return f"{round(factor, digits):.{max(0, digits)}f}"

@@ -1,4 +1,4 @@
-"""What DRAM stores of each draw in ``sample_stats``."""
+"""The statistics of each draw that DRAM stores in ``sample_stats``."""
 
 from typing import Any
 
@@ -16,11 +16,12 @@ from pymc_statespace_filters.sampling.kernel.state import (
     N_SCREENED,
     SCALING,
     STAGE,
+    ChainState,
     Draws,
 )
 from pymc_statespace_filters.sampling.target.target import Target
 
-# PyMC's own names: it renames the first "lp", and logs and drops the second.
+# PyMC's own names: it renames the first to "lp", and logs and removes the second.
 MODEL_LOGP, WARNING = "model_logp", "warning"
 
 
@@ -35,22 +36,22 @@ _SCREEN_COUNTS = {"n_screened": N_SCREENED, "n_screen_failed": N_SCREEN_FAILED}
 
 
 def dtypes(target: Target) -> dict[str, Any]:
-    """Types of the statistics, by name."""
-    dim = target.held.dim
+    """Dtypes of the statistics, by name."""
+    dim = target.raveled.dim
     types: dict[str, Any] = dict.fromkeys(_NUMBERS, np.float64) | dict.fromkeys(_COUNTS, np.int64)
     types |= {
         "accept_rate": np.float64,
-        # A number, as Metropolis has it: PyMC wants one type for a name in all steps of a model.
+        # A float, as in Metropolis: PyMC requires one dtype per name in all steps of a model.
         "accepted": np.float64,
         "exact": np.bool_,
         WARNING: SamplerWarning,
     }
-    if target.holds_all:  # else another DRAM may have one of another shape, which PyMC refuses
-        # A subarray type: the only way to have a matrix per draw stored as numbers.
+    if target.samples_all:  # else another DRAM may have another shape, which PyMC refuses
+        # A subarray dtype is the only way to store a matrix per draw as numbers.
         types["proposal_cov"] = np.dtype((np.float64, (dim, dim)))
     if target.seed_names:
         types["n_effective"] = np.float64
-    if target.moves_noise:  # no seed alone gives the estimate again
+    if target.carries_noise:  # a seed alone does not reproduce the estimate
         types["correlation"] = np.float64
     else:
         types |= dict.fromkeys(target.seed_names, np.int64)
@@ -60,14 +61,14 @@ def dtypes(target: Target) -> dict[str, Any]:
 
 
 def dtypes_shapes(target: Target) -> dict[str, tuple[Any, Any]]:
-    """Types with PyMC's shapes: a scalar, or None for what not every draw has."""
+    """Dtypes with PyMC's shapes: a scalar, or None for a statistic that some draws lack."""
     return {
         name: (dtype, None if name == WARNING else []) for name, dtype in dtypes(target).items()
     }
 
 
 def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
-    """Statistics of one iteration, or of several: numbers, or arrays of them.
+    """Statistics of one iteration, as numbers, or of several, as arrays.
 
     Parameters
     ----------
@@ -78,20 +79,52 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     Returns
     -------
     dict
-        Without ``accept_rate``, which depends on what came before, and the warning.
+        Without ``accept_rate``, which depends on earlier iterations, and the warning.
     """
     stats = {name: draws.numbers[rows, column] for name, column in _NUMBERS.items()}
     stats |= {name: draws.counts[rows, column] for name, column in _COUNTS.items()}
     stats["accepted"] = (stats["stage"] > 0) * 1.0
     stats["exact"] = np.full(stats["stage"].shape, target.exact)
-    if draws.covs.size and target.holds_all:
+    if draws.covs.size and target.samples_all:
         stats["proposal_cov"] = draws.covs[rows].copy()
     if target.seed_names:
         stats["n_effective"] = draws.numbers[rows, N_EFFECTIVE]
-    if target.moves_noise:
+    if target.carries_noise:
         stats["correlation"] = np.full(stats["stage"].shape, target.settings.correlation)
     else:
         stats |= {name: draws.seeds[rows, i] for i, name in enumerate(target.seed_names)}
     if target.screen is not None:
         stats |= {name: draws.counts[rows, column] for name, column in _SCREEN_COUNTS.items()}
     return stats
+
+
+def whole_chain(
+    target: Target, draws: Draws, state: ChainState, tune: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Positions and statistics of a whole chain, as copies.
+
+    Parameters
+    ----------
+    target : Target
+    draws : Draws
+    state : ChainState
+        After the last iteration.
+    tune : int
+        Iterations of warm-up.
+
+    Returns
+    -------
+    ndarray, shape (n, d)
+    dict of str to ndarray, shape (n, ...)
+        ``proposal_cov`` is a view without a stride if the covariances of the warm-up were not kept.
+    """
+    n = len(draws.positions)
+    stats = {name: values.copy() for name, values in of_draws(target, draws, slice(0, n)).items()}
+    moved = draws.counts[:, STAGE] > 0
+    stats["accept_rate"] = np.concatenate(
+        [np.cumsum(phase) / np.arange(1, phase.size + 1) for phase in np.split(moved, [tune])]
+    )
+    covs = np.broadcast_to(state.proposal_cov, (n, *state.proposal_cov.shape))
+    if len(draws.covs):
+        covs = np.concatenate([draws.covs[:n], covs[tune:]])
+    return draws.positions.copy(), stats | {"proposal_cov": covs}

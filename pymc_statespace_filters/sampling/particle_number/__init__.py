@@ -1,1 +1,1 @@
-"""How many particles a record needs."""
+"""Measurement of the number of particles that a noisy likelihood needs."""

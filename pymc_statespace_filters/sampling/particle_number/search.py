@@ -1,4 +1,4 @@
-"""Which numbers of particles to measure, and which to suggest: the variance falls about as 1/N."""
+"""Search over numbers of particles N, for a variance that is about proportional to 1/N."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -6,32 +6,32 @@ from typing import NamedTuple
 
 from pymc_statespace_filters.sampling.output.likelihood_variance import TOO_NOISY, SeedSpread
 
-# Numbers that are tried: two digits at most, each at most a sixth above the one before.
+# Numbers tried have two digits at most, and each is at most a sixth above the one before.
 _MANTISSAS = (1, 1.1, 1.2, 1.4, 1.6, 1.8, 2, 2.2, 2.5, 2.8, 3, 3.5, 4, 4.5, 5, 5.5, 6, 7, 8, 9, 10)
 LEAST = 10  # particles
 MOST_NUMBERS = 7
-# The largest step from one number to the next, for the law is rough where the variance is large;
-# and the largest number, in units of the first and of this many particles at least.
+# Largest ratio of consecutive numbers, because 1/N is inaccurate for large variances; and the
+# largest number, as a multiple of the first or of so many particles.
 _JUMP, _GROWTH, _FIRST = 8.0, 64, 250
-# The variance does not fall if eight times the particles leave this share of it, or more.
-_STUBBORN = 0.6
-# Distance kept from the upper end of the target, for what is measured has an error.
+# The variance does not decrease if this fraction or more is left with eight times the particles.
+_STAGNANT = 0.6
+# Factor kept from the upper end of the target, for the error of measurement.
 _MARGIN = 1.2
 
 
 class Row(NamedTuple):
-    """What is known of one number of particles.
+    """Measurements with one number of particles.
 
     Attributes
     ----------
     n_particles : int
     centre : SeedSpread
     tail : float
-        Largest variance at the tail points; NaN where it was not measured.
+        Largest variance at the tail points; NaN if it was not measured.
     n_failed : int
-        Evaluations that failed, at all points.
+        Failed evaluations, at all points.
     seconds : float
-        Of one evaluation at the centre.
+        CPU time of one evaluation at the centre.
     """
 
     n_particles: int
@@ -48,7 +48,7 @@ def search(measure: Callable[[int], Row], first: int, target: tuple[float, float
     ----------
     measure : callable
     first : int
-        The number to begin with.
+        The first number.
     target : (float, float)
 
     Returns
@@ -58,51 +58,50 @@ def search(measure: Callable[[int], Row], first: int, target: tuple[float, float
     """
     rows = [measure(first)]
     while len(rows) < MOST_NUMBERS:
-        wanted = _next_number(rows, first, target)
-        if wanted is None:
+        proposed = _next_number(rows, first, target)
+        if proposed is None:
             break
-        rows = sorted([*rows, measure(wanted)])
+        rows = sorted([*rows, measure(proposed)])
     return rows
 
 
 def choose(rows: Sequence[Row], target: tuple[float, float]) -> tuple[Row, str | None]:
-    """Choose the smallest number whose variance lies in the target, and in the tail below 10.
+    """Choose the smallest number with a variance in the target, and below 10 in the tail.
 
     Returns
     -------
     Row
     str or None
-        Why the choice is not good, if it is not.
+        The problem with the choice, if there is one.
     """
     low, high = target
     inside = [row for row in rows if low <= row.centre.variance <= high]
     safe = [row for row in inside if row.centre.variance <= high / _margin(target)] or inside
-    calm = [row for row in safe if row.tail <= TOO_NOISY]
-    if calm:
-        return calm[0], None
+    quiet_in_tail = [row for row in safe if row.tail <= TOO_NOISY]
+    if quiet_in_tail:
+        return quiet_in_tail[0], None
     if inside:
         row = inside[-1]
         return row, (
             f"in the tail of the pilot posterior the variance of the estimated log-likelihood "
-            f"reaches {row.tail:.3g} with {row.n_particles} particles: chains will stand still "
-            "there for long. More particles than the target asks for may be worth their time"
+            f"reaches {row.tail:.3g} with {row.n_particles} particles: chains will stay at one "
+            "point for long there. More particles than the target requires may be worth their time"
         )
     quiet = [row for row in rows if row.centre.variance < low]
     if quiet and quiet[0].n_particles <= LEAST:
         return quiet[0], None
     if quiet:
         return quiet[0], (
-            f"no number that was tried brings the variance between {low:g} and {high:g}: "
-            f"{quiet[0].n_particles} particles lie below it, at {quiet[0].centre.variance:.3g}"
+            f"no number tried gives a variance between {low:g} and {high:g}: with "
+            f"{quiet[0].n_particles} particles it is {quiet[0].centre.variance:.3g}"
         )
     first, last = rows[0], rows[-1]
     return last, (
-        f"the variance of the estimated log-likelihood at the centre does not come down to "
+        f"the variance of the estimated log-likelihood at the centre does not decrease to "
         f"{high:g}: it is {first.centre.variance:.3g} with {first.n_particles} particles and "
-        f"{last.centre.variance:.3g} with {last.n_particles}, the most that were tried. If it "
-        "falls slower than one over the number, particles collapse at some observation: see at "
-        "which one the terms of psf.log_likelihood scatter over seeds, and compare the filters "
-        "there"
+        f"{last.centre.variance:.3g} with {last.n_particles}, the most tried. If it decreases "
+        "slower than 1/N, particles collapse at some observation: find it as the one whose terms "
+        "of psf.log_likelihood vary most over seeds, and compare filters there"
     )
 
 
@@ -111,7 +110,7 @@ def _margin(target: tuple[float, float]) -> float:
 
 
 def _next_number(rows: Sequence[Row], first: int, target: tuple[float, float]) -> int | None:
-    """Give the next number to measure, None if there is none."""
+    """The next number to measure, None if there is none."""
     low, high = target
     margin, most = _margin(target), _GROWTH * max(first, _FIRST)
     aim = high / margin**2
@@ -121,43 +120,43 @@ def _next_number(rows: Sequence[Row], first: int, target: tuple[float, float]) -
     )
     if abs(_log_ratio(nearest.centre.variance, aim)) > math.log(margin):
         factor = min(_JUMP, max(1.0 / _JUMP, nearest.centre.variance / aim))
-        wanted = min(most, pleasant(nearest.n_particles * factor))
-        if wanted not in numbers and not _is_stubborn(rows, high):
-            return wanted
-    calmer = _calmer_number(rows, target)
-    if calmer is not None:
-        return calmer
+        proposed = min(most, round_up(nearest.n_particles * factor))
+        if proposed not in numbers and not _is_stagnant(rows, high):
+            return proposed
+    for_tail = _number_for_tail(rows, target)
+    if for_tail is not None:
+        return for_tail
     if numbers[0] > LEAST and not any(row.centre.variance > high for row in rows):
-        return pleasant(0.5 * numbers[0])
+        return round_up(0.5 * numbers[0])
     if numbers[-1] < most and any(low <= row.centre.variance <= high for row in rows[-1:]):
-        return min(most, pleasant(2.5 * numbers[-1]))
+        return min(most, round_up(2.5 * numbers[-1]))
     return None
 
 
-def _calmer_number(rows: Sequence[Row], target: tuple[float, float]) -> int | None:
-    """Give a number with less noise in the tail that the centre still allows, if one is needed."""
+def _number_for_tail(rows: Sequence[Row], target: tuple[float, float]) -> int | None:
+    """A larger number for less noise in the tail, if needed and within the target at the centre."""
     inside = [row for row in rows if target[0] <= row.centre.variance <= target[1]]
     if not inside or any(row.tail <= TOO_NOISY for row in inside):
         return None
     row, margin = inside[-1], _margin(target)
     factor = min(margin * row.tail / TOO_NOISY, row.centre.variance / (target[0] * margin))
-    wanted = pleasant(row.n_particles * factor)
-    return wanted if wanted > row.n_particles else None
+    proposed = round_up(row.n_particles * factor)
+    return proposed if proposed > row.n_particles else None
 
 
-def pleasant(number: float) -> int:
-    """Round up to a number of two digits at most, and no less than ten."""
+def round_up(number: float) -> int:
+    """Round up to a number of at most two digits, at least ten."""
     if number <= LEAST:
         return LEAST
     decade = 10 ** math.floor(math.log10(number))
     return next(round(m * decade) for m in _MANTISSAS if m * decade >= number * (1.0 - 1e-9))
 
 
-def _is_stubborn(rows: Sequence[Row], high: float) -> bool:
+def _is_stagnant(rows: Sequence[Row], high: float) -> bool:
     noisy = [row for row in rows if row.centre.variance > high]
     return any(
         b.n_particles >= _JUMP * a.n_particles
-        and b.centre.variance >= _STUBBORN * a.centre.variance
+        and b.centre.variance >= _STAGNANT * a.centre.variance
         for a in noisy
         for b in noisy
         if a.centre.variance < math.inf

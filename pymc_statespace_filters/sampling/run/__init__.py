@@ -1,1 +1,1 @@
-"""Many chains: in threads, over ranks."""
+"""Chains in threads and over ranks, from the request to the results."""

@@ -1,4 +1,8 @@
-"""One chain while it runs: where it stands, and the arrays that its machine code works on."""
+"""One Markov chain: its state, its draws, and the machine code that advances it.
+
+PyMC's step method advances a `Chain` by one iteration at a time; `ChainTask` advances it block by
+block in a thread. Both get the same draws from the same key.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,69 +13,74 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     pack,
     packed_size,
     start_adaptation,
-    unpack,
 )
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
+from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_seeds
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
-    DONE,
     FAILURE,
     N_COUNTS,
+    N_DONE,
     N_EVALUATIONS,
     N_FAILED,
     N_NUMBERS,
-    PAUSE,
+    PAUSE_REQUESTED,
     SCALING,
     STAGE,
+    ChainState,
     Draws,
     Evaluation,
-    Random,
-    Settings,
-    State,
+    PhaseSettings,
+    RandomBlock,
 )
 from pymc_statespace_filters.sampling.kernel.transition import advance
 from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread, seed_spread
-from pymc_statespace_filters.sampling.target.initial_points import EvaluatedPoint, best_start
+from pymc_statespace_filters.sampling.target.initial_points import (
+    EvaluatedPoint,
+    best_initial_point,
+)
 from pymc_statespace_filters.sampling.target.target import Target
 
 
-class Halted(Exception):
-    """Somebody asked for a pause outside of the chain's iterations."""
+class StopRequested(Exception):
+    """A stop was requested outside of the chain's iterations."""
 
 
-class RunningChain:
-    """A chain of a target.
+class Chain:
+    """A Markov chain of a target.
 
     Parameters
     ----------
     target : Target
         Prepared.
+    key : ndarray of uint64, shape (2,)
+        Key of the chain's random numbers.
     n_rows : int
-        Iterations of which the draws are kept.
+        Number of iterations whose draws are kept.
     n_covs : int
-        Of how many of these, the first, the proposal covariance is kept.
+        Number of these, the first ones, whose proposal covariance is kept.
 
     Attributes
     ----------
-    state : State
+    state : ChainState
     draws : Draws
-    talk : ndarray of int64, shape (2,)
-        See `chain_arrays.PAUSE` and `chain_arrays.DONE`.
+    control : ndarray of int64, shape (2,)
+        Control block: cells `state.PAUSE_REQUESTED` and `state.N_DONE`.
     """
 
-    def __init__(self, target: Target, n_rows: int, n_covs: int):
+    def __init__(self, target: Target, key: np.ndarray, n_rows: int, n_covs: int):
         self._target = target
         self._density = target.density.bind()
         self._screen = None if target.screen is None else target.screen.bind()
-        dim, n_noisy = target.held.dim, len(target.seed_names)
+        dim, n_noisy = target.raveled.dim, len(target.seed_names)
         adaptation = np.empty(packed_size(dim))
         pack(start_adaptation(target.first_cov), adaptation)
-        self.state = State(
+        self.state = ChainState(
             np.empty(dim),
             np.zeros(n_noisy, dtype=np.int64),
             np.zeros(3),
             adaptation,
             self._density.carried,
+            np.array(key),
         )
         self.draws = Draws(
             np.empty((n_rows, dim)),
@@ -80,7 +89,13 @@ class RunningChain:
             np.empty((n_rows, n_noisy), dtype=np.int64),
             np.empty((n_covs, dim, dim)),
         )
-        self.talk = np.zeros(2, dtype=np.int64)
+        self.control = np.zeros(2, dtype=np.int64)
+        self._block: tuple[int, RandomBlock] | None = None
+
+    @property
+    def others(self) -> list[np.ndarray]:
+        """Last values of the variables that other step methods move."""
+        return self._density.others
 
     def start(
         self,
@@ -88,12 +103,12 @@ class RunningChain:
         others: Sequence[np.ndarray],
         rng: np.random.Generator,
     ) -> tuple[int, ...]:
-        """Stand at the best of the candidates, each with noise of its own.
+        """Move to the best of the candidates, each evaluated with its own noise.
 
         Parameters
         ----------
         candidates : sequence of ndarray, shape (d,)
-            The last one is where the chain was told to start.
+            The last one is the point given by the user or the model.
         others : sequence of ndarray
             Values of the variables that other step methods move.
         rng : numpy.random.Generator
@@ -101,71 +116,117 @@ class RunningChain:
         Returns
         -------
         tuple of int
-            For each evaluation made, 0 or the code of its failure.
+            For each evaluation made, 0 or its failure code.
 
         Raises
         ------
-        Halted
-            If somebody asked for a pause.
+        StopRequested
+            If a stop is requested meanwhile.
         Exception
             What the model raised.
         """
         self._density.correlation[...] = 0.0
 
-        def evaluate_afresh(candidate: np.ndarray) -> EvaluatedPoint:
-            self._heed_pause()
-            seeds = self.noise(draw_seeds(rng, self.state.seeds.shape))
+        def evaluate(candidate: np.ndarray) -> EvaluatedPoint:
+            self._check_pause()
+            seeds = draw_seeds(rng, self.state.seeds.shape)
+            if not self._target.settings.refresh_noise:
+                seeds = self._target.fixed_seeds
             log_screen, failure = self._evaluate_screen(candidate, others, seeds)
-            if log_screen == -np.inf:  # no move would ever leave
+            if log_screen == -np.inf:  # no move of the screen would ever leave this point
                 return EvaluatedPoint(candidate, seeds, -np.inf, failure)
             value = self._density(candidate, others, seeds)
             return EvaluatedPoint(candidate, seeds, *value, log_screen)
 
-        start, codes = best_start(candidates, evaluate_afresh)
-        if self.state.carried.size:  # the noise of the start, which others have overwritten
+        start, failures = best_initial_point(candidates, evaluate)
+        if self.state.carried.size:  # later candidates have overwritten the noise of this one
             self._density(start.position, others, start.seeds)
-        self._stand(start)
-        return codes
+        self._set_current(start)
+        return failures
 
     def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
-        """Measure the scatter of the estimates at a point over seeds (R, noisy).
+        """Measure the spread of estimates at a point over seeds, shape (R, noisy); as `start`."""
 
-        The chain stays where it is. Raises what `start` raises.
-        """
-
-        def evaluate_afresh(*arguments: Any) -> Evaluation:
-            self._heed_pause()
+        def evaluate(*arguments: Any) -> Evaluation:
+            self._check_pause()
             return self._density(*arguments)
 
         self._density.correlation[...] = 0.0
-        spread = seed_spread(evaluate_afresh, position, (), seeds)
-        self._move_noise()
+        spread = seed_spread(evaluate, position, (), seeds)
+        self._restore_correlation()
         return spread
 
     def evaluate_again(self, others: Sequence[np.ndarray]) -> int:
-        """Evaluate the current point with its noise where only others moved; its failure's code.
+        """Evaluate the current point and noise after other variables moved; its failure code.
 
-        Where the screen is impossible now, no move of it is accepted until others move again.
+        If the screen's log-density is minus infinity there, no move is accepted until they move.
         """
         self._density.correlation[...] = 1.0
         position, seeds = self.state.position.copy(), self.state.seeds.copy()
         log_screen, _ = self._evaluate_screen(position, others, seeds)
         value = self._density(position, others, seeds)
-        self._stand(EvaluatedPoint(position, seeds, *value, log_screen))
+        self._set_current(EvaluatedPoint(position, seeds, *value, log_screen))
         return value.failure
 
-    def adopt(self, state: State) -> None:
-        """Go on from a state: a copy of it, as the machine code reads arrays of its own."""
+    def advance(self, tune: bool, iteration: int, row: int, n: int) -> int:
+        """Make up to n iterations, within one block of random numbers, and record them.
+
+        Parameters
+        ----------
+        tune : bool
+        iteration : int
+            Number of the first iteration since the start of the chain.
+        row : int
+            Row of the draws for the first iteration.
+        n : int
+
+        Returns
+        -------
+        int
+            Iterations made: fewer than asked for at the end of the block, or after a pause was
+            requested.
+
+        Raises
+        ------
+        Exception
+            What the model raised.
+        """
+        random, first = self._random_numbers(iteration)
+        n = min(n, BLOCK - first)
+        target = self._density.native
+        screen = target if self._screen is None else self._screen.native
+        settings = self._phase_settings(tune)
+        state, draws, control = self.state, self.draws, self.control
+        done = advance(settings, target, screen, state, random, first, draws, row, n, control)
+        if done < n and not control[PAUSE_REQUESTED]:
+            for density in filter(None, (self._screen, self._density)):
+                density.raise_error()
+            raise RuntimeError("the model's log-density raised an error that did not occur again")
+        return done
+
+    def add_evaluations(self, failures: Sequence[int]) -> None:
+        """Add evaluations made in Python, given by their failure codes, to the first draw."""
+        if failures:
+            counts = self.draws.counts[0]
+            failed = [code for code in failures if code]
+            counts[N_EVALUATIONS] += len(failures)
+            counts[N_FAILED] += len(failed)
+            if failed and not counts[FAILURE]:
+                counts[FAILURE] = failed[-1]
+
+    def load_state(self, state: ChainState) -> None:
+        """Continue from a state, copied into the arrays that the machine code reads."""
         for mine, given in zip(self.state, state, strict=True):
             if mine is not given:
                 mine[...] = given
+        self._block = None
 
     def snapshot(self, begin: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Draws from an iteration on, and the state, as plain arrays for a checkpoint.
 
-        What has not changed since the iteration before is left out: most proposals are rejected.
+        Rows that repeat the row before, as after a rejection, are stored once.
         """
-        rows = slice(begin, int(self.talk[DONE]))
+        rows = slice(begin, int(self.control[N_DONE]))
         counts, numbers = self.draws.counts[rows], self.draws.numbers[rows]
         changed = counts[:, STAGE] > 0
         changed[1:] |= numbers[1:, SCALING] != numbers[:-1, SCALING]
@@ -182,7 +243,7 @@ class RunningChain:
         return draws, self.state._asdict()
 
     def restore(self, draws: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> None:
-        """Go on from all the snapshots of a checkpoint together."""
+        """Continue from the concatenated snapshots of a checkpoint."""
         done = len(draws["counts"])
         last_change = np.cumsum(draws["changed"]) - 1
         for name in ("positions", "numbers", "seeds"):
@@ -190,49 +251,20 @@ class RunningChain:
         self.draws.counts[:done] = draws["counts"]
         self.draws.numbers[:done, ACCEPTANCE] = draws["acceptance"]
         self.draws.covs[: len(draws["covs"])] = draws["covs"]
-        self.adopt(State(**state))
-        self.talk[DONE] = done
-        self._move_noise()
+        self.load_state(ChainState(**state))
+        self.control[N_DONE] = done
+        self._restore_correlation()
 
-    def add_evaluations(self, codes: Sequence[int]) -> None:
-        """Count evaluations made in Python, by the codes of their failures, to the first draw."""
-        if codes:
-            counts = self.draws.counts[0]
-            failed = [code for code in codes if code]
-            counts[N_EVALUATIONS] += len(codes)
-            counts[N_FAILED] += len(failed)
-            if failed and not counts[FAILURE]:
-                counts[FAILURE] = failed[-1]
+    def _random_numbers(self, iteration: int) -> tuple[RandomBlock, int]:
+        """The block of random numbers of an iteration, and the row of the iteration in it."""
+        index, row = divmod(iteration, BLOCK)
+        if self._block is None or self._block[0] != index:
+            self._block = index, self._target.random_block(self.state.key, index)
+        return self._block[1], row
 
-    @property
-    def proposal_cov(self) -> np.ndarray:
-        """Covariance of the first stage's proposals, shape (d, d)."""
-        return unpack(self.state.adaptation, self.state.position.size).cov
-
-    @property
-    def others(self) -> list[np.ndarray]:
-        """Values of the variables that other step methods move, as they were last."""
-        return self._density.others
-
-    def noise(self, fresh: np.ndarray) -> np.ndarray:
-        """Seeds of an evaluation: those drawn, or the held ones in their place."""
-        return fresh if self._target.settings.refresh_noise else self._target.held_seeds
-
-    def advance(self, tune: bool, random: Random, first: int, row: int, n: int) -> int:
-        """Make up to n iterations with random numbers from ``first``, noted down from ``row``.
-
-        Returns
-        -------
-        int
-            How many were made: fewer if somebody asked for a pause.
-
-        Raises
-        ------
-        Exception
-            What the model raised.
-        """
+    def _phase_settings(self, tune: bool) -> PhaseSettings:
         settings = self._target.settings
-        phase = Settings(
+        return PhaseSettings(
             settings.stages[0 if tune else 1],
             float(settings.stage_scale),
             self._screen is not None,
@@ -240,40 +272,30 @@ class RunningChain:
             settings.adaptation == "continuous",
             int(settings.adapt_every),
         )
-        target = self._density.density
-        screen = target if self._screen is None else self._screen.density
-        done = advance(
-            phase, target, screen, self.state, random, first, self.draws, row, n, self.talk
-        )
-        if done < n and not self.talk[PAUSE]:
-            for density in filter(None, (self._screen, self._density)):
-                density.raise_error()
-            raise RuntimeError("the model's log-density raised an error, but not when asked again")
-        return done
 
-    def _heed_pause(self) -> None:
-        if self.talk[PAUSE]:
-            raise Halted
+    def _check_pause(self) -> None:
+        if self.control[PAUSE_REQUESTED]:
+            raise StopRequested
 
     def _evaluate_screen(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: np.ndarray
     ) -> tuple[float, int]:
-        """Log-density of the screen, 0 without one; and the code of its failure."""
+        """Log-density of the screen, 0 without one, and its failure code."""
         if self._screen is None:
             return 0.0, 0
         value = self._screen(position, others, seeds)
         return value.log_density, value.failure
 
-    def _stand(self, point: EvaluatedPoint) -> None:
-        """Take a point just evaluated as the current one, and its noise."""
+    def _set_current(self, point: EvaluatedPoint) -> None:
+        """Take the point just evaluated, and its noise, as the current state."""
         state = self.state
         state.position[:], state.seeds[:] = point.position, point.seeds
         state.numbers[:] = point.log_density, point.n_effective, point.log_screen
         if state.carried.size:
-            state.carried[:] = self._density.density.call.out[-state.carried.size :]
-        self._move_noise()
+            state.carried[:] = self._density.native.call.out[-state.carried.size :]
+        self._restore_correlation()
 
-    def _move_noise(self) -> None:
-        """From now on, move the noise by as much as the settings say."""
+    def _restore_correlation(self) -> None:
+        """Set the correlation of the next proposals' noise to that of the settings."""
         if self._target.settings.correlation is not None:
             self._density.correlation[...] = self._target.settings.correlation

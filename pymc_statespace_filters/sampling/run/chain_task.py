@@ -1,220 +1,178 @@
-"""A chain from its start to its end, in a thread of its own, and what is kept of it on disk.
+"""A chain run from its start, or from its checkpoint, to its end, in a thread of its own.
 
-The thread is in machine code nearly all the time and holds no interpreter lock. It comes back to
-Python for the next block of random numbers, and where the main thread has asked for a pause: to
+The thread spends nearly all its time in machine code, without the interpreter lock. It returns to
+Python for the next block of random numbers, and when the main thread has requested a pause: to
 write a checkpoint, or to stop.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from threading import Event
-from typing import NamedTuple
 
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, log_warnings
 
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_key, draw_seeds
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key, draw_seeds
 from pymc_statespace_filters.sampling.kernel.state import (
-    DONE,
+    N_DONE,
     N_FAILED,
-    PAUSE,
+    PAUSE_REQUESTED,
     STAGE,
+    ChainState,
     Draws,
-    Random,
 )
-from pymc_statespace_filters.sampling.output import noise_check
-from pymc_statespace_filters.sampling.run.chain import Halted, RunningChain
+from pymc_statespace_filters.sampling.output.likelihood_variance import (
+    N_SEEDS,
+    N_STUCK,
+    start_warning,
+)
+from pymc_statespace_filters.sampling.run.chain import Chain, StopRequested
 from pymc_statespace_filters.sampling.target.target import Target
 
 CHECKPOINT_SECONDS = 5.0
 
-
-class Plan(NamedTuple):
-    """What a run is to do.
-
-    Attributes
-    ----------
-    tune, draws : int
-        Iterations of each chain.
-    keeps_warmup : bool
-    starts : sequence of callable
-        For each chain, from its generator to the candidates for its start.
-    seeds : sequence of numpy.random.SeedSequence
-        For each chain, all its randomness.
-    measures_noise : bool
-        Whether the scatter of the estimates is measured at each start.
-    """
-
-    tune: int
-    draws: int
-    keeps_warmup: bool
-    starts: Sequence[Callable[[np.random.Generator], Sequence[np.ndarray]]]
-    seeds: Sequence[np.random.SeedSequence]
-    measures_noise: bool = False
-
-    @property
-    def n_iterations(self) -> int:
-        """Iterations of a chain."""
-        return self.tune + self.draws
+Candidates = Callable[[np.random.Generator], Sequence[np.ndarray]]
 
 
-class ChainResult(NamedTuple):
-    """What is left of a chain at its end.
-
-    Attributes
-    ----------
-    draws : Draws
-        Of ``done`` iterations.
-    done : int
-        Fewer than were planned after an interruption.
-    key : ndarray of uint64, shape (2,)
-    proposal_cov : ndarray, shape (d, d)
-        Of the first stage, as it was last.
-    seconds : float
-    """
-
-    draws: Draws
-    done: int
-    key: np.ndarray
-    proposal_cov: np.ndarray
-    seconds: float
-
-
-class ChainRun:
-    """One chain from its start, or from its checkpoint, to its end.
+class ChainTask:
+    """One chain to be run.
 
     Parameters
     ----------
     target : Target
         Prepared.
-    plan : Plan
+    tune, draws : int
+        Iterations of warm-up and after it.
+    candidates : callable
+        From the chain's generator to the candidates for its start.
+    seed : numpy.random.SeedSequence
+        The chain's randomness.
     index : int
-        Which chain.
-    checkpoint : Checkpoint, optional
+        Number of the chain.
     name : str, optional
-        For messages.
+        For messages. Default: "chain" and the index.
+    checkpoint : Checkpoint, optional
+    keeps_warmup : bool
+    measures_noise : bool
+        Whether the variance of the estimated log-likelihood is measured at the start.
 
     Attributes
     ----------
-    running : RunningChain
-    key : ndarray of uint64, shape (2,)
-        Of its random numbers.
+    chain : Chain
     seconds : float
-        How long it took from start to end; 0 if a checkpoint had begun it.
+        Duration of a finished chain; 0 if a checkpoint had begun it.
     """
 
     def __init__(
         self,
         target: Target,
-        plan: Plan,
-        index: int,
-        checkpoint: Checkpoint | None,
+        tune: int,
+        draws: int,
+        candidates: Candidates,
+        seed: np.random.SeedSequence,
+        *,
+        index: int = 0,
         name: str | None = None,
+        checkpoint: Checkpoint | None = None,
+        keeps_warmup: bool = False,
+        measures_noise: bool = False,
     ):
-        self._target, self._plan, self._index = target, plan, index
-        self._name = name or f"chain {index}"
-        n_covs = plan.tune if plan.keeps_warmup else 0
-        self.running = RunningChain(target, plan.n_iterations, n_covs)
-        self._rng = np.random.default_rng(plan.seeds[index])
-        self.key = draw_key(self._rng)
-        self._block: tuple[int, Random] | None = None
+        self._tune, self._n_iterations = tune, tune + draws
+        self._candidates, self._measures_noise = candidates, measures_noise
+        self._index, self._name = index, name or f"chain {index}"
+        self._rng = np.random.default_rng(seed)
+        n_covs = tune if keeps_warmup else 0
+        self.chain = Chain(target, draw_key(self._rng), self._n_iterations, n_covs)
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
-            draws, state = stored
-            self.key = state.pop("key")
-            self.running.restore(draws, state)
-        self._n_saved = self.done
+            self.chain.restore(*stored)
+        self._n_saved = self.n_done
         self._saved_at = time.monotonic()
         self.seconds = 0.0
         self._start_warning: SamplerWarning | None = None
 
     @property
-    def done(self) -> int:
+    def n_done(self) -> int:
         """Iterations made so far."""
-        return int(self.running.talk[DONE])
+        return int(self.chain.control[N_DONE])
 
-    def ask_for_pause(self, stop: Event) -> None:
-        """Bring the chain back to Python if there is something to do there."""
+    def request_pause(self, stop: Event) -> None:
+        """Have the chain return to Python if it is to stop or to be saved."""
         if stop.is_set() or self._must_save():
-            self.running.talk[PAUSE] = 1
+            self.chain.control[PAUSE_REQUESTED] = 1
 
     def run(self, stop: Event) -> None:
-        """Go on to the end, or until told to stop."""
-        began, resumed = time.monotonic(), self.done > 0
+        """Run to the end, or until the event is set."""
+        began, resumed = time.monotonic(), self.n_done > 0
         try:
-            codes = self._start() if self.done == 0 else ()
-            while self.done < self._plan.n_iterations and not stop.is_set():
-                self.running.talk[PAUSE] = 0  # asked for again and again where it is needed
+            failures = () if resumed else self._start()
+            while self.n_done < self._n_iterations and not stop.is_set():
+                self.chain.control[PAUSE_REQUESTED] = 0  # the main thread repeats its request
                 self._advance()
-                if codes and self.done > 0:
-                    self.running.add_evaluations(codes)
-                    codes = ()
-                self._warn_if_still_there()
+                if failures and self.n_done > 0:
+                    self.chain.add_evaluations(failures)
+                    failures = ()
+                self._warn_if_stuck()
                 if self._must_save():
                     self._save()
             self._save()
             self.seconds = 0.0 if resumed else time.monotonic() - began
-        except Halted:
+        except StopRequested:
             return
         except Exception as error:
-            error.add_note(f"in {self._name}, after {self.done} iterations")
+            error.add_note(f"in {self._name}, after {self.n_done} iterations")
             raise
 
-    def result(self) -> ChainResult:
-        """What is left of the chain; its machine code goes."""
-        done = self.done
-        cut = {
+    def result(self) -> tuple[Draws, ChainState]:
+        """Draws of the iterations made, and the state after them; the machine code is released."""
+        done = self.n_done
+        draws = {
             name: array if name == "covs" else array[:done]
-            for name, array in self.running.draws._asdict().items()
+            for name, array in self.chain.draws._asdict().items()
         }
-        cov = self.running.proposal_cov.copy()
-        return ChainResult(Draws(**cut), done, self.key, cov, self.seconds)
+        state = self.chain.state._replace(carried=np.empty(0))  # as long as the record
+        return Draws(**draws), ChainState(*(array.copy() for array in state))
 
     def progress(self) -> dict[str, float]:
-        """What a progress bar shows of the iterations made so far, one at least."""
-        draws, done = self.running.draws, self.done
-        begin = self._plan.tune if done > self._plan.tune else 0
+        """Statistics for a progress bar, after at least one iteration."""
+        draws, done = self.chain.draws, self.n_done
+        begin = self._tune if done > self._tune else 0
         return {
             "accept_rate": float(np.mean(draws.counts[begin:done, STAGE] > 0)),
             "n_failed": int(draws.counts[done - 1, N_FAILED]),
         }
 
     def _start(self) -> tuple[int, ...]:
-        """Find a start; for each evaluation made, 0 or the code of its failure."""
-        candidates = self._plan.starts[self._index](self._rng)
-        codes = self.running.start(candidates, (), self._rng)
-        if self._plan.measures_noise:
-            state = self.running.state
-            seeds = draw_seeds(self._rng, (noise_check.N_SEEDS, state.seeds.size))
-            spread = self.running.seed_spread(state.position, seeds)
-            self._start_warning = noise_check.start_warning(spread, self._index)
-        return codes
+        """Find a start; for each evaluation made, 0 or its failure code."""
+        failures = self.chain.start(self._candidates(self._rng), (), self._rng)
+        if self._measures_noise:
+            state = self.chain.state
+            seeds = draw_seeds(self._rng, (N_SEEDS, state.seeds.size))
+            spread = self.chain.seed_spread(state.position, seeds)
+            self._start_warning = start_warning(spread, self._index)
+        return failures
 
-    def _warn_if_still_there(self) -> None:
-        """Say that the start is too noisy, unless the chain has left it: most do, uphill."""
-        if self._start_warning is not None and self.done >= noise_check.STILL:
-            if not self.running.draws.counts[: noise_check.STILL, STAGE].any():
+    def _warn_if_stuck(self) -> None:
+        """Log that the start is too noisy, unless the chain has left it, as most do."""
+        if self._start_warning is not None and self.n_done >= N_STUCK:
+            if not self.chain.draws.counts[:N_STUCK, STAGE].any():
                 log_warnings([self._start_warning])
             self._start_warning = None
 
     def _advance(self) -> None:
-        """Go on to the end of the block of random numbers, or of the phase."""
-        done, plan = self.done, self._plan
-        tune = done < plan.tune
-        index, first = divmod(done, BLOCK)
-        if self._block is None or self._block[0] != index:
-            self._block = index, self._target.random(self.key, index)
-        end = min((index + 1) * BLOCK, plan.tune if tune else plan.n_iterations)
-        self.running.advance(tune, self._block[1], first, done, end - done)
+        """Advance to the end of the block of random numbers, or of the phase."""
+        done = self.n_done
+        tune = done < self._tune
+        end = self._tune if tune else self._n_iterations
+        self.chain.advance(tune, done, done, end - done)
 
     def _must_save(self) -> bool:
         due = time.monotonic() - self._saved_at >= CHECKPOINT_SECONDS
-        return self._log is not None and due and self.done > self._n_saved
+        return self._log is not None and due and self.n_done > self._n_saved
 
     def _save(self) -> None:
-        if self._log is not None and self.done > self._n_saved:
-            draws, state = self.running.snapshot(self._n_saved)
-            self._log.append(draws, state | {"key": self.key})
-            self._n_saved = self.done
+        if self._log is not None and self.n_done > self._n_saved:
+            self._log.append(*self.chain.snapshot(self._n_saved))
+            self._n_saved = self.n_done
         self._saved_at = time.monotonic()

@@ -1,46 +1,46 @@
-"""A whole run, from what was asked for to its trees: what all ranks do in step."""
+"""A whole run, from the request to the DataTrees: the steps that all ranks take together.
+
+Types on the way of a draw, from the request to the DataTree:
+
+`SamplingRequest`
+    what the user asked for, and on which the draws depend; `ExecutionOptions` has the rest
+`ModelTask`
+    the request applied to one model: target, starts, results, DataTree
+`ChainTask`
+    one chain of it, run in a thread and stored in a checkpoint
+`Chain`
+    the chain itself: `ChainState`, the arrays that its machine code changes, and `Draws`, the
+    arrays in which it records every iteration; the two are also the result of a chain
+"""
 
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any, NamedTuple
 
 from pymc.model import Model
 from xarray import DataTree
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
-from pymc_statespace_filters.parallel.cpu_affinity import core_numbers, share_of_cores
+from pymc_statespace_filters.parallel.cpu_affinity import allowed_cores, cores_per_process
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import join_checkpoint, open_checkpoint
-from pymc_statespace_filters.sampling.run.model_task import Asked, ModelRun
+from pymc_statespace_filters.sampling.run.model_task import ModelTask
+from pymc_statespace_filters.sampling.run.request import ExecutionOptions, SamplingRequest
 from pymc_statespace_filters.sampling.run.scheduler import run_chains
-from pymc_statespace_filters.sampling.target.leader_follower import follow, leading
-from pymc_statespace_filters.system.checks import is_integer
+from pymc_statespace_filters.sampling.target.leader_follower import follow, release_followers
 
-_GATHERS = ("root", "all")
-_SEED_CURE = (
-    ", and with the same integer as random_seed: a Generator is the same on two ranks only if it "
-    "was made of the same seed on both and has drawn as much"
+_SEED_ADVICE = (
+    ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
+    "made of the same seed and have drawn as much"
 )
-_PILOT_CURE = ', and with the same pilot, which gather="all" gives to all ranks'
-
-
-class How(NamedTuple):
-    """How a run is made, on which its draws do not depend: arguments of ``sample_dram``."""
-
-    cores: int | None
-    progressbar: bool | str
-    compute_convergence_checks: bool
-    comm: Any
-    ranks_per_chain: int
-    gather: str
+_PILOT_ADVICE = ', and the same pilot, which gather="all" gives to all ranks'
 
 
 def sample_models(
     models: Mapping[str, Model],
-    asked: Asked,
-    how: How,
+    request: SamplingRequest,
+    options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
     """Sample models on all ranks of a communicator.
@@ -48,8 +48,8 @@ def sample_models(
     Parameters
     ----------
     models : mapping of str to pymc.Model
-    asked : Asked
-    how : How
+    request : SamplingRequest
+    options : ExecutionOptions
     checkpoints : sequence of str or path
         A folder for each model, or none.
 
@@ -63,134 +63,131 @@ def sample_models(
     ModelError, DataMismatchError, ParallelError
         As in ``sample_dram``.
     """
-    _check(how)
-    with communicator_of(how.comm, in_lockstep=how.ranks_per_chain > 1) as ranks:
-        if ranks.size > 1:
-            _check_agreement(ranks, models, asked, how, bool(checkpoints))
-        asked = asked._replace(entropy=ranks.broadcast(asked.entropy))
-        group, leaders = ranks.groups(_group_size(how.ranks_per_chain, ranks.size))
+    options.check()
+    with communicator_of(options.comm, in_lockstep=options.ranks_per_chain > 1) as comm:
+        if comm.size > 1:
+            _check_agreement(comm, models, request, options, bool(checkpoints))
+        request = request._replace(entropy=comm.broadcast(request.entropy))
+        group, leaders = comm.groups(_group_size(options.ranks_per_chain, comm.size))
         trees = None
         with group:
             if leaders is None:
                 follow(group)
             else:
-                with leading(group), leaders:
-                    runs = [ModelRun(model, asked, name, group) for name, model in models.items()]
-                    trees = _lead(runs, leaders, how, checkpoints)
-        if how.gather == "all":
-            trees = ranks.broadcast(trees)
+                with release_followers(group), leaders:
+                    tasks = [
+                        ModelTask(model, request, name, group) for name, model in models.items()
+                    ]
+                    trees = _run(tasks, leaders, options, checkpoints)
+        if options.gather == "all":
+            trees = comm.broadcast(trees)
     return trees
 
 
-def _lead(
-    runs: Sequence[ModelRun],
-    ranks: Communicator,
-    how: How,
+def _run(
+    tasks: Sequence[ModelTask],
+    comm: Communicator,
+    options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
-    """Run all chains; ``ranks`` are those that run some."""
-    place, cores = ranks.node_local(core_numbers())
+    """Run all chains on the ranks of ``comm``, one rank of each group; DataTrees on rank 0."""
+    local_rank, cores = comm.node_local(allowed_cores())
     # Each model is compiled by one rank of a computer, the others find the code on disk; rank 0
     # needs all models, the others those of their chains.
-    for mine in (runs[place :: len(cores)], runs if ranks.rank == 0 else ()):
-        ranks.run_collectively(partial(_prepare, mine))
-    n_threads = 1  # where others evaluate with us, for one chain at a time
-    if not runs[0].is_shared:
-        n_threads = how.cores or share_of_cores(place, cores)
-    n_chains = sum(run.n_chains for run in runs)
+    for local in (tasks[local_rank :: len(cores)], tasks if comm.rank == 0 else ()):
+        comm.run_collectively(partial(_prepare, local))
+    n_threads = 1  # followers evaluate for one chain at a time
+    if not tasks[0].is_distributed:
+        n_threads = options.cores or cores_per_process(local_rank, cores)
+    n_chains = sum(task.n_chains for task in tasks)
     with ExitStack() as stack:
         if checkpoints:
-            _open_checkpoints(runs, checkpoints, ranks, stack)
-        outcomes = run_chains(
-            runs,
-            ranks,
-            n_threads=min(n_threads, -(-n_chains // ranks.size)),
-            progressbar=how.progressbar,
+            _open_checkpoints(tasks, checkpoints, comm, stack)
+        run_chains(
+            tasks,
+            comm,
+            n_threads=min(n_threads, -(-n_chains // comm.size)),
+            progressbar=options.progressbar,
         )
 
     def trees() -> dict[str, DataTree] | None:
-        if ranks.rank > 0:
+        if comm.rank > 0:
             return None
-        checks = how.compute_convergence_checks
-        return {run.name: run.tree(*o, checks) for run, o in zip(runs, outcomes, strict=True)}
+        check = options.compute_convergence_checks
+        return {task.name: task.to_datatree(check_convergence=check) for task in tasks}
 
-    return ranks.run_collectively(trees) if how.gather == "all" else trees()
-
-
-def _prepare(runs: Sequence[ModelRun]) -> None:
-    for run in runs:
-        run.prepare()
+    return comm.run_collectively(trees) if options.gather == "all" else trees()
 
 
-def _check(how: How) -> None:
-    if how.gather not in _GATHERS:
-        raise ModelError(f"gather={how.gather!r}: expected one of {_GATHERS}")
-    if how.cores is not None and (not is_integer(how.cores) or how.cores < 1):
-        raise ModelError(f"cores={how.cores!r}: expected an integer, at least 1, or None")
-    if not is_integer(how.ranks_per_chain) or how.ranks_per_chain < 1:
-        raise ModelError(
-            f"ranks_per_chain={how.ranks_per_chain!r}: expected an integer, at least 1"
-        )
-    if how.ranks_per_chain > 1 and how.comm is None:
-        raise ModelError(
-            f"ranks_per_chain={how.ranks_per_chain} without comm: say comm='world' for the ranks "
-            f"that mpiexec started"
-        )
+def _prepare(tasks: Sequence[ModelTask]) -> None:
+    for task in tasks:
+        task.prepare()
 
 
 def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
-    """As many ranks as were asked for; fewer if there are no more, as on a laptop."""
+    """Ranks of a group: as many as there are if more were asked for, as on a laptop."""
     size = min(ranks_per_chain, n_ranks)
     if n_ranks % size:
-        raise ModelError(f"ranks_per_chain={size}: {n_ranks} ranks are not whole groups of {size}")
+        raise ModelError(
+            f"ranks_per_chain must divide the number of ranks, got ranks_per_chain={size} with "
+            f"{n_ranks} ranks"
+        )
     return size
 
 
 def _check_agreement(
-    ranks: Communicator, models: Mapping[str, Model], asked: Asked, how: How, stores: bool
+    comm: Communicator,
+    models: Mapping[str, Model],
+    request: SamplingRequest,
+    options: ExecutionOptions,
+    has_checkpoint: bool,
 ) -> None:
-    """Raise, on all ranks, unless all were asked for the same."""
-    of_all: list[dict[str, Any]] = [
-        {"models": list(models)},
-        {"ranks_per_chain": how.ranks_per_chain, "gather": how.gather, "checkpoint": stores},
-    ]
+    """Raise, on all ranks, unless all made the same call with the same data."""
 
-    def in_words() -> list[dict]:
-        return [*of_all, *(asked.in_words(model, strictly=False) for model in models.values())]
+    def keys() -> list[dict]:
+        return [
+            {"models": list(models)},
+            {
+                "ranks_per_chain": options.ranks_per_chain,
+                "gather": options.gather,
+                "checkpoint": has_checkpoint,
+            },
+            *(request.cache_key(model, require_fingerprint=False) for model in models.values()),
+        ]
 
-    first, *others = ranks.allgather(ranks.run_collectively(in_words))
+    first, *others = comm.allgather(comm.run_collectively(keys))
     for rank, theirs in enumerate(others, start=1):
-        pairs = zip(first, theirs, strict=False)  # of other numbers the first differ already
-        differing = [key for a, b in pairs for key in a if a[key] != b[key]]
+        pairs = zip(first, theirs, strict=False)  # with other numbers of models the first differ
+        differing = [name for a, b in pairs for name in a if a[name] != b[name]]
         if differing:
-            cures = {"random_seed": _SEED_CURE, "proposal_cov": _PILOT_CURE}
+            advice = {"random_seed": _SEED_ADVICE, "proposal_cov": _PILOT_ADVICE}
             raise DataMismatchError(
-                f"rank {rank} of {ranks.size} was asked for something else than rank 0: "
+                f"rank {rank} of {comm.size} and rank 0 differ in "
                 f"{', '.join(dict.fromkeys(differing))}; all ranks must make the same call, with "
-                f"the same data{''.join(cures[name] for name in cures if name in differing)}"
+                f"the same data{''.join(advice[name] for name in advice if name in differing)}"
             )
 
 
 def _open_checkpoints(
-    runs: Sequence[ModelRun],
+    tasks: Sequence[ModelTask],
     folders: Sequence[str | os.PathLike],
-    ranks: Communicator,
+    comm: Communicator,
     stack: ExitStack,
 ) -> None:
-    """Rank 0 opens the folders, the others join."""
+    """Open the folders on rank 0, and join them on the others."""
 
-    def begin() -> list:
+    def open_all() -> list:
         tickets: list = []
-        if ranks.rank == 0:
-            for run, folder in zip(runs, folders, strict=True):
-                in_words = run.asked.in_words(run.model)
-                run.checkpoint = stack.enter_context(open_checkpoint(folder, in_words))
-                tickets.append(run.checkpoint.ticket)
+        if comm.rank == 0:
+            for task, folder in zip(tasks, folders, strict=True):
+                key = task.request.cache_key(task.model)
+                task.checkpoint = stack.enter_context(open_checkpoint(folder, key))
+                tickets.append(task.checkpoint.ticket)
         return tickets
 
-    def join(tickets: list) -> None:
-        if ranks.rank > 0:
-            for run, ticket in zip(runs, tickets, strict=True):
-                run.checkpoint = stack.enter_context(join_checkpoint(ticket))
+    def join_all(tickets: list) -> None:
+        if comm.rank > 0:
+            for task, ticket in zip(tasks, tickets, strict=True):
+                task.checkpoint = stack.enter_context(join_checkpoint(ticket))
 
-    ranks.run_collectively(partial(join, ranks.broadcast(ranks.run_collectively(begin))))
+    comm.run_collectively(partial(join_all, comm.broadcast(comm.run_collectively(open_all))))

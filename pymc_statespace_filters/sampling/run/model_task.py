@@ -1,107 +1,44 @@
-"""All chains of one model: how they begin, and what they become in the end."""
+"""All chains of one model: their starts, their results, and the DataTree made of them."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
-from importlib.metadata import version
-from typing import Any, NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, log_warnings, run_convergence_checks
-from pytensor.graph.basic import Variable
 from xarray import DataTree
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
-    model_data_fingerprint,
-    model_fingerprint,
-)
-from pymc_statespace_filters.sampling.kernel.state import STAGE
+from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
-from pymc_statespace_filters.sampling.output import sample_stats as statistics
-from pymc_statespace_filters.sampling.output.datatree import ChainDraws, to_datatree
-from pymc_statespace_filters.sampling.output.noise_check import at_the_highest_draw, is_worthwhile
-from pymc_statespace_filters.sampling.output.warnings import Record, closing_warning
-from pymc_statespace_filters.sampling.run.chain import RunningChain
-from pymc_statespace_filters.sampling.run.chain_task import ChainResult, ChainRun, Plan
-from pymc_statespace_filters.sampling.target.initvals import chain_starts
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.output.datatree import to_datatree
+from pymc_statespace_filters.sampling.output.likelihood_variance import (
+    is_measured,
+    spread_at_highest_draw,
+)
+from pymc_statespace_filters.sampling.output.sample_stats import whole_chain
+from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
+from pymc_statespace_filters.sampling.run.chain import Chain
+from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
-_SHOWN_DIGITS = 16  # of a fingerprint: 64 bits, in a file and in messages
 
-
-class Asked(NamedTuple):
-    """What the user asked for, the same for all models of a run.
-
-    Attributes
-    ----------
-    draws, tune, chains : int
-    entropy : list of int
-        Of all randomness.
-    is_seeded : bool
-        Whether the user gave a seed.
-    initvals : mapping, sequence of mappings, or None
-    keeps_warmup : bool
-    proposal_cov : array_like or None
-    settings : DRAMSettings
-    """
-
-    draws: int
-    tune: int
-    chains: int
-    entropy: list[int]
-    is_seeded: bool
-    initvals: Any
-    keeps_warmup: bool
-    proposal_cov: Any
-    settings: DRAMSettings
-
-    def in_words(self, model: Model, *, strictly: bool = True) -> dict[str, Any]:
-        """All that a model's draws depend on, as JSON knows it.
-
-        Raises
-        ------
-        ModelError
-            If a part of the model cannot be recognised in another process; without ``strictly``
-            the equations are then left out.
-        """
-        try:
-            fingerprint = model_fingerprint(model)
-        except ModelError:
-            if strictly:
-                raise
-            fingerprint = ""
-        return {
-            "random_seed": self.entropy if self.is_seeded else None,
-            "initvals": _plain(self.initvals),
-            "proposal_cov": _plain(self.proposal_cov),
-            "draws": int(self.draws),
-            "tune": int(self.tune),
-            "chains": int(self.chains),
-            "discard_tuned_samples": not self.keeps_warmup,
-            **{f.name: repr(getattr(self.settings, f.name)) for f in fields(self.settings)},
-            "model": fingerprint[:_SHOWN_DIGITS],
-            "data": model_data_fingerprint(model)[:_SHOWN_DIGITS],
-            "version": version("pymc-statespace-filters"),
-        }
-
-
-class ModelRun:
+class ModelTask:
     """The chains of a model.
 
     Parameters
     ----------
     model : pymc.Model
-    asked : Asked
+    request : SamplingRequest
     name : str
-        For messages; empty if there is one model alone.
-    group : Ranks, optional
+        For messages; empty if there is only one model.
+    group : Communicator, optional
         Ranks that evaluate the likelihoods together, of which this is the first.
 
     Attributes
@@ -116,92 +53,122 @@ class ModelRun:
     """
 
     def __init__(
-        self, model: Model, asked: Asked, name: str = "", group: Communicator | None = None
+        self,
+        model: Model,
+        request: SamplingRequest,
+        name: str = "",
+        group: Communicator | None = None,
     ):
         check_no_generators(model)
-        self.model, self.asked, self.name = model, asked, name
+        self.model, self.request, self.name = model, request, name
         self._group = group
         self.checkpoint: Checkpoint | None = None
         self._target: Target | None = None
+        self._results: dict[int, tuple[Draws, ChainState]] = {}
+        self._began = self._ended = 0.0
 
     @property
-    def is_shared(self) -> bool:
+    def is_distributed(self) -> bool:
         """Whether other ranks evaluate likelihoods together with this one."""
         return self._group is not None and self._group.size > 1
 
     @property
     def n_chains(self) -> int:
-        """How many chains there are."""
-        return self.asked.chains
+        """Number of chains."""
+        return self.request.chains
 
     def prepare(self) -> Target:
-        """Compile the model, and find out where chains may start; done once."""
+        """Compile the model and find candidates for the starts, once."""
         if self._target is None:
-            asked = self.asked
-            self._target = Target(
-                self.model, None, asked.settings, asked.proposal_cov, group=self._group
+            request = self.request
+            self._target = target = Target(
+                self.model, None, request.settings, request.proposal_cov, group=self._group
             )
-            self._target.prepare()
-            seeds = np.random.SeedSequence(asked.entropy).spawn(asked.chains)
-            self.plan = Plan(
-                asked.tune,
-                asked.draws,
-                asked.keeps_warmup,
-                chain_starts(
-                    self.model, self._target, asked.initvals, seeds, disperse=asked.tune > 0
-                ),
-                seeds,
-                is_worthwhile(self._target, asked.tune + asked.draws),
+            target.prepare()
+            self._seeds = np.random.SeedSequence(request.entropy).spawn(request.chains)
+            self._candidates = chain_candidates(
+                self.model,
+                target.raveled,
+                target.prior_draws,
+                request.initvals,
+                self._seeds,
+                disperse=request.tune > 0,
             )
+            self._measures_noise = is_measured(target, request.n_iterations)
         return self._target
 
-    def chain(self, index: int) -> ChainRun:
-        """Make a chain ready to run, from its start or from its checkpoint."""
-        target = self.prepare()
-        name = f"chain {index} of model {self.name!r}" if self.name else f"chain {index}"
-        return ChainRun(target, self.plan, index, self.checkpoint, name)
+    def chain_task(self, index: int) -> ChainTask:
+        """Make the task of a chain, from its start or from its checkpoint."""
+        target, request = self.prepare(), self.request
+        return ChainTask(
+            target,
+            request.tune,
+            request.draws,
+            self._candidates[index],
+            self._seeds[index],
+            index=index,
+            name=f"chain {index} of model {self.name!r}" if self.name else None,
+            checkpoint=self.checkpoint,
+            keeps_warmup=request.keeps_warmup,
+            measures_noise=self._measures_noise,
+        )
 
     def cost(self) -> float:
-        """Seconds that a chain will take, roughly: as many evaluations as iterations."""
+        """Estimate the seconds that a chain takes: as many evaluations as iterations."""
         bound = self.prepare().density.bind()
         seconds = []
         for _ in range(3):
             began = time.perf_counter()
-            evaluate(bound.density)  # reads arrays that live as long as `bound`
+            evaluate(bound.native)  # reads arrays that live as long as `bound`
             seconds.append(time.perf_counter() - began)
-        return min(seconds) * self.plan.n_iterations
+        return min(seconds) * self.request.n_iterations
 
-    def tree(
-        self, results: list[ChainResult], sampling_time: float, checks_convergence: bool
-    ) -> DataTree:
-        """What ``pm.sample`` returns of the chains; says what is wrong with them.
+    def start_clock(self) -> None:
+        """Note that a chain starts; the first one starts the sampling time."""
+        self._began = self._began or time.monotonic()
 
-        The results are taken out of the list one by one, so that draws are in memory twice, but
-        never three times.
+    def add_result(self, index: int, draws: Draws, state: ChainState) -> None:
+        """Keep the result of a chain, from this rank or another."""
+        self._results[index] = draws, state
+        self._ended = time.monotonic()
+
+    def load_missing_results(self) -> None:
+        """Take what the checkpoint holds for chains that never ran, as after an interruption."""
+        for index in set(range(self.n_chains)) - set(self._results):
+            self._results[index] = self.chain_task(index).result()
+
+    def to_datatree(self, *, check_convergence: bool) -> DataTree:
+        """Make the DataTree of the results of all chains, and log warnings about them.
+
+        Results are released one by one, so that the draws are in memory twice, but never three
+        times.
         """
-        target, asked = self.prepare(), self.asked
-        warnings, attrs = self._look_at(target, results)
+        target, request = self.prepare(), self.request
+        results = [self._results.pop(index) for index in range(self.n_chains)]
+        warnings = _chain_warnings(target, results, request.tune)
+        attrs, noise_warnings = self._measure_noise(target, results)
+        warnings += noise_warnings
         chains = []
         while results:
-            chains.append(_chain_draws(target, results.pop(0), asked.tune))
+            chains.append(whole_chain(target, *results.pop(0), request.tune))
         tree = to_datatree(
             self.model,
-            target.held,
+            target.raveled,
             chains,
-            tune=asked.tune,
-            keep_warmup=asked.keeps_warmup,
-            sampling_time=sampling_time,
+            tune=request.tune,
+            keep_warmup=request.keeps_warmup,
+            sampling_time=self._ended - self._began,
         )
         tree.attrs |= {
             "exact": int(target.exact),
-            "refresh_noise": int(asked.settings.refresh_noise),
-            "correlation": asked.settings.correlation or 0.0,
+            "refresh_noise": int(request.settings.refresh_noise),
+            "correlation": request.settings.correlation or 0.0,
             **attrs,
         }
-        if checks_convergence and "posterior" in tree:
+        if check_convergence and "posterior" in tree:
             with (
-                suppress(KeyboardInterrupt),  # the draws are there, who does not want to wait
-                np.errstate(invalid="ignore", divide="ignore"),  # chains that stand still
+                suppress(KeyboardInterrupt),  # the draws are kept if the user does not wait
+                np.errstate(invalid="ignore", divide="ignore"),  # chains that never moved
             ):
                 warnings += run_convergence_checks(tree, self.model)
         if self.name:
@@ -209,64 +176,35 @@ class ModelRun:
         log_warnings(warnings)
         return tree
 
-    def _look_at(
-        self, target: Target, results: Sequence[ChainResult]
-    ) -> tuple[list[SamplerWarning], dict[str, float]]:
-        """What is wrong with the chains one by one, and how noisy their likelihood is."""
-        plan = self.plan
-        warnings = _chain_warnings(target, results, plan.tune)
-        attrs = {}
-        if plan.measures_noise and all(r.done == plan.n_iterations for r in results):
+    def _measure_noise(
+        self, target: Target, results: Sequence[tuple[Draws, ChainState]]
+    ) -> tuple[dict[str, float], list[SamplerWarning]]:
+        """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
+        request = self.request
+        lengths = {len(draws.positions) for draws, _ in results}
+        if self._measures_noise and lengths == {request.n_iterations}:
             with suppress(KeyboardInterrupt):
-                spread, warning = at_the_highest_draw(
-                    [result.draws for result in results],
-                    plan.tune if plan.draws else 0,
-                    RunningChain(target, 0, 0).seed_spread,
-                    [result.key for result in results],
+                keys = [state.key for _, state in results]
+                spread, warning = spread_at_highest_draw(
+                    [draws for draws, _ in results],
+                    request.tune if request.draws else 0,
+                    Chain(target, keys[0], 0, 0).seed_spread,
+                    keys,
                 )
-                attrs["log_likelihood_variance"] = spread.variance
-                warnings += filter(None, [warning])
-        return warnings, attrs
-
-
-def _chain_draws(target: Target, result: ChainResult, tune: int) -> ChainDraws:
-    """What a chain has drawn, with its statistics: copies, which need the draws no more."""
-    draws, done = result.draws, result.done
-    stats = {
-        name: values.copy()
-        for name, values in statistics.of_draws(target, draws, slice(0, done)).items()
-    }
-    moved = draws.counts[:done, STAGE] > 0
-    stats["accept_rate"] = np.concatenate(
-        [np.cumsum(phase) / np.arange(1, phase.size + 1) for phase in np.split(moved, [tune])]
-    )
-    frozen = result.proposal_cov
-    covs = np.broadcast_to(frozen, (done, *frozen.shape))  # of the draws, where the warm-up goes
-    if len(draws.covs):
-        covs = np.concatenate([draws.covs[:done], covs[tune:]])
-    return ChainDraws(draws.positions[:done].copy(), stats | {"proposal_cov": covs})
+                warnings = [] if warning is None else [warning]
+                return {"log_likelihood_variance": spread.variance}, warnings
+        return {}, []
 
 
 def _chain_warnings(
-    target: Target, results: Sequence[ChainResult], tune: int
+    target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
 ) -> list[SamplerWarning]:
-    """What is wrong with the chains, one by one."""
+    """Warnings about single chains."""
     warnings = []
-    for i, result in enumerate(results):
-        record = Record.of(result.draws, tune, result.done)
-        if record.iterations:
-            warning = closing_warning(record, target.growth(result.proposal_cov))
+    for i, (draws, state) in enumerate(results):
+        statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
+        if statistics.iterations:
+            warning = closing_warning(statistics, target.growth(state.proposal_cov))
             if warning is not None:
                 warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
     return warnings
-
-
-def _plain(value: Any) -> Any:
-    """A value as JSON knows it, for comparison."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    return np.asarray(value).tolist() if not isinstance(value, Variable) else str(value)

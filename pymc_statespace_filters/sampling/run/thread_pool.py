@@ -1,28 +1,22 @@
-"""The chains that one process runs at a time, in threads."""
+"""The threads of one process that run its chains."""
 
 import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from threading import Event
-from typing import NamedTuple, Self
+from typing import Self
 
-from pymc_statespace_filters.sampling.run.chain_task import ChainRun
+from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 
 _REFRESH_SECONDS = 0.1
 
 
-class Job(NamedTuple):
-    """A chain of one of several models, by their numbers."""
+class ChainPool:
+    """Threads that run chains; a context manager that stops them all on exit.
 
-    model: int
-    chain: int
-
-
-class Crew:
-    """Threads that run chains; a context manager, after which none of them runs any more.
-
-    All methods are called from one thread, the one that may be interrupted.
+    All methods are called from one thread, the one that may be interrupted. Chains are identified
+    by number.
 
     Parameters
     ----------
@@ -30,36 +24,36 @@ class Crew:
 
     Attributes
     ----------
-    at_work : dict of Job to ChainRun
-        The chains that run, and those that were halted.
+    running : dict of int to ChainTask
+        Chains that run, and chains that were stopped.
     """
 
     def __init__(self, n_threads: int):
         self._n_threads = n_threads
         self._pool = ThreadPoolExecutor(n_threads)
         self._stop = Event()
-        self._futures: dict[Future, Job] = {}
-        self.at_work: dict[Job, ChainRun] = {}
+        self._futures: dict[Future, int] = {}
+        self.running: dict[int, ChainTask] = {}
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.halt()
+        self.stop()
         self._pool.shutdown()
 
     @property
-    def has_room(self) -> bool:
-        """Whether a thread is free."""
-        return len(self.at_work) < self._n_threads
+    def is_idle(self) -> bool:
+        """Whether a thread is idle."""
+        return len(self.running) < self._n_threads
 
-    def start(self, job: Job, run: ChainRun) -> None:
-        """Let a free thread run a chain."""
-        self.at_work[job] = run
-        self._futures[self._pool.submit(run.run, self._stop)] = job
+    def start(self, number: int, task: ChainTask) -> None:
+        """Run a chain in an idle thread."""
+        self.running[number] = task
+        self._futures[self._pool.submit(task.run, self._stop)] = number
 
-    def ended(self, seconds: float = _REFRESH_SECONDS) -> Sequence[tuple[Job, ChainRun]]:
-        """Wait so long at most for chains to end, and hand out those that have.
+    def finished(self, seconds: float = _REFRESH_SECONDS) -> Sequence[tuple[int, ChainTask]]:
+        """Wait for chains to finish, for at most so many seconds, and remove those that have.
 
         Raises
         ------
@@ -68,21 +62,21 @@ class Crew:
         """
         if not self._futures:
             time.sleep(seconds)
-        ended, _ = wait(self._futures, seconds, return_when=FIRST_COMPLETED)
-        for future in ended:
+        done, _ = wait(self._futures, seconds, return_when=FIRST_COMPLETED)
+        for future in done:
             future.result()
-        jobs = [self._futures.pop(future) for future in ended]
-        for run in self.at_work.values():
-            run.ask_for_pause(self._stop)
-        return [(job, self.at_work.pop(job)) for job in jobs]
+        numbers = [self._futures.pop(future) for future in done]
+        for task in self.running.values():
+            task.request_pause(self._stop)
+        return [(number, self.running.pop(number)) for number in numbers]
 
-    def halt(self) -> None:
-        """Bring all chains to a halt, however often the user interrupts meanwhile."""
+    def stop(self) -> None:
+        """Stop all chains and wait for them, ignoring further interrupts."""
         self._stop.set()
-        running = set(self._futures)
-        while running:
+        unfinished = set(self._futures)
+        while unfinished:
             with suppress(KeyboardInterrupt):
-                for run in self.at_work.values():
-                    run.ask_for_pause(self._stop)
-                _, running = wait(running, timeout=_REFRESH_SECONDS)
+                for task in self.running.values():
+                    task.request_pause(self._stop)
+                _, unfinished = wait(unfinished, timeout=_REFRESH_SECONDS)
         self._futures.clear()

@@ -1,1 +1,1 @@
-"""The log-density that a chain evaluates."""
+"""The log-density that a chain evaluates, and where chains start."""

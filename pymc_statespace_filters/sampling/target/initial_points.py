@@ -1,40 +1,41 @@
-"""Where chains start when the user does not say.
+"""Where chains start: the user's initial values, or draws from the prior.
 
-PyMC starts every chain of a step method at one point, which hides from R-hat what it is meant to
-find. Draws from the prior, on the unconstrained space, disperse the starts; their spread is also
-the one thing known about the units of the variables before a chain has moved.
+PyMC starts all chains of a step method at one point, so that R-hat cannot detect a chain that has
+not left its start. Draws from the prior, on the unconstrained space, disperse the starts. Their
+spread is also all that is known of the scales of the variables before a chain has moved.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
-from pymc.initial_point import make_initial_point_fn
+from pymc.initial_point import make_initial_point_fn, make_initial_point_fns_per_chain
 from pymc.model import Model
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.output.warnings import reason
-from pymc_statespace_filters.sampling.target.variables import HeldVariables
+from pymc_statespace_filters.sampling.kernel.state import failure_reason
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
 N_DRAWS = 200
-# Possible prior draws of which a chain starts at the best.
+# Number of prior draws with finite log-density of which a chain starts at the best.
 N_COMPARED = 10
 
 
 class EvaluatedPoint(NamedTuple):
-    """A point with its estimate.
+    """A point and the estimate of its log-density.
 
     Attributes
     ----------
     position : ndarray, shape (d,)
         On the unconstrained space.
     seeds : ndarray of int64, shape (noisy,)
-        The noise behind the estimate.
+        Noise seeds of the estimate.
     log_density : float
     failure : int
-        0, or the code of the reason why the log-density is minus infinity.
+        0, or the failure code if the log-density is minus infinity.
     n_effective : float
-        Smallest effective number of particles behind the estimate; infinity if it has no noise.
+        Smallest effective number of particles of the estimate; infinity without noise.
     log_screen : float
         Log-density of the screen, 0 without one.
     """
@@ -47,59 +48,59 @@ class EvaluatedPoint(NamedTuple):
     log_screen: float = 0.0
 
 
-class Starts:
-    """The prior's draws, and whether a start has been chosen by the user.
+class PriorDraws:
+    """Draws from the prior, as candidates for starts and as a measure of scale.
 
-    PyMC does not hand ``initvals`` to a step method; a start that differs from the model's own
-    starting point, or an ``initval`` in the model, gives the choice away. (Somebody who passes
-    exactly the model's starting point is not recognised.)
+    PyMC does not pass ``initvals`` to a step method. The user's choice is recognised by a start
+    that differs from the model's initial point, or by an ``initval`` in the model; values equal to
+    the model's initial point are not recognised.
 
     Parameters
     ----------
     model : pymc.Model
-    held : HeldVariables
+    raveled : RaveledVariables
     default : mapping of str to ndarray
-        The model's own starting point.
+        The model's initial point.
     """
 
-    def __init__(self, model: Model, held: HeldVariables, default: Mapping[str, np.ndarray]):
-        held_rvs = [model.values_to_rvs[v] for v in held.variables]
-        self._in_model = any(model.rvs_to_initial_values[rv] is not None for rv in held_rvs)
-        self._default = held.join(default)
-        self._draws = _prior_draws(model, held)
+    def __init__(self, model: Model, raveled: RaveledVariables, default: Mapping[str, np.ndarray]):
+        rvs = [model.values_to_rvs[v] for v in raveled.variables]
+        self._has_initvals = any(model.rvs_to_initial_values[rv] is not None for rv in rvs)
+        self._default = raveled.ravel(default)
+        self._draws = _prior_draws(model, raveled)
 
     def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-        """List where a chain may start: draws from the prior before the point it was told.
+        """List candidates for a chain's start: draws from the prior, then the given point.
 
         Parameters
         ----------
         start : ndarray, shape (d,)
-            Where the chain was told to start.
+            The start given by the user or the model.
         rng : numpy.random.Generator
 
         Returns
         -------
         list of ndarray, shape (d,)
-            Only ``start`` itself if the user chose it.
+            Only ``start`` if the user chose it.
         """
-        if self._in_model or not np.array_equal(start, self._default):
+        if self._has_initvals or not np.array_equal(start, self._default):
             return [start]
         return [*rng.permutation(self._draws), start]
 
     def covariance(self) -> np.ndarray:
-        """Guess a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
+        """Give a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
         dim = self._default.size
         variance = self._draws.var(axis=0) if len(self._draws) > 1 else np.ones(dim)
         variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
         return np.diag(variance) * 2.38**2 / dim
 
 
-def _prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
+def _prior_draws(model: Model, raveled: RaveledVariables) -> np.ndarray:
     """Draw from the prior, on the unconstrained space: finite rows, shape (n, d).
 
-    The seed is fixed, so that the table belongs to the model; a chain's own generator picks from
-    it. Where a prior cannot be drawn from (it is flat), the draws are the model's starting point
-    plus U(-1, 1), as under PyMC's NUTS.
+    The seed is fixed, so that the draws depend on the model alone; the generator of a chain chooses
+    among them. A prior that cannot be drawn from, such as a flat one, is replaced by the model's
+    initial point plus U(-1, 1), as in PyMC's NUTS.
     """
     free = list(model.free_RVs)
     from_prior = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
@@ -108,50 +109,117 @@ def _prior_draws(model: Model, held: HeldVariables) -> np.ndarray:
     except NotImplementedError:
         jittered = make_initial_point_fn(model=model, jitter_rvs=set(free))
         points = [jittered(seed) for seed in range(N_DRAWS)]
-    table = np.array([held.join(point) for point in points])
+    table = np.array([raveled.ravel(point) for point in points])
     return table[np.isfinite(table).all(axis=1)]
 
 
-def best_start(
+def best_initial_point(
     candidates: Sequence[np.ndarray], evaluate: Callable[[np.ndarray], EvaluatedPoint]
 ) -> tuple[EvaluatedPoint, tuple[int, ...]]:
-    """Take the best of the first few candidates of positive density.
+    """Take the best of the first few candidates with finite log-density.
 
-    Far out in the prior an estimated likelihood is a matter of luck, and a chain that begins at a
-    lucky estimate stays there; a few more draws lie better and are still dispersed.
+    Far out in the prior an estimated likelihood varies widely, and a chain that starts at an
+    overestimate is slow to leave it. The best of a few draws lies closer, and the starts of several
+    chains are still dispersed.
 
     Parameters
     ----------
     candidates : sequence of ndarray, shape (d,)
-        The last one is where the chain was told to start.
+        The last one is the start given by the user or the model.
     evaluate : callable
 
     Returns
     -------
     EvaluatedPoint
     tuple of int
-        For each evaluation made, 0 or the code of its failure.
+        For each evaluation made, 0 or its failure code.
 
     Raises
     ------
     ModelError
-        If all are impossible.
+        If the log-density is minus infinity at all candidates.
     """
-    codes: tuple[int, ...] = ()
-    possible: list[EvaluatedPoint] = []
+    failures: tuple[int, ...] = ()
+    finite: list[EvaluatedPoint] = []
     for position in candidates:
-        start = evaluate(position)
-        codes = (*codes, start.failure)
-        if start.log_density > -np.inf:
-            possible.append(start)
-        if len(possible) == N_COMPARED:
+        point = evaluate(position)
+        failures = (*failures, point.failure)
+        if point.log_density > -np.inf:
+            finite.append(point)
+        if len(finite) == N_COMPARED:
             break
-    if possible:
-        return max(possible, key=lambda start: start.log_density), codes
-    tried = f", nor at {len(codes) - 1} draws from the prior" if len(codes) > 1 else ""
-    because = f" ({reason(codes[-1])})" if codes[-1] else ""
+    if finite:
+        return max(finite, key=lambda point: point.log_density), failures
+    tried = f", nor at {len(failures) - 1} draws from the prior" if len(failures) > 1 else ""
+    because = f" ({failure_reason(failures[-1])})" if failures[-1] else ""
     raise ModelError(
         f"the log-density is not finite at the start, {candidates[-1].tolist()} on the "
-        f"unconstrained space{because}{tried}: give a possible starting point in initvals, or a "
-        "pilot to sample_dram whose chains end at possible points"
+        f"unconstrained space{because}{tried}: give a start of finite log-density by initvals, or "
+        "by a pilot of sample_dram whose chains ended at such points"
     )
+
+
+def chain_candidates(
+    model: Model,
+    raveled: RaveledVariables,
+    prior_draws: PriorDraws,
+    initvals: Any,
+    seeds: Sequence[np.random.SeedSequence],
+    *,
+    disperse: bool,
+) -> list[Callable[[np.random.Generator], Sequence[np.ndarray]]]:
+    """For each chain, a function from its generator to the candidates for its start.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    raveled : RaveledVariables
+    prior_draws : PriorDraws
+    initvals : None, mapping, or sequence of these
+        As in ``pm.sample``.
+    seeds : sequence of numpy.random.SeedSequence
+        Of the chains.
+    disperse : bool
+        Whether candidates are drawn from the prior if no initial values are given.
+
+    Raises
+    ------
+    ModelError
+        If the values do not fit the model.
+    """
+    _check_initvals(model, initvals, len(seeds))
+    points = make_initial_point_fns_per_chain(
+        model=model, overrides=initvals, jitter_rvs=set(), chains=len(seeds)
+    )
+    disperse = disperse and initvals is None
+
+    def candidates(start: np.ndarray, rng: np.random.Generator) -> Sequence[np.ndarray]:
+        return prior_draws.candidates(start, rng) if disperse else [start]
+
+    # Evaluated here, because chains would call PyMC's functions from several threads at once.
+    starts = [
+        raveled.ravel(point(int(seed.generate_state(1)[0])))
+        for point, seed in zip(points, seeds, strict=True)
+    ]
+    return [partial(candidates, start) for start in starts]
+
+
+def _check_initvals(model: Model, initvals: Any, chains: int) -> None:
+    is_common = initvals is None or isinstance(initvals, Mapping)
+    if not is_common:
+        if not isinstance(initvals, list | tuple):
+            raise ModelError(
+                f"initvals must be None, a mapping or a sequence of mappings, got {initvals!r}"
+            )
+        if len(initvals) != chains:
+            raise ModelError(
+                f"initvals must have one entry for each chain, got {len(initvals)} for "
+                f"chains={chains}"
+            )
+    known = {name for v, rv in model.values_to_rvs.items() for name in (v.name, rv.name)}
+    for given in [initvals] if is_common else initvals:
+        if unknown := [str(name) for name in given or () if str(name) not in known]:
+            raise ModelError(
+                f"initvals must name free variables of the model, "
+                f"{', '.join(rv.name for rv in model.free_RVs)}, got {unknown[0]!r}"
+            )

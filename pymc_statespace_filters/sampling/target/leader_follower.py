@@ -1,9 +1,9 @@
 """Several ranks that evaluate a chain's likelihoods together: one leads, the others follow.
 
-The leader runs the chain. Where its log-density comes to a noisy likelihood, machine code calls the
-leader's delegate, which sends parameters and seed to the followers, and then all of them run the
-filter, each over its own members. The rest of the log-density, and every decision of the chain, is
-the leader's alone: there is nothing on which ranks could come to differ.
+The leader runs the chain. For a noisy likelihood its machine code calls the leader's callback,
+which sends parameters and seed to the followers; then all of them run the filter, each on its local
+particles. The leader alone evaluates the rest of the log-density and makes all decisions of the
+chain, so that ranks cannot disagree.
 """
 
 import pickle
@@ -17,38 +17,38 @@ import numpy as np
 from pymc.model import Model
 
 from pymc_statespace_filters.errors import ModelError, ParallelError
-from pymc_statespace_filters.evaluation.log_likelihood import check_ranks, distributed_evaluator
+from pymc_statespace_filters.ops.distributed import (
+    PythonCallback,
+    check_ranks,
+    distributed_evaluator,
+)
 from pymc_statespace_filters.parallel.communicator import (
-    LAST_WORDS_SECONDS,
+    ABORT_GRACE_SECONDS,
     Communicator,
     Message,
     describe_error,
 )
-from pymc_statespace_filters.parallel.signals import (
-    interrupts_left_to_another_rank,
-    noticed_interrupts,
-)
-from pymc_statespace_filters.pymc_model.graph_rewrites import PythonCallback
+from pymc_statespace_filters.parallel.signals import deferred_interrupts, ignored_interrupts
 from pymc_statespace_filters.pymc_model.inspection import noisy_filters
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 
-# What the leader sends: what is to be evaluated, that it is, that all is over.
+# Messages of the leader: a likelihood with its record, an evaluation of it, the end.
 _RECORD, _EVALUATE, _END = "record", "evaluate", "end"
-# What followers answer to the first and to the last.
-_READY, _FAILED, _HEARD = "ready", "failed", "heard"
+# Answers of the followers to the first and to the last.
+_READY, _FAILED, _ACKNOWLEDGED = "ready", "failed", "acknowledged"
 
-# A follower looks for the next message all the time, but between chains only now and then: looking
-# takes a core, sleeping up to a millisecond for each evaluation.
-_PATIENCE_SECONDS = 0.02
-_NAP_SECONDS = 0.001
-# Whoever has not answered by then is in an evaluation that will never end.
+# A follower polls without a pause for so long, and then, between chains, once in a millisecond:
+# polling takes a core, sleeping delays each evaluation.
+_BUSY_SECONDS = 0.02
+_POLL_SECONDS = 0.001
+# A rank that has not answered by then is in an evaluation that will never end.
 _ANSWER_SECONDS = 10.0
 
 _leader_numbers = count()
 
 
-class _Record(NamedTuple):
-    """A record as the filters read it."""
+class _RecordArrays(NamedTuple):
+    """The arrays of a record that the filters read."""
 
     steps: np.ndarray
     observed: np.ndarray
@@ -62,19 +62,19 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
     Raises
     ------
     ModelError
-        If there is no noisy likelihood, more ranks than its filter has blocks of members, or the
-        noise is moved.
+        If there is no noisy likelihood, its filter has fewer blocks of particles than there are
+        ranks, or the noise is correlated.
     """
     if settings.correlation is not None:
         raise ModelError(
-            f"correlation={settings.correlation!r}: noise is moved by one rank alone, "
-            "use ranks_per_chain=1"
+            f"ranks_per_chain must be 1 with correlation={settings.correlation!r}, got {n_ranks}: "
+            "correlated noise is carried by one rank"
         )
     filters = noisy_filters(model)
     if not filters:
         raise ModelError(
-            f"ranks_per_chain={n_ranks}: the model has no StateSpace variable whose filter moves "
-            "members, so there is nothing to spread over ranks; use ranks_per_chain=1"
+            "ranks_per_chain must be 1 for a model without a StateSpace variable whose filter has "
+            f"particles, got {n_ranks}"
         )
     for filter in filters.values():
         check_ranks(filter, n_ranks)
@@ -85,29 +85,29 @@ class Leader:
 
     Parameters
     ----------
-    ranks : Ranks
-        The group. The others `follow`.
+    comm : Communicator
+        The group. The other ranks call `follow`.
     likelihoods : sequence of (StateSpaceModel, filter)
-        What is evaluated together, by number, see `inspection.delegable_likelihoods`.
+        The likelihoods evaluated together, by number, see `inspection.with_likelihood_callback`.
     """
 
-    def __init__(self, ranks: Communicator, likelihoods: Sequence[tuple[Any, Any]]):
-        self._ranks = ranks
-        self._name = next(_leader_numbers)  # a group may have several leaders, one for each model
+    def __init__(self, comm: Communicator, likelihoods: Sequence[tuple[Any, Any]]):
+        self._comm = comm
+        self._name = next(_leader_numbers)  # a group may have a leader for each model
         self._likelihoods = likelihoods
-        self._evaluators = [distributed_evaluator(*of, ranks) for of in likelihoods]
+        self._evaluators = [distributed_evaluator(*likelihood, comm) for likelihood in likelihoods]
         self._sent: dict[int, bytes] = {}
-        self._delegate = PythonCallback(self._evaluate)
+        self._callback = PythonCallback(self._evaluate)
 
     @property
     def address(self) -> np.ndarray:
-        """Of the delegate, shape ()."""
-        return self._delegate.address
+        """Address of the callback, shape ()."""
+        return self._callback.address
 
     @property
     def error(self) -> BaseException | None:
-        """What was met in an evaluation; there is no other after it."""
-        return self._delegate.error
+        """Error of an evaluation, after which there is no other."""
+        return self._callback.error
 
     def _evaluate(
         self,
@@ -119,34 +119,34 @@ class Leader:
         t0: float,
         seed: int,
     ) -> tuple[np.ndarray, np.ndarray]:
-        record = _Record(steps, observed, inputs, t0)
+        record = _RecordArrays(steps, observed, inputs, t0)
         content = pickle.dumps(record)
-        if self._sent.get(number) != content:  # once, unless the record is itself sampled
+        if self._sent.get(number) != content:  # once, unless it depends on sampled variables
             self._send_record(number, record)
             self._sent[number] = content
-        with noticed_interrupts() as interrupted:  # the followers wait in every exchange
-            _tell(self._ranks, _EVALUATE, ((self._name, number), theta, seed))
+        with deferred_interrupts() as interrupted:  # the followers wait in every allgather
+            _send_all(self._comm, _EVALUATE, ((self._name, number), theta, seed))
             values = self._evaluators[number](theta, *record, seed)
         if interrupted.is_set():
             raise KeyboardInterrupt
         return values
 
-    def _send_record(self, number: int, record: _Record) -> None:
-        """Make the followers ready; they all answer, so that none is waited for in vain."""
-        of_all = (self._name, number), *self._likelihoods[number], record
-        _tell(self._ranks, _RECORD, of_all)
-        answers = [_next(self._ranks) for _ in range(1, self._ranks.size)]
+    def _send_record(self, number: int, record: _RecordArrays) -> None:
+        """Send the followers a likelihood and its record, and wait for the answers of all."""
+        likelihood = (self._name, number), *self._likelihoods[number], record
+        _send_all(self._comm, _RECORD, likelihood)
+        answers = [_receive(self._comm) for _ in range(1, self._comm.size)]
         for answer in answers:
             if answer.kind == _FAILED:
                 raise ParallelError(
-                    f"rank {answer.source} of the {self._ranks.size} that share a chain cannot "
+                    f"rank {answer.source} of the {self._comm.size} that share a chain cannot "
                     f"evaluate its likelihood: {answer.value}"
                 )
 
 
 @contextmanager
-def own_errors(leader: Leader | None) -> Iterator[None]:
-    """Raise what a leader met, where machine code only says that there was something."""
+def leader_errors(leader: Leader | None) -> Iterator[None]:
+    """Raise the leader's own error instead of the machine code's report that there was one."""
     try:
         yield
     except Exception:
@@ -156,24 +156,24 @@ def own_errors(leader: Leader | None) -> Iterator[None]:
 
 
 @contextmanager
-def leading(ranks: Communicator) -> Iterator[None]:
-    """Whatever becomes of the leader, the first of the ranks: let the followers go in the end."""
+def release_followers(comm: Communicator) -> Iterator[None]:
+    """Release the followers at the end, also after an error on the leader, the first rank."""
     try:
         yield
     except BaseException as error:
-        _tell(ranks, _END, f"the leader of the chain has stopped: {describe_error(error)}")
-        if not _is_heard(ranks):
-            ranks.abort(error)
+        _send_all(comm, _END, f"the leader of the chain has stopped: {describe_error(error)}")
+        if not _is_acknowledged(comm):
+            comm.abort(error)
         raise
-    _tell(ranks, _END)
+    _send_all(comm, _END)
 
 
-def follow(ranks: Communicator) -> None:
-    """Evaluate with the leader, rank 0, whatever it comes to, until it says that it is over.
+def follow(comm: Communicator) -> None:
+    """Take part in the evaluations of the leader, rank 0, until it sends the end.
 
     Parameters
     ----------
-    ranks : Ranks
+    comm : Communicator
         The group.
 
     Raises
@@ -181,63 +181,62 @@ def follow(ranks: Communicator) -> None:
     ParallelError
         If the leader was stopped by an error.
     Exception
-        What was met here. In the midst of an evaluation that ends the whole job, as the others
-        wait for this rank.
+        What an evaluation raised here. It ends the whole job, as the others wait for this rank.
     """
     failure = None
-    known: dict[Any, tuple[Callable, _Record]] = {}
-    with interrupts_left_to_another_rank():
-        while (message := _next(ranks)).kind != _END:
+    evaluators: dict[Any, tuple[Callable, _RecordArrays]] = {}
+    with ignored_interrupts():
+        while (message := _receive(comm)).kind != _END:
             if message.kind == _EVALUATE:
                 name, theta, seed = message.value
-                evaluate, record = known[name]
-                _evaluate_or_abort(ranks, evaluate, theta, *record, seed)
+                evaluate, record = evaluators[name]
+                _evaluate_or_abort(comm, evaluate, theta, *record, seed)
                 continue
             name, system, filter, record = message.value
             try:
-                known[name] = distributed_evaluator(system, filter, ranks), record
-                ranks.send(message.source, _READY)
+                evaluators[name] = distributed_evaluator(system, filter, comm), record
+                comm.send(message.source, _READY)
             except Exception as error:
                 failure = error
-                ranks.send(message.source, _FAILED, describe_error(error))
+                comm.send(message.source, _FAILED, describe_error(error))
     if message.value is None:
         return
-    ranks.send(message.source, _HEARD)
+    comm.send(message.source, _ACKNOWLEDGED)
     if failure is not None:
         raise failure
-    time.sleep(LAST_WORDS_SECONDS)
+    time.sleep(ABORT_GRACE_SECONDS)
     raise ParallelError(message.value)
 
 
-def _evaluate_or_abort(ranks: Communicator, evaluate: Callable, *arguments: Any) -> None:
+def _evaluate_or_abort(comm: Communicator, evaluate: Callable, *arguments: Any) -> None:
     try:
         evaluate(*arguments)
     except BaseException as error:
-        error.add_note(f"on rank {ranks.rank} of the {ranks.size} that share a chain")
-        ranks.abort(error)
+        error.add_note(f"on rank {comm.rank} of the {comm.size} that share a chain")
+        comm.abort(error)
         raise
 
 
-def _is_heard(ranks: Communicator) -> bool:
-    """Wait until all followers have heard that it is over; False if they do not."""
+def _is_acknowledged(comm: Communicator) -> bool:
+    """Wait until all followers have acknowledged the end; False if they do not."""
     until = time.monotonic() + _ANSWER_SECONDS
-    missing = ranks.size - 1
+    missing = comm.size - 1
     while missing and time.monotonic() < until:
-        message = ranks.receive()
-        missing -= message is not None and message.kind == _HEARD
-        time.sleep(0.0 if message else _NAP_SECONDS)
+        message = comm.receive()
+        missing -= message is not None and message.kind == _ACKNOWLEDGED
+        time.sleep(0.0 if message else _POLL_SECONDS)
     return not missing
 
 
-def _tell(ranks: Communicator, kind: str, value: Any = None) -> None:
+def _send_all(comm: Communicator, kind: str, value: Any = None) -> None:
     """Send to all followers."""
-    for rank in range(1, ranks.size):
-        ranks.send(rank, kind, value)
+    for rank in range(1, comm.size):
+        comm.send(rank, kind, value)
 
 
-def _next(ranks: Communicator) -> Message:
+def _receive(comm: Communicator) -> Message:
     """Wait for a message."""
     began = time.monotonic()
-    while (message := ranks.receive()) is None:
-        time.sleep(_NAP_SECONDS if time.monotonic() - began > _PATIENCE_SECONDS else 0.0)
+    while (message := comm.receive()) is None:
+        time.sleep(_POLL_SECONDS if time.monotonic() - began > _BUSY_SECONDS else 0.0)
     return message

@@ -1,4 +1,4 @@
-"""Settings of the DRAM step: frozen, validated once."""
+"""Settings of DRAM: frozen, validated once."""
 
 import math
 import numbers
@@ -22,7 +22,7 @@ class DRAMSettings:
     Attributes
     ----------
     stages : tuple of int
-        Stages while tuning, and afterwards.
+        Stages while tuning and afterwards.
     stage_scale : float
         Standard deviation of each stage relative to the one before.
     adaptation : str
@@ -30,13 +30,13 @@ class DRAMSettings:
     adapt_every : int
         Iterations in a block of warm-up.
     refresh_noise : bool
-        Whether every proposal has noise of its own.
+        Whether every proposal has its own noise.
     correlation : float or None
-        Of the noise of a proposal with that of the current point, if not drawn afresh.
+        Correlation of a proposal's noise with that of the current point; None draws fresh noise.
     screen : filter or None
-        Whose likelihood stands in for that of the model until a move has been made on it.
+        Filter whose likelihood screens the proposals.
     screen_power : float
-        By which that likelihood enters.
+        Exponent of that likelihood.
     """
 
     stages: Any = (2, 1)
@@ -49,7 +49,7 @@ class DRAMSettings:
     screen_power: float = 0.5
 
     @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> Self:
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self:
         """Make settings of arguments by name, as a user gave them.
 
         Raises
@@ -72,49 +72,53 @@ class DRAMSettings:
         object.__setattr__(self, "stages", stage_pair(self.stages))
         scale = self.stage_scale
         if not _is_real(scale) or not 0.0 < scale < math.inf:
-            raise ModelError(f"stage_scale={scale!r}: expected a positive number")
+            raise ModelError(f"stage_scale must be a positive number, got {scale!r}")
         if not isinstance(self.adaptation, str) or self.adaptation not in ADAPTATIONS:
             raise ModelError(
-                f"adaptation={self.adaptation!r}: expected one of "
-                f"{', '.join(map(repr, ADAPTATIONS))}"
+                f"adaptation must be one of {', '.join(map(repr, ADAPTATIONS))}, got "
+                f"{self.adaptation!r}"
             )
         if not is_integer(self.adapt_every) or self.adapt_every < 4:
-            raise ModelError(f"adapt_every={self.adapt_every!r}: expected an integer, at least 4")
+            raise ModelError(
+                f"adapt_every must be an integer of at least 4, got {self.adapt_every!r}"
+            )
         if not isinstance(self.refresh_noise, bool | np.bool_):
-            raise ModelError(f"refresh_noise={self.refresh_noise!r}: expected True or False")
+            raise ModelError(f"refresh_noise must be True or False, got {self.refresh_noise!r}")
         if self.screen is not None and not is_filter(self.screen):
             raise ModelError(
-                f"screen={self.screen!r}: expected a filter such as psf.EKF(), or None"
+                f"screen must be a filter such as psf.EKF(), or None, got {self.screen!r}"
             )
         power = self.screen_power
         if not _is_real(power) or not 0.0 < power <= 1.0:
-            raise ModelError(f"screen_power={power!r}: expected a number above 0, at most 1")
-        if _is_real(self.correlation) and self.correlation == 0.0:  # noise drawn anew
+            raise ModelError(f"screen_power must be a number in (0, 1], got {power!r}")
+        if _is_real(self.correlation) and self.correlation == 0.0:  # fresh noise
             object.__setattr__(self, "correlation", None)
         if self.correlation is not None:
             self._check_correlation(self.correlation)
 
     def _check_correlation(self, correlation: float) -> None:
-        given = f"correlation={correlation!r}"
         if not _is_real(correlation) or not 0.0 < correlation < 1.0:
-            raise ModelError(f"{given}: expected a number between 0 and 1, or None")
+            raise ModelError(
+                f"correlation must be a number between 0 and 1, or None, got {correlation!r}"
+            )
+        given = f"with correlation={correlation!r}"
         if self.stages != (1, 1):
             raise ModelError(
-                f"{given} needs stages=1, got stages={self.stages}: the noise of a second proposal "
+                f"stages must be 1 {given}, got {self.stages}: the noise of a second proposal "
                 "would depend on that of the first, and the densities of the noise would not "
-                "cancel in the probability of accepting it"
+                "cancel in the acceptance probability"
             )
         if not self.refresh_noise:
-            raise ModelError(f"{given} moves the noise, which refresh_noise=False holds")
+            raise ModelError(f"refresh_noise must be True {given}, got False")
         if self.screen is not None and self.screen.noisy:
             raise ModelError(
-                f"{given} needs a screen without noise, got screen={self.screen!r}: two estimates "
-                "with noise of their own would not be compared at the same noise"
+                f"screen must be a filter without noise {given}, got {self.screen!r}: its "
+                "estimates at the two points would not be compared at the same noise"
             )
 
 
 def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
-    """Check a proposal covariance given by the user.
+    """Check the user's proposal covariance.
 
     Parameters
     ----------
@@ -131,19 +135,19 @@ def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
     ModelError
         If it is not a symmetric positive definite matrix of numbers, d by d.
     """
-    expected = f"expected a symmetric positive definite {dim} x {dim} matrix"
+    expected = f"proposal_cov must be a symmetric positive definite {dim} x {dim} matrix, got"
     try:
         cov = np.array(proposal_cov, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"proposal_cov={proposal_cov!r}: {expected}") from None
+        raise ModelError(f"{expected} {proposal_cov!r}") from None
     if cov.shape != (dim, dim):
-        raise ModelError(f"proposal_cov has the shape {cov.shape}: {expected}")
+        raise ModelError(f"{expected} shape {cov.shape}")
     if not np.isfinite(cov).all() or not _is_symmetric(cov):
-        raise ModelError(f"proposal_cov={cov.tolist()}: {expected}")
+        raise ModelError(f"{expected} {cov.tolist()}")
     try:
         np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        raise ModelError(f"proposal_cov={cov.tolist()}: {expected}") from None
+        raise ModelError(f"{expected} {cov.tolist()}") from None
     return 0.5 * (cov + cov.T)
 
 
@@ -162,8 +166,8 @@ def stage_pair(stages: object) -> tuple[int, int]:
         or not all(is_integer(k) and k >= 1 for k in pair)
     ):
         raise ModelError(
-            f"stages={stages!r}: expected an integer, at least 1, or a pair of them "
-            "(while tuning, afterwards)"
+            "stages must be an integer of at least 1, or a pair of them (while tuning, "
+            f"afterwards), got {stages!r}"
         )
     return int(pair[0]), int(pair[1])
 

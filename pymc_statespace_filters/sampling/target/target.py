@@ -1,6 +1,12 @@
-"""What all chains of a run share: the log-densities, and where chains start."""
+"""A model as the sampler sees it: its log-densities, and where chains start.
+
+`Target` has a `LogDensity` for the model and one for the screen, if there is one. `LogDensity` is
+the compiled graph; its ``bind`` gives a `BoundLogDensity`, callable from one thread, whose
+``native`` is what machine code calls.
+"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pymc.model import Model
@@ -10,17 +16,29 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_names
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
-from pymc_statespace_filters.sampling.kernel.state import Random
-from pymc_statespace_filters.sampling.output.warnings import Growth
-from pymc_statespace_filters.sampling.target.initial_points import Starts
+from pymc_statespace_filters.sampling.kernel.state import RandomBlock
+from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
 from pymc_statespace_filters.sampling.target.leader_follower import check_group
 from pymc_statespace_filters.sampling.target.log_density import LogDensity, screening_density
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
 from pymc_statespace_filters.sampling.target.variables import (
-    HeldVariables,
-    check_noise_is_held,
+    RaveledVariables,
+    check_noise_dependencies,
     continuous_value_vars,
 )
+
+
+class Growth(NamedTuple):
+    """The variable whose proposals are widest relative to the draws from its prior.
+
+    Attributes
+    ----------
+    name : str
+    factor : float
+    """
+
+    name: str
+    factor: float
 
 
 class Target:
@@ -36,14 +54,14 @@ class Target:
     compile_kwargs : dict, optional
         Passed to PyMC's compiler.
     graph : TensorVariable, optional
-        The log-density if it is not the model's own.
-    group : Ranks, optional
+        The log-density, if it is not the model's own.
+    group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together, of which this is the first.
 
     Attributes
     ----------
-    held : HeldVariables
-    starts : Starts
+    raveled : RaveledVariables
+    prior_draws : PriorDraws
     density : LogDensity
     screen : LogDensity or None
     first_cov : ndarray, shape (d, d)
@@ -51,8 +69,8 @@ class Target:
     exact : bool
         Whether the chains target the posterior itself, without the bias of a filter's noise.
     seed_names : tuple of str
-        Of the noise seeds that are noted down.
-    holds_all : bool
+        Names of the recorded noise seeds.
+    samples_all : bool
         Whether no other step method moves continuous variables.
 
     Raises
@@ -79,25 +97,24 @@ class Target:
         self.settings = settings
         variables = continuous_value_vars(vars, model)
         seeds = noise_seeds(model)
-        check_noise_is_held(model, variables, seeds)
+        check_noise_dependencies(model, variables, seeds)
         self.exact = exactness(model) and (settings.refresh_noise or not seeds)
         self.seed_names = tuple(f"{name}_seed" for name in seeds)
         self._seed_variables = tuple(seeds.values())
-        self.holds_all = set(variables) >= set(model.continuous_value_vars)
+        self.samples_all = set(variables) >= set(model.continuous_value_vars)
         default = model.initial_point(random_seed=0)
-        self.held = HeldVariables(variables, default)
-        if not self.held.dim:
-            raise ModelError("vars: the model has no free variable to sample")
-        self.starts = Starts(model, self.held, default)
+        self.raveled = RaveledVariables(variables, default)
+        if not self.raveled.dim:
+            raise ModelError("model must have at least one free variable to sample, got none")
+        self.prior_draws = PriorDraws(model, self.raveled, default)
         if proposal_cov is None:
-            self.first_cov = self.starts.covariance()
+            self.first_cov = self.prior_draws.covariance()
         else:
-            self.first_cov = checked_proposal_cov(proposal_cov, self.held.dim)
-
+            self.first_cov = checked_proposal_cov(proposal_cov, self.raveled.dim)
         shared = (model, variables, default, seeds, compile_kwargs)
         self.density = LogDensity(
             *shared,
-            holds_noise=not settings.refresh_noise,
+            fixed_noise=not settings.refresh_noise,
             correlation=settings.correlation,
             graph=graph,
             group=group,
@@ -106,33 +123,34 @@ class Target:
         if settings.screen is not None:
             if not state_space_names(model):
                 raise ModelError(
-                    f"screen={settings.screen!r}: the model has no StateSpace variable"
+                    f"screen needs a model with a StateSpace variable, got {settings.screen!r} for "
+                    "a model without one"
                 )
             graph = screening_density(model, settings.screen, settings.screen_power)
-            self.screen = LogDensity(*shared, holds_noise=settings.screen.noisy, graph=graph)
+            self.screen = LogDensity(*shared, fixed_noise=settings.screen.noisy, graph=graph)
 
     @property
-    def moves_noise(self) -> bool:
-        """Whether a chain carries its noise along."""
+    def carries_noise(self) -> bool:
+        """Whether proposals have noise correlated with that of the current point."""
         return self.settings.correlation is not None and bool(self.seed_names)
 
     def prepare(self) -> None:
-        """Take hold of machine code, and of data and held seeds as they are now."""
-        self.held_seeds = np.array([s.get_value() for s in self._seed_variables], dtype=np.int64)
+        """Load the machine code, and read data and fixed seeds as they are now."""
+        self.fixed_seeds = np.array([s.get_value() for s in self._seed_variables], dtype=np.int64)
         self.density.prepare()
         if self.screen is not None:
             self.screen.prepare()
 
     def growth(self, cov: np.ndarray) -> Growth:
-        """Compare a covariance of proposals with that of the prior's draws."""
-        variances = np.diag(cov) / np.diag(self.starts.covariance())
+        """Compare a proposal covariance with that of the draws from the prior."""
+        variances = np.diag(cov) / np.diag(self.prior_draws.covariance())
         most = int(variances.argmax())
-        return Growth(self.held.name_at(most), float(variances[most]) ** 0.5)
+        return Growth(self.raveled.name_at(most), float(variances[most]) ** 0.5)
 
-    def random(self, key: np.ndarray, index: int) -> Random:
+    def random_block(self, key: np.ndarray, index: int) -> RandomBlock:
         """Draw a block of random numbers for a chain with this key."""
-        shape = max(self.settings.stages), self.held.dim, len(self.seed_names)
+        shape = max(self.settings.stages), self.raveled.dim, len(self.seed_names)
         block = random_block(key, index, *shape)
         if not self.settings.refresh_noise:
-            block.seeds[...] = self.held_seeds
+            block.seeds[...] = self.fixed_seeds
         return block

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from pymc.blocking import DictToArrayBijection, RaveledVars
 from pymc.model import Model
 from pymc.util import get_value_vars_from_user_vars
 from pytensor.graph.traversal import ancestors, graph_inputs
@@ -13,15 +14,15 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.inspection import log_density_terms
 
 
-class HeldVariables:
-    """Value variables and where each lies in the vector.
+class RaveledVariables:
+    """Value variables raveled into one vector, by PyMC's `DictToArrayBijection`.
 
     Parameters
     ----------
     variables : sequence of TensorVariable
         Value variables, in the order of the vector.
     point : mapping of str to ndarray
-        Any point of the model; only shapes are read.
+        Any point of the model; only shapes and dtypes are read.
 
     Attributes
     ----------
@@ -32,36 +33,30 @@ class HeldVariables:
 
     def __init__(self, variables: Sequence[TensorVariable], point: Mapping[str, np.ndarray]):
         self.variables = tuple(variables)
-        self._layout, end = [], 0
-        for v in variables:
-            value = point[v.name]
-            begin, end = end, end + value.size
-            self._layout.append((v.name, slice(begin, end), value.shape, v.dtype))
-        self.dim = end
+        self._layout = self._map(point).point_map_info
+        self.dim = sum(size for _, _, size, _ in self._layout)
 
     def name_at(self, i: int) -> str:
         """Name of the variable that element i of the vector belongs to."""
-        return next(name for name, part, _, _ in self._layout if i < part.stop)
+        ends = np.cumsum([size for _, _, size, _ in self._layout])
+        return self._layout[int(np.searchsorted(ends, i, side="right"))][0]
 
-    def join(self, point: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Join a point's values into the vector, shape (d,)."""
-        position = np.empty(self.dim)
-        for name, part, _, _ in self._layout:
-            position[part] = np.ravel(point[name])
-        return position
+    def ravel(self, point: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Ravel the values of a point into the vector, shape (d,)."""
+        return self._map(point).data.astype(np.float64, copy=False)
 
-    def split(self, position: np.ndarray) -> dict[str, np.ndarray]:
+    def unravel(self, position: np.ndarray) -> dict[str, np.ndarray]:
         """Split the vector into values by name."""
-        return {
-            name: position[part].reshape(shape).astype(dtype, copy=False)
-            for name, part, shape, dtype in self._layout
-        }
+        return DictToArrayBijection.rmap(RaveledVars(position, self._layout))
+
+    def _map(self, point: Mapping[str, np.ndarray]) -> RaveledVars:
+        return DictToArrayBijection.map({v.name: np.asarray(point[v.name]) for v in self.variables})
 
 
 def continuous_value_vars(
     vars: Sequence[TensorVariable] | None, model: Model
 ) -> list[TensorVariable]:
-    """Give the value variables of what the user named, all of the model's by default.
+    """Give the value variables of the user's variables, by default of all the model's.
 
     Raises
     ------
@@ -69,17 +64,17 @@ def continuous_value_vars(
         If one of them is discrete.
     """
     if vars is None:
-        held = list(model.value_vars)
+        chosen = list(model.value_vars)
     else:
-        held = get_value_vars_from_user_vars(vars, model)
-    discrete = [model.values_to_rvs[v].name for v in held if not v.dtype.startswith("float")]
+        chosen = get_value_vars_from_user_vars(vars, model)
+    discrete = [model.values_to_rvs[v].name for v in chosen if not v.dtype.startswith("float")]
     if discrete:
         raise ModelError(
-            f"vars: DRAM samples continuous variables, these are discrete: {', '.join(discrete)}. "
+            f"vars must be continuous for DRAM, these are discrete: {', '.join(discrete)}. "
             "Name the continuous ones, pm.sample(step=[DRAM([...])]), and PyMC finds a step method "
             "for the rest"
         )
-    return held
+    return chosen
 
 
 def check_no_generators(model: Model) -> None:
@@ -93,21 +88,21 @@ def check_no_generators(model: Model) -> None:
     for name, term in log_density_terms(model):
         if any(isinstance(v.type, RandomType) for v in graph_inputs([term])):
             raise ModelError(
-                f"the log-density of {name!r} draws random numbers of its own, from a "
-                "generator that all chains would share: the draws would be no function of "
-                "random_seed. pm.sample(step=psf.DRAM()) takes such a model"
+                f"the log-density of {name!r} draws random numbers of its own, from a generator "
+                "shared by all chains: the draws would not be a function of random_seed. "
+                "pm.sample(step=psf.DRAM()) accepts such a model"
             )
 
 
-def check_noise_is_held(
-    model: Model, held: Sequence[TensorVariable], seeds: Mapping[str, TensorVariable]
+def check_noise_dependencies(
+    model: Model, sampled: Sequence[TensorVariable], seeds: Mapping[str, TensorVariable]
 ) -> None:
-    """Check that no other step method can move what an estimated likelihood depends on.
+    """Check that no other step method moves a variable of an estimated likelihood.
 
     Parameters
     ----------
     model : pymc.Model
-    held : sequence of TensorVariable
+    sampled : sequence of TensorVariable
         Value variables that the sampler moves.
     seeds : mapping of str to shared variable
         The noise seeds, by the name of their StateSpace variable.
@@ -115,15 +110,15 @@ def check_noise_is_held(
     Raises
     ------
     ModelError
-        If a term of the log-density with a seed in it depends on a variable that is not held.
+        If a term of the log-density that contains a seed depends on a variable not sampled.
     """
     for term in model.logp(sum=False):
-        behind = set(ancestors([term]))
-        noisy = [name for name, seed in seeds.items() if seed in behind]
-        rest = [v for v in model.value_vars if v in behind and v not in held]
+        inputs = set(ancestors([term]))
+        noisy = [name for name, seed in seeds.items() if seed in inputs]
+        rest = [v for v in model.value_vars if v in inputs and v not in sampled]
         if noisy and rest:
             raise ModelError(
-                f"vars: the noisy likelihood of {', '.join(noisy)} also depends on "
-                f"{', '.join(model.values_to_rvs[v].name for v in rest)}: DRAM must hold these "
-                "too, or their moves would redraw the estimate of a point already accepted"
+                f"vars must include {', '.join(model.values_to_rvs[v].name for v in rest)}: the "
+                f"noisy likelihood of {', '.join(noisy)} depends on them, and other step methods "
+                "would redraw the estimate at a point already accepted"
             )

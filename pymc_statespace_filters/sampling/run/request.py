@@ -1,0 +1,179 @@
+"""What the user asks of a run, checked once: what to draw, and how to execute it.
+
+`SamplingRequest` holds all that the draws depend on, apart from the model; `ExecutionOptions` holds
+threads, ranks and output, on which they do not depend.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymc.model import Model
+from pytensor.graph.basic import Variable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
+    model_data_fingerprint,
+    model_fingerprint,
+)
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.system.checks import is_integer
+
+_GATHER = ("root", "all")
+_FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
+
+
+class SamplingRequest(NamedTuple):
+    """Arguments of ``sample_dram`` that the draws depend on, the same for all models of a run.
+
+    Attributes
+    ----------
+    draws, tune, chains : int
+    entropy : list of int
+        Entropy of the seed sequence from which each chain gets its own.
+    is_seeded : bool
+        Whether the user gave a seed.
+    initvals : mapping, sequence of mappings, or None
+    keeps_warmup : bool
+    proposal_cov : array_like or None
+    settings : DRAMSettings
+    """
+
+    draws: int
+    tune: int
+    chains: int
+    entropy: list[int]
+    is_seeded: bool
+    initvals: Any
+    keeps_warmup: bool
+    proposal_cov: Any
+    settings: DRAMSettings
+
+    @property
+    def n_iterations(self) -> int:
+        """Iterations of a chain, warm-up included."""
+        return self.tune + self.draws
+
+    def cache_key(self, model: Model, *, require_fingerprint: bool = True) -> dict[str, Any]:
+        """Give all that a model's draws depend on, as values of JSON.
+
+        Raises
+        ------
+        ModelError
+            If a part of the model has no text that is the same in every process. Without
+            ``require_fingerprint`` the fingerprint of the model is then left empty.
+        """
+        try:
+            fingerprint = model_fingerprint(model)
+        except ModelError:
+            if require_fingerprint:
+                raise
+            fingerprint = ""
+        return {
+            "random_seed": self.entropy if self.is_seeded else None,
+            "initvals": _json_value(self.initvals),
+            "proposal_cov": _json_value(self.proposal_cov),
+            "draws": int(self.draws),
+            "tune": int(self.tune),
+            "chains": int(self.chains),
+            "discard_tuned_samples": not self.keeps_warmup,
+            **{f.name: repr(getattr(self.settings, f.name)) for f in fields(self.settings)},
+            "model": fingerprint[:_FINGERPRINT_DIGITS],
+            "data": model_data_fingerprint(model)[:_FINGERPRINT_DIGITS],
+            "version": version("pymc-statespace-filters"),
+        }
+
+
+class ExecutionOptions(NamedTuple):
+    """Arguments of ``sample_dram`` that the draws do not depend on."""
+
+    cores: int | None
+    progressbar: bool | str
+    compute_convergence_checks: bool
+    comm: Any
+    ranks_per_chain: int
+    gather: str
+
+    def check(self) -> None:
+        """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""
+        if self.gather not in _GATHER:
+            raise ModelError(f"gather must be one of {_GATHER}, got {self.gather!r}")
+        if self.cores is not None and (not is_integer(self.cores) or self.cores < 1):
+            raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
+        size = self.ranks_per_chain
+        if not is_integer(size) or size < 1:
+            raise ModelError(f"ranks_per_chain must be an integer of at least 1, got {size!r}")
+        if size > 1 and self.comm is None:
+            raise ModelError(
+                f"ranks_per_chain={size} needs comm, got None: comm='world' gives the ranks that "
+                "mpiexec started"
+            )
+
+
+def sampling_request(
+    draws: int,
+    tune: int,
+    chains: int,
+    random_seed: Any,
+    initvals: Any,
+    keeps_warmup: bool,
+    dram_settings: Mapping[str, Any],
+) -> SamplingRequest:
+    """Check the arguments of ``sample_dram`` that need no model, and make a request of them.
+
+    Raises
+    ------
+    ModelError
+        If an argument is not as ``sample_dram`` describes it.
+    TypeError
+        If a setting has an unknown name.
+    """
+    for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
+        if not is_integer(value) or value < least:
+            raise ModelError(f"{name} must be an integer of at least {least}, got {value!r}")
+    if draws + tune * keeps_warmup == 0:
+        raise ModelError(
+            f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, tune={tune}, "
+            f"discard_tuned_samples={not keeps_warmup}; for the warm-up alone give "
+            "discard_tuned_samples=False"
+        )
+    settings = dict(dram_settings)
+    proposal_cov = settings.pop("proposal_cov", None)
+    return SamplingRequest(
+        draws,
+        tune,
+        chains,
+        _entropy(random_seed),
+        random_seed is not None,
+        initvals,
+        keeps_warmup,
+        proposal_cov,
+        DRAMSettings.from_arguments(settings),
+    )
+
+
+def _entropy(random_seed: object) -> list[int]:
+    """Turn a seed of PyMC's kinds into the entropy of a run."""
+    if random_seed is None:
+        return np.random.SeedSequence().generate_state(4).tolist()
+    if isinstance(random_seed, np.random.Generator):
+        return random_seed.integers(2**32, size=4).tolist()
+    if not is_integer(random_seed) or random_seed < 0:
+        raise ModelError(
+            "random_seed must be None, a non-negative integer or a numpy.random.Generator, got "
+            f"{random_seed!r}"
+        )
+    return [int(random_seed)]
+
+
+def _json_value(value: Any) -> Any:
+    """Convert a value to types that JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(name): _json_value(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(part) for part in value]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    return np.asarray(value).tolist() if not isinstance(value, Variable) else str(value)
