@@ -75,7 +75,7 @@ def test_a_folder_is_held_once_by_a_process(tmp_path, clock):
     assert clock.now == 0
 
 
-@pytest.mark.parametrize("pid", [os.getpid(), os.getppid()])
+@pytest.mark.parametrize("pid", [os.getpid(), os.getppid()], ids=["itself", "parent"])
 def test_a_process_that_has_the_number_of_a_dead_one_is_not_it(tmp_path, clock, pid):
     lease_file(tmp_path, pid, HOST, start=1, name=f"lease.{lease._process_table()}-0")
     FolderLease(tmp_path).release()
