@@ -152,20 +152,11 @@ class GridFilter:
             health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
             table = make_table()
             arguments = PointMassArguments(
-                table=table.ctypes.data,
-                dt=dt,
-                theta=theta.ctypes.data,
-                n_theta=theta.size,
-                inputs=inputs.ctypes.data,
-                n_rows=inputs.shape[0],
-                tolerance=tolerance,
-                steps=steps.ctypes.data,
-                n_observations=steps.size,
-                observed=observed.ctypes.data,
-                t0=t0,
-                terms=terms.ctypes.data,
-                health=health.ctypes.data,
-            )
+                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
+                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], tolerance=tolerance,
+                steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
+                t0=t0, terms=terms.ctypes.data, health=health.ctypes.data,
+            )  # fmt: skip
             evaluate(*arguments)
             keep_alive(table)
             return terms, health

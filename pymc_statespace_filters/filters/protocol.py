@@ -52,62 +52,50 @@ class System(Protocol):
     @property
     def prepare(self) -> CompiledFunction:
         """Function (theta) -> c, the constants of one evaluation."""
-        ...
 
     @property
     def initialise(self) -> CompiledFunction:
         """Function (c, Z, X) that draws the state at step 0."""
-        ...
 
     @property
     def propagate(self) -> CompiledFunction:
         """Function (c, inputs, k, t, Z, X) that moves every member one step, in place."""
-        ...
 
     @property
     def observe(self) -> CompiledFunction:
         """Function (c, inputs, k, t, Z, X, D) that simulates observations."""
-        ...
 
     @property
     def log_density(self) -> CompiledFunction:
         """Function (c, inputs, k, t, d, X, out) that writes log p(d | x)."""
-        ...
 
     @property
     def step_moments(self) -> CompiledFunction:
         """Function (c, inputs, k, t, X, M): mean and variance of the next state, one state."""
-        ...
 
     @property
     def is_linear(self) -> bool:
         """Whether the system is known to be linear."""
-        ...
 
     @property
     def has_additive_process_noise(self) -> bool:
         """Whether the transition is known to be g(x, 0) + G(x) q."""
-        ...
 
     @property
     def has_smooth_transition(self) -> bool:
         """Whether the transition is known to have no kink and no jump."""
-        ...
 
     @property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` is known to depend on neither inputs nor time."""
-        ...
 
     @property
     def has_transition_density(self) -> bool:
         """Whether one step is known to have a Gaussian density given the state before."""
-        ...
 
     @property
     def has_exact_observation_density(self) -> bool:
         """Whether `log_density` is exact, not a linearization."""
-        ...
 
 
 class LogLikelihoodFunction(Protocol):
@@ -118,35 +106,20 @@ class LogLikelihoodFunction(Protocol):
     """
 
     def __call__(
-        self,
-        theta: Array,
-        steps: Integers,
-        observed: Array,
-        inputs: Array,
-        t0: float,
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float,
         noise: tuple[int, Array],
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Evaluate."""
-        ...
 
 
 class DistributedLogLikelihoodFunction(Protocol):
     """Terms and health of an evaluation that several ranks make together, equal on all of them."""
 
     def __call__(
-        self,
-        theta: Array,
-        steps: Integers,
-        observed: Array,
-        inputs: Array,
-        t0: float,
-        seed: int,
-        rank: int,
-        n_ranks: int,
-        exchange: int,
-    ) -> tuple[Array, Array]:
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
+        rank: int, n_ranks: int, exchange: int,
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Evaluate."""
-        ...
 
 
 class StatesFunction(Protocol):
@@ -156,18 +129,10 @@ class StatesFunction(Protocol):
     """
 
     def __call__(
-        self,
-        theta: Array,
-        steps: Integers,
-        observed: Array,
-        inputs: Array,
-        t0: float,
-        seed: int,
-        rows: Integers,
-        draw_seed: int,
-    ) -> tuple[Array, Array, Array, Array, Array]:
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
+        rows: Integers, draw_seed: int,
+    ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
         """Evaluate."""
-        ...
 
 
 class RunFunction(Protocol):
@@ -178,34 +143,20 @@ class RunFunction(Protocol):
     """
 
     def __call__(
-        self,
-        theta: Array,
-        steps: Integers,
-        observed: Array,
-        inputs: Array,
-        t0: float,
-        seed: int,
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
         rows: Integers,
-    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
         """Evaluate."""
-        ...
 
 
 class GradientFunction(Protocol):
     """Vector-Jacobian product: the cotangent of theta (k,) from that of the terms (J,)."""
 
     def __call__(
-        self,
-        theta: Array,
-        steps: Integers,
-        observed: Array,
-        inputs: Array,
-        t0: float,
-        seed: int,
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
         terms_bar: Array,
-    ) -> Array:
+    ) -> Array:  # fmt: skip
         """Evaluate."""
-        ...
 
 
 class StoredNoiseFunction(Protocol):
@@ -213,7 +164,6 @@ class StoredNoiseFunction(Protocol):
 
     def __call__(self, steps: Integers, seed: int) -> Array:
         """Evaluate."""
-        ...
 
 
 @runtime_checkable
@@ -223,24 +173,19 @@ class Filter(Protocol):
     @property
     def noisy(self) -> bool:
         """Whether the likelihood is an estimate that depends on a seed."""
-        ...
 
     @property
     def has_gradient(self) -> bool:
         """Whether the filter is a `DifferentiableFilter`."""
-        ...
 
     def check(self, system: System) -> None:
         """Raise `ModelError` if the filter cannot treat the system."""
-        ...
 
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood, or the mean of its estimates, is that of the system."""
-        ...
 
     def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
         """Compile the log-likelihood."""
-        ...
 
 
 @runtime_checkable
@@ -249,7 +194,6 @@ class RunFilter(Filter, Protocol):
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
-        ...
 
 
 @runtime_checkable
@@ -262,7 +206,6 @@ class StatesFilter(Filter, Protocol):
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
-        ...
 
 
 @runtime_checkable
@@ -271,7 +214,6 @@ class BatchFilter(Filter, Protocol):
 
     def compile_batch(self, system: System) -> CompiledFunction:
         """Compile the log-likelihood of theta (B, k): terms (B, J), health (B, 3)."""
-        ...
 
 
 @runtime_checkable
@@ -284,15 +226,12 @@ class DifferentiableFilter(Filter, Protocol):
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
         """Compile both passes as one function."""
-        ...
 
     def compile_taped(self, system: System) -> CompiledFunction:
         """Compile the pass forwards: terms, health and the tape."""
-        ...
 
     def compile_pullback(self, system: System) -> CompiledFunction:
         """Compile the pass back: (theta .. seed, tape, terms_bar) -> theta_bar."""
-        ...
 
 
 @runtime_checkable
@@ -301,29 +240,23 @@ class EnsembleFilter(Filter, Protocol):
 
     def size(self) -> int:
         """Return the number of members."""
-        ...
 
     def max_ranks(self) -> int:
         """Return how many ranks can have a whole block of members each."""
-        ...
 
     def smooth(self, system: System) -> "EnsembleFilter":
         """Return this filter with an estimate that changes little when its normals do."""
-        ...
 
     def n_normals(self, system: System, n_steps: Any, n_observations: Any) -> Any:
         """Return how many normals one evaluation uses."""
-        ...
 
     def stored_noise(self, system: System) -> CompiledFunction[StoredNoiseFunction]:
         """Compile the making of these normals."""
-        ...
 
     def compile_distributed(
         self, system: System
     ) -> CompiledFunction[DistributedLogLikelihoodFunction]:
         """Compile the log-likelihood for members that are divided among ranks."""
-        ...
 
 
 def check_states_filter(filter: Filter) -> StatesFilter:

@@ -121,35 +121,21 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
     c = np.empty(slots[TABLE.n_constants])
     call_address(slots[TABLE.prepare], (theta, n_theta, c))
     return TabledSystem(
-        n=slots[TABLE.n],
-        p=slots[TABLE.p],
-        n_theta=slots[TABLE.n_theta],
-        dt=dt,
-        is_time_invariant=slots[TABLE.is_time_invariant] != 0,
-        free=free,
-        c=c,
+        n=slots[TABLE.n], p=slots[TABLE.p], n_theta=slots[TABLE.n_theta], dt=dt,
+        is_time_invariant=slots[TABLE.is_time_invariant] != 0, free=free, c=c,
         inputs=carray(inputs, (n_rows, slots[TABLE.n_inputs])),
-        initialise=slots[TABLE.initialise],
-        propagate=slots[TABLE.propagate],
-        observe=slots[TABLE.observe],
-        log_density=slots[TABLE.log_density],
+        initialise=slots[TABLE.initialise], propagate=slots[TABLE.propagate],
+        observe=slots[TABLE.observe], log_density=slots[TABLE.log_density],
         step_moments=slots[TABLE.step_moments],
-    )
+    )  # fmt: skip
 
 
 @inline_always
 def _call(address, system, k, t, z, width, X, out):
     arguments = MemberArguments(
-        c=system.c,
-        inputs=system.inputs,
-        k=k,
-        t=t,
-        z=z,
-        width=width,
-        X=X,
-        out=out,
+        c=system.c, inputs=system.inputs, k=k, t=t, z=z, width=width, X=X, out=out,
         n_members=np.int64(X.shape[1]),
-    )
+    )  # fmt: skip
     call_address(address, arguments)
 
 

@@ -96,15 +96,12 @@ def _past_of(integers, reals):
     n, N, R = header[_N], header[_MEMBERS], header[_ROWS]
     S, n_free, n_results = header[_SLOTS], header[_FREE], (3 * n + 1) * R
     return _Past(
-        header=header,
-        free=whole[:n_free],
-        rows=whole[n_free : n_free + R],
+        header=header, free=whole[:n_free], rows=whole[n_free : n_free + R],
         settled_at=whole[n_free + R : n_free + 2 * R],
-        origins=whole[n_free + 2 * R :].reshape(S, N),
-        results=reals[:n_results],
+        origins=whole[n_free + 2 * R :].reshape(S, N), results=reals[:n_results],
         last_log_w=reals[n_results : n_results + N],
         states=reals[n_results + N :].reshape(S, n, N),
-    )
+    )  # fmt: skip
 
 
 def _carry_past(integers, reals, event, j, k, X, log_w, d, D, ancestors):

@@ -266,24 +266,11 @@ def backward_simulation(
         if health[1] == NONE:
             table = make_table()
             arguments = BackwardArguments(
-                table=table.ctypes.data,
-                dt=dt,
-                theta=theta.ctypes.data,
-                n_theta=theta.size,
-                inputs=inputs.ctypes.data,
-                n_rows=inputs.shape[0],
-                N=N,
-                m=m,
-                M=M,
-                n_steps=n_steps,
-                t0=t0,
-                seed=draw_seed,
-                stored=stored.ctypes.data,
-                rows=rows.ctypes.data,
-                R=R,
-                reals=reals.ctypes.data,
-                succeeded=succeeded.ctypes.data,
-            )
+                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
+                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], N=N, m=m, M=M, n_steps=n_steps,
+                t0=t0, seed=draw_seed, stored=stored.ctypes.data, rows=rows.ctypes.data, R=R,
+                reals=reals.ctypes.data, succeeded=succeeded.ctypes.data,
+            )  # fmt: skip
             simulate_backward(*arguments)
             keep_alive(table)
             if succeeded[0] == 0.0:

@@ -121,16 +121,10 @@ class EnsembleFilterBase:
             n_steps = steps[-1] if steps.size else np.int64(0)
             out = np.empty(n_stored(sizes, n_steps, steps.size))
             arguments = StoreArguments(
-                seed=seed,
-                steps=steps.ctypes.data,
-                n_observations=steps.size,
-                width=width,
-                initial=initial,
-                process=process,
-                observation=observation,
-                resampling=resampling,
+                seed=seed, steps=steps.ctypes.data, n_observations=steps.size, width=width,
+                initial=initial, process=process, observation=observation, resampling=resampling,
                 out=out.ctypes.data,
-            )
+            )  # fmt: skip
             store(*arguments)
             return out
 
@@ -213,29 +207,14 @@ class EnsembleFilterBase:
             health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
             table = make_table()
             arguments = FilterArguments(
-                table=table.ctypes.data,
-                dt=dt,
-                theta=theta.ctypes.data,
-                n_theta=theta.size,
-                inputs=inputs.ctypes.data,
-                n_rows=inputs.shape[0],
-                settings=settings.ctypes.data,
-                steps=steps.ctypes.data,
-                n_observations=steps.size,
-                observed=observed.ctypes.data,
-                t0=t0,
-                seed=seed,
-                normals=normals.ctypes.data,
-                n_normals=normals.size,
-                callback=callback[0],
-                integers=callback[1],
-                reals=callback[2],
-                rank=layout[0],
-                n_ranks=layout[1],
-                exchange=layout[2],
-                terms=terms.ctypes.data,
+                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
+                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], settings=settings.ctypes.data,
+                steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
+                t0=t0, seed=seed, normals=normals.ctypes.data, n_normals=normals.size,
+                callback=callback[0], integers=callback[1], reals=callback[2], rank=layout[0],
+                n_ranks=layout[1], exchange=layout[2], terms=terms.ctypes.data,
                 health=health.ctypes.data,
-            )
+            )  # fmt: skip
             evaluate(*arguments)
             keep_alive(table)
             keep_alive(normals)

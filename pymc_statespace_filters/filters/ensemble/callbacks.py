@@ -41,17 +41,9 @@ def emit(callback, event, j, k, members, d, ancestors):
     address, integers, reals = callback
     if address != 0:
         arguments = CallbackArguments(
-            integers=integers,
-            reals=reals,
-            event=event,
-            j=np.int64(j),
-            k=k,
-            X=members.X,
-            log_w=members.log_w,
-            d=d,
-            D=members.D,
-            ancestors=ancestors,
-        )
+            integers=integers, reals=reals, event=event, j=np.int64(j), k=k, X=members.X,
+            log_w=members.log_w, d=d, D=members.D, ancestors=ancestors,
+        )  # fmt: skip
         call_address(address, arguments)
 
 

@@ -51,7 +51,6 @@ FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
 FilterArguments = arguments_class("FilterArguments", FILTER_ARGUMENTS, __name__)
 
 _N_LEADING = 6  # number of members and five of `NoiseSizes`
-_PACKAGE = __name__.partition(".")[0]
 
 
 class Members(NamedTuple):
@@ -78,20 +77,23 @@ def _members(n, p, local):
     for i in range(N):
         log_w[i] = -math.log(local.n_members)
     return Members(
-        X=np.empty((n, N)),
-        D=np.empty((p, N)),
-        X_f=np.empty((n, N)),
-        w=np.empty(N),
-        log_w=log_w,
-        log_p=np.empty(N),
-        alive=np.empty(N, np.bool_),
-    )
+        X=np.empty((n, N)), D=np.empty((p, N)), X_f=np.empty((n, N)), w=np.empty(N), log_w=log_w,
+        log_p=np.empty(N), alive=np.empty(N, np.bool_),
+    )  # fmt: skip
 
 
 @inline_always
 def _n_sums(system):
     """Enough rows of sums for the weights, means and covariances of an update."""
     return 8 + 2 * (system.n + system.p) ** 2
+
+
+@inline_always
+def _noise(seed, normals, given, steps, local):
+    """The normals of this rank: padded to its own width, else of the sizes that the filter gave."""
+    sizes = NoiseSizes(local.width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
+    n_steps = steps[-1] if steps.size else np.int64(0)
+    return noise_of(seed, normals, sizes, n_steps, local.first_block)
 
 
 class _NoResampling(NamedTuple):
@@ -152,19 +154,15 @@ def ensemble_filter(
         terms, health,
     ):  # fmt: skip
         given = carray(settings, (_N_LEADING + n_settings,))
-        n_members = int(given[0])
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-        local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, _n_sums(system))
-        width = local.width
-        sizes = NoiseSizes(width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
-        at = carray(steps, (n_observations,))
-        record = carray(observed, (n_observations, system.p))
+        n_members, n_sums = int(given[0]), _n_sums(system)
+        local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums)
+        at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
-        n_steps = at[n_observations - 1] if n_observations else np.int64(0)
-        noise = noise_of(seed, carray(normals, (n_normals,)), sizes, n_steps, local.first_block)
+        noise = _noise(seed, carray(normals, (n_normals,)), given, at, local)
         work = workspace(system, local, given[_N_LEADING:])
         resampling = resampler(given[_N_LEADING:], system.n, local)
-        members = _members(system.n, system.p, local)
+        members, width = _members(system.n, system.p, local), local.width
         to = (callback, integers, reals)
         state[0], state[1], state[2] = n_members, NONE, -1
         initialise(system, initial_normals(noise), width, members.X)
@@ -193,6 +191,9 @@ def ensemble_filter(
         if state[1] == NONE:
             emit(to, ENDED, n_observations, k, members, nothing, ancestors)
 
-    in_package = update.__module__.partition(".")[0] == _PACKAGE
-    key = digest(name) if in_package else None
-    return EntryPoint(run, FILTER_ARGUMENTS, name, key, needs=(FILL_NORMALS,))
+    return EntryPoint(run, FILTER_ARGUMENTS, name, _key(name, update), needs=(FILL_NORMALS,))
+
+
+def _key(name: str, update: Callable) -> str | None:
+    in_package = update.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return digest(name) if in_package else None

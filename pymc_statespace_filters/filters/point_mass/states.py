@@ -289,27 +289,13 @@ def _bind(system: System, tolerance: float, moment: int) -> CompiledFunction:
         health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
         table = make_table()
         arguments = StatesArguments(
-            table=table.ctypes.data,
-            dt=dt,
-            theta=theta.ctypes.data,
-            n_theta=theta.size,
-            inputs=inputs.ctypes.data,
-            n_rows=inputs.shape[0],
-            tolerance=tolerance,
-            moment=moment,
-            steps=steps.ctypes.data,
-            n_observations=steps.size,
-            observed=observed.ctypes.data,
-            t0=t0,
-            rows=rows.ctypes.data,
-            R=rows.size,
-            draw_seed=draw_seed,
-            mean=mean.ctypes.data,
-            sd=sd.ctypes.data,
-            drawn=drawn.ctypes.data,
-            terms=terms.ctypes.data,
+            table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
+            inputs=inputs.ctypes.data, n_rows=inputs.shape[0], tolerance=tolerance, moment=moment,
+            steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
+            t0=t0, rows=rows.ctypes.data, R=rows.size, draw_seed=draw_seed, mean=mean.ctypes.data,
+            sd=sd.ctypes.data, drawn=drawn.ctypes.data, terms=terms.ctypes.data,
             health=health.ctypes.data,
-        )
+        )  # fmt: skip
         evaluate(*arguments)
         keep_alive(table)
         return mean, sd, drawn, terms, health
