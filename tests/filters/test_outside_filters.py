@@ -1,0 +1,143 @@
+"""Filters from a user's own file, which inherit nothing from the package, work everywhere."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.filters import (
+    EnsembleFilter,
+    Filter,
+    RunFilter,
+    StatesFilter,
+)
+from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
+
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "filter.md"
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q, a: [a * x[0] + 0.1 * x[1] + q[0], 0.9 * x[1] + q[1]],
+    process_noise=[[0.5, 0.1], [0.1, 0.3]],
+    observation=lambda x: [x[0], x[0] - x[1]],
+    observation_noise=[[0.4, 0.1], [0.1, 0.2]],
+    initial_mean=[0.5, 0.0],
+    initial_cov=[[1.0, 0.2], [0.2, 0.5]],
+)
+RECORD_STEPS = np.array([0, 1, 3, 4, 8])
+RECORD = np.array([[0.3, 0.1], [1.2, np.nan], [np.nan, np.nan], [0.4, 0.2], [-0.3, 0.5]])
+RUN = {"observed": RECORD, "steps": RECORD_STEPS}
+
+
+@pytest.fixture(scope="module")
+def cubature():
+    """The filter of the page "A new filter", from its definitions alone."""
+    cells = re.findall(r"```\{code-cell\} python3\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    definitions = [cell for cell in cells if re.search(r"^(@njit|@dataclass|from )", cell, re.M)]
+    namespace = {"__name__": "a_users_file"}
+    exec("\n".join(definitions), namespace)
+    return namespace["CubatureKF"]()
+
+
+@dataclass(frozen=True)
+class PlainParticles:
+    """A noisy filter with the least there can be: no members, no states, no stored noise."""
+
+    n: int
+    noisy: ClassVar[bool] = True
+    has_gradient: ClassVar[bool] = False
+
+    def check(self, system):
+        if system.carried:
+            raise psf.ModelError("no carried states")
+
+    def is_exact_for(self, system):
+        return True
+
+    def compile(self, system):
+        return psf.BootstrapPF(self.n).compile(system)
+
+
+def model_of(filter):
+    with pm.Model() as model:
+        pm.Uniform("a", -1.0, 1.0)
+        psf.StateSpace("d", SYSTEM, filter, **RUN)
+    return model
+
+
+def test_what_an_outside_filter_is(cubature):
+    assert type(cubature).__mro__[1:] == (object,)
+    assert isinstance(cubature, Filter)
+    assert isinstance(cubature, RunFilter)
+    assert isinstance(cubature, StatesFilter)
+    assert not isinstance(cubature, EnsembleFilter)
+    assert isinstance(PlainParticles(50), Filter)
+    assert not isinstance(PlainParticles(50), StatesFilter)
+
+
+def test_its_likelihood_is_exact_on_linear_systems(cubature):
+    for a in (0.3, 0.8):
+        terms = psf.log_likelihood(SYSTEM, cubature, {"a": a}, **RUN)
+        exact = psf.log_likelihood(SYSTEM, psf.EKF(), {"a": a}, **RUN)
+        np.testing.assert_allclose(terms, exact, rtol=1e-9)
+    forced = {"observed": FORCED_DATA, "steps": STEPS, "inputs": FORCE}
+    params = dict.fromkeys(FORCED.parameters, 0.6)
+    np.testing.assert_allclose(
+        psf.log_likelihood(FORCED, cubature, params, **forced),
+        psf.log_likelihood(FORCED, psf.EKF(), params, **forced),
+        rtol=1e-9,
+    )
+
+
+def test_its_states_are_exact_on_linear_systems(cubature):
+    run = psf.run_filter(SYSTEM, cubature, {"a": 0.7}, **RUN, at="steps")
+    exact = psf.run_filter(SYSTEM, psf.EKF(), {"a": 0.7}, **RUN, at="steps")
+    for name in ("mean", "sd", "cov", "log_likelihood"):
+        np.testing.assert_allclose(run[name], exact[name], rtol=1e-8, atol=1e-12)
+
+
+def test_it_is_sampled_and_gives_evidence_and_states(cubature):
+    found = {}
+    for filter in (cubature, psf.EKF()):
+        with model_of(filter):
+            idata = psf.sample_dram(
+                400, tune=400, chains=2, random_seed=3, compute_convergence_checks=False
+            )
+            evidence = psf.chib_jeliazkov(idata, random_seed=1)
+            states = psf.filtered_states(idata, n_draws=20, random_seed=2)["filtered_states"]
+        assert idata.attrs["exact"]
+        found[type(filter).__name__] = evidence.log_evidence, states["d_mean"].values
+    (ours, our_mean), (theirs, their_mean) = found.values()
+    assert ours == pytest.approx(theirs, abs=0.01)  # likelihoods equal to 1e-9, one seed
+    np.testing.assert_allclose(our_mean, their_mean, rtol=1e-6, atol=1e-8)
+
+
+def test_a_noisy_one_without_anything_else_is_sampled_with_fresh_noise():
+    with model_of(PlainParticles(100)):
+        idata = psf.sample_dram(
+            50, tune=50, chains=2, random_seed=3, compute_convergence_checks=False
+        )
+        seeds = idata.sample_stats["d_seed"].values
+        assert np.unique(seeds).size > 2
+        with pytest.raises(psf.ModelError, match=r"gives no states: it has no compile_states"):
+            psf.filtered_states(idata)
+        with pytest.raises(psf.ModelError, match="correlation needs a filter whose normals"):
+            psf.sample_dram(5, tune=5, chains=1, stages=1, correlation=0.9)
+
+
+def test_what_it_refuses_is_its_own_error(cubature):
+    with model_of(cubature):
+        idata = psf.sample_dram(
+            20, tune=20, chains=1, random_seed=1, compute_convergence_checks=False
+        )
+        with pytest.raises(psf.ModelError, match="does not smooth; take filter="):
+            psf.smoothed_states(idata)
+
+
+@pytest.mark.parametrize("filter", [psf.EKF, PlainParticles, "EKF", None])
+def test_what_is_no_filter_is_refused(filter):
+    with pytest.raises(psf.ModelError, match=r"filter must be a filter such as psf.EKF\(\)"):
+        psf.log_likelihood(SYSTEM, filter, {"a": 0.5}, **RUN)
