@@ -29,13 +29,7 @@ from pymc_statespace_filters.sampling.target.variables import (
 
 
 class Growth(NamedTuple):
-    """The variable whose proposals are widest relative to the draws from its prior.
-
-    Attributes
-    ----------
-    name : str
-    factor : float
-    """
+    """The variable whose proposals are widest relative to the draws from its prior."""
 
     name: str
     factor: float
