@@ -129,6 +129,12 @@ class Communicator:
         self._sent = [request for request in self._sent if not request.Test()]
         self._sent.append(self._comm.isend((kind, value), to))
 
+    def send_to_others(self, kind: str, value: Any = None) -> None:
+        """Send a message to every other rank."""
+        for rank in range(self.size):
+            if rank != self.rank:
+                self.send(rank, kind, value)
+
     def receive(self) -> Message | None:
         """Receive the next message, if there is one."""
         if self._comm is None:

@@ -38,18 +38,10 @@ _CHECKSUM_SIZE = 4
 
 
 class StoredChain(NamedTuple):
-    """What a journal holds of its chain.
+    """The stored arrays of a chain, by name."""
 
-    Attributes
-    ----------
-    draws : dict of str to ndarray, shape (draws, ...)
-        All draws, from the first record to the last.
-    state : dict of str to ndarray
-        The state of the chain after the last of them.
-    """
-
-    draws: dict[str, np.ndarray]
-    state: dict[str, np.ndarray]
+    draws: dict[str, np.ndarray]  # all draws, from the first record to the last
+    state: dict[str, np.ndarray]  # the state of the chain after the last of them
 
 
 class _Segment(NamedTuple):
@@ -87,10 +79,7 @@ class ChainJournal:
     def read(self) -> StoredChain | None:
         """Read all records up to the first that is missing or damaged; the later ones are removed.
 
-        Returns
-        -------
-        StoredChain or None
-            None if there is no good record.
+        None if there is no good record.
 
         Warns
         -----
@@ -157,7 +146,7 @@ class ChainJournal:
         return sorted(found, key=lambda segment: (segment.first, -segment.last))
 
     def _load(self, segment: _Segment) -> StoredChain | None:
-        """What a segment holds, None if it is damaged or another one."""
+        """The arrays in a segment, None if it is damaged or another one."""
         content = memoryview(segment.path.read_bytes())
         body, checksum = content[:-_CHECKSUM_SIZE], content[-_CHECKSUM_SIZE:]
         if checksum != self._checksum(segment.path, body):

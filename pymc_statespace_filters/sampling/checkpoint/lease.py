@@ -1,7 +1,7 @@
 """A lease on a folder, so that one job at a time writes there.
 
-Each job puts a lease file of its own into the folder, and then looks at those of other jobs: of two
-jobs at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
+Each job puts a new lease file into the folder, and then looks at those of other jobs: of two jobs
+at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
 which names the process and its host, and touches it every few seconds in a thread. The lease of an
 ended process of this computer is removed at once. Any other is watched, and removed if it is not
 touched for 20 s; only changes count, the clocks of two computers are never compared. A job that was
@@ -36,21 +36,12 @@ _N_POLLS_FOR_NEW_FILE = 60
 
 
 class FolderLease:
-    """Hold a folder until `release`.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Attributes
-    ----------
-    path : Path
-        The lease file. Its name is never used again.
+    """A lease on a folder until `release`; ``path`` is its file, whose name is never used again.
 
     Raises
     ------
     ModelError
-        If a living process holds the folder.
+        If a living process has a lease on the folder.
     OSError
         If the folder is not writable.
     """

@@ -24,7 +24,7 @@ from numba import njit
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
-from pymc_statespace_filters.sampling.kernel.adaptation import AdaptationSettings, learn
+from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.kernel.state import (
@@ -210,7 +210,6 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
     raised. The state is that after the last of them.
     """
     learnt = unpack(state.adaptation, state.position.size)
-    adaptation = AdaptationSettings(settings.adapt_every)
     scaling = _scaling(learnt.chol)
     done = 0
     while done < n and control[PAUSE_REQUESTED] == 0:
@@ -233,7 +232,7 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
             for i in range(state.position.size):
                 _copy(learnt.cov[i], draws.covs[at, i])
         if settings.adapts:
-            learn(adaptation, settings.continuous, learnt, state.position, counts[STAGE])
+            learn(settings.adapt_every, settings.continuous, learnt, state.position, counts[STAGE])
             scaling = _scaling(learnt.chol)
         done += 1
         control[N_DONE] += 1

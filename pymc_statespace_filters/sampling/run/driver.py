@@ -43,25 +43,9 @@ def sample_models(
     options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
-    """Sample models on all ranks of a communicator.
+    """Sample models on all ranks of a communicator; None on ranks that do not get the result.
 
-    Parameters
-    ----------
-    models : mapping of str to pymc.Model
-    request : SamplingRequest
-    options : ExecutionOptions
-    checkpoints : sequence of str or path
-        A folder for each model, or none.
-
-    Returns
-    -------
-    dict of str to xarray.DataTree
-        None on ranks that do not get it.
-
-    Raises
-    ------
-    ModelError, DataMismatchError, ParallelError
-        As in ``sample_dram``.
+    ``checkpoints`` has a folder for each model, or none. Errors are those of ``sample_dram``.
     """
     options.check()
     with communicator_of(options.comm, in_lockstep=options.ranks_per_chain > 1) as comm:
@@ -99,7 +83,7 @@ def _run(
     n_threads = 1  # followers evaluate for one chain at a time
     if not tasks[0].is_distributed:
         n_threads = options.cores or cores_per_process(local_rank, cores)
-    n_chains = sum(task.n_chains for task in tasks)
+    n_chains = sum(task.request.chains for task in tasks)
     with ExitStack() as stack:
         if checkpoints:
             _open_checkpoints(tasks, checkpoints, comm, stack)

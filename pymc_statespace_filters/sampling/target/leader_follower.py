@@ -125,7 +125,7 @@ class Leader:
             self._send_record(number, record)
             self._sent[number] = content
         with deferred_interrupts() as interrupted:  # the followers wait in every allgather
-            _send_all(self._comm, _EVALUATE, ((self._name, number), theta, seed))
+            self._comm.send_to_others(_EVALUATE, ((self._name, number), theta, seed))
             values = self._evaluators[number](theta, *record, seed)
         if interrupted.is_set():
             raise KeyboardInterrupt
@@ -134,7 +134,7 @@ class Leader:
     def _send_record(self, number: int, record: _RecordArrays) -> None:
         """Send the followers a likelihood and its record, and wait for the answers of all."""
         likelihood = (self._name, number), *self._likelihoods[number], record
-        _send_all(self._comm, _RECORD, likelihood)
+        self._comm.send_to_others(_RECORD, likelihood)
         answers = [_receive(self._comm) for _ in range(1, self._comm.size)]
         for answer in answers:
             if answer.kind == _FAILED:
@@ -161,11 +161,11 @@ def release_followers(comm: Communicator) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        _send_all(comm, _END, f"the leader of the chain has stopped: {describe_error(error)}")
+        comm.send_to_others(_END, f"the leader of the chain has stopped: {describe_error(error)}")
         if not _is_acknowledged(comm):
             comm.abort(error)
         raise
-    _send_all(comm, _END)
+    comm.send_to_others(_END)
 
 
 def follow(comm: Communicator) -> None:
@@ -226,12 +226,6 @@ def _is_acknowledged(comm: Communicator) -> bool:
         missing -= message is not None and message.kind == _ACKNOWLEDGED
         time.sleep(0.0 if message else _POLL_SECONDS)
     return not missing
-
-
-def _send_all(comm: Communicator, kind: str, value: Any = None) -> None:
-    """Send to all followers."""
-    for rank in range(1, comm.size):
-        comm.send(rank, kind, value)
 
 
 def _receive(comm: Communicator) -> Message:
