@@ -90,18 +90,9 @@ class _Evaluator(Protocol):
 
 
 class Deterministics:
-    """The variables of a trace, evaluated at all positions of a chain.
+    """The variables of a trace, in the order of ``pm.sample``, evaluated at positions of a chain.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-        All value variables of the model.
-
-    Attributes
-    ----------
-    names : list of str
-        In the order in which ``pm.sample`` has them.
+    ``raveled`` has all value variables of the model.
     """
 
     def __init__(self, model: Model, raveled: RaveledVariables):
@@ -114,17 +105,7 @@ class Deterministics:
             self._evaluators.append(_PerPosition(rest, raveled))
 
     def __call__(self, positions: np.ndarray) -> dict[str, np.ndarray]:
-        """Evaluate.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (n, d)
-            Repeated rows, as after a rejection, are evaluated once.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n, ...)
-        """
+        """Values (n, ...) by name at positions (n, d); equal rows in succession count once."""
         moved = np.ones(len(positions), dtype=np.bool_)
         moved[1:] = (positions[1:] != positions[:-1]).any(axis=1)
         distinct, place = positions[moved], np.cumsum(moved) - 1

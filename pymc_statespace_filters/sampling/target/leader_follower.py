@@ -81,14 +81,10 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
 
 
 class Leader:
-    """The rank of a group that runs its chains.
+    """The rank of a group that runs its chains; the other ranks call `follow`.
 
-    Parameters
-    ----------
-    comm : Communicator
-        The group. The other ranks call `follow`.
-    likelihoods : sequence of (StateSpaceModel, filter)
-        The likelihoods evaluated together, by number, see `inspection.with_likelihood_callback`.
+    The likelihoods, pairs of a system and a filter, are identified by their index in the sequence,
+    see `graph_rewrites.with_likelihood_callback`.
     """
 
     def __init__(self, comm: Communicator, likelihoods: Sequence[tuple[Any, Any]]):
@@ -106,7 +102,7 @@ class Leader:
 
     @property
     def error(self) -> BaseException | None:
-        """Error of an evaluation, after which there is no other."""
+        """Error of an evaluation, after which there are no further evaluations."""
         return self._callback.error
 
     def _evaluate(
@@ -146,7 +142,7 @@ class Leader:
 
 @contextmanager
 def leader_errors(leader: Leader | None) -> Iterator[None]:
-    """Raise the leader's own error instead of the machine code's report that there was one."""
+    """Raise the error of the leader's callback instead of the machine code's report of one."""
     try:
         yield
     except Exception:
@@ -169,12 +165,7 @@ def release_followers(comm: Communicator) -> Iterator[None]:
 
 
 def follow(comm: Communicator) -> None:
-    """Take part in the evaluations of the leader, rank 0, until it sends the end.
-
-    Parameters
-    ----------
-    comm : Communicator
-        The group.
+    """Take part in the evaluations of the leader, rank 0 of the group, until it sends the end.
 
     Raises
     ------
