@@ -40,19 +40,9 @@ def run_estimators(
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> dict[str, Evidence]:
-    """Run estimators on the same draws and report each result as an `Evidence`.
+    """Run estimators with different names on the same draws; an `Evidence` by each name.
 
-    Parameters
-    ----------
-    idata, model, random_seed, extend_inferencedata, progressbar
-        As in `chib_jeliazkov`.
-    estimators : iterable of Estimator
-        With different names.
-
-    Returns
-    -------
-    dict of str to Evidence
-        By name of the estimator.
+    The other arguments are those of `chib_jeliazkov`.
 
     Warns
     -----

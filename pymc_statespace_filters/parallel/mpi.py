@@ -1,6 +1,6 @@
 """Access to MPI: the communicator for the argument ``comm``, with advice when it cannot be had.
 
-The only module that imports mpi4py, and only if a communicator is asked for.
+The only module that imports mpi4py, and only if a communicator is requested.
 """
 
 import os
@@ -77,7 +77,7 @@ def check_threads() -> None:
     loaded = mpi()
     if loaded.Query_thread() < loaded.THREAD_MULTIPLE:
         raise ParallelError(
-            "Ranks that share a chain need an MPI that several threads may call at once "
+            "Ranks that run a chain together need an MPI that several threads may call at once "
             "(MPI_THREAD_MULTIPLE), but it was initialized for a lower thread level. Leave "
             "`mpi4py.rc.threads` and `mpi4py.rc.thread_level`, or the variables MPI4PY_RC_THREADS "
             "and MPI4PY_RC_THREAD_LEVEL, at their defaults; if they are, use another MPI library, "

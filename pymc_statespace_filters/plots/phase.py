@@ -115,7 +115,7 @@ def plot_phase(
     legend = {}
     if n_draws:
         mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
-        style = {**style, "alpha": 0.25}  # the median must stand out
+        style = {**style, "alpha": 0.25}  # paler than the median
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
         legend["draws"] = {**PATHS, "width": 1.5}
     median = over_draws(data).sel(quantile=0.5)

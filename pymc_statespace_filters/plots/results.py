@@ -75,20 +75,11 @@ def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -
 def truth_of(
     truth: Any, simulated: str, along: str, names: Sequence[str], times: np.ndarray
 ) -> xr.DataArray:
-    """Return the user's `truth` with dimensions "time" and `along`.
+    """Return the user's `truth` with dimensions "time" and `along` ("state" or "observable").
 
-    Parameters
-    ----------
-    truth : xarray.Dataset, xarray.DataArray or array_like
-        Result of `simulate`; array with the dimension `along` and another whose coordinate is time;
-        or array of shape (len(times), len(names)).
-    simulated : str
-        The variable of a result of `simulate`.
-    along : {"state", "observable"}
-    names : sequence of str
-        Names in the results, in order.
-    times : numpy.ndarray
-        Times of the results.
+    It is a result of `simulate`, of which the variable `simulated` is taken; an array with the
+    dimension `along` and another whose coordinate is time; or an array of shape (times, names),
+    those of the results.
     """
     if isinstance(truth, xr.Dataset):
         if simulated not in truth:

@@ -7,13 +7,14 @@ import xarray as xr
 from arviz_plots import PlotCollection
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import canvas, curve
+from pymc_statespace_filters.plots.canvas import curve
 from pymc_statespace_filters.plots.marks import (
     DATA,
     DOTS,
     PATHS,
     TRUTH,
     add_legend,
+    canvas_over_time,
     draw_bands,
     draw_bars,
     label_axes,
@@ -118,16 +119,7 @@ def plot_states(
         truth = truth.where((truth["time"] >= begin) & (truth["time"] <= end), drop=True)
 
     data = draws.sel(state=shown).to_dataset(name="states")
-    collection = canvas(
-        data,
-        backend=backend,
-        pc_kwargs=pc_kwargs,
-        aes={},
-        size=(7.0, 1.3 + 2.0 * len(shown) ** 0.9),
-        n_panels=len(shown),
-        panels_in_line=1,
-        cols=["state"],
-    )
+    collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths(group, results) else (points, DOTS)
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)

@@ -89,7 +89,7 @@ def prior_sensitivity(
         below 100, if the Pareto shape k is above 0.5 (the posterior is nearly as wide as the prior,
         and the mean of the weights has no standard error), or if more than 2 per cent of the
         evidence may lie outside the bounds of the original prior, where there are no draws.
-        ``width_beyond`` is an upper bound of that share, from the draws in the outermost 5 per cent
+        ``width_beyond`` is an upper bound of that part, from the draws in the outermost 5 per cent
         of a bounded support, provided that likelihood and prior do not increase outwards from
         there. Where one evidence is NaN, the probabilities of all models are.
 
@@ -250,7 +250,7 @@ def _drawn(
         )
     free = {name: [rv.name for rv in models[name].free_RVs] for name in names}
     chosen = [var_names] if isinstance(var_names, str) else list(var_names or [])
-    if unknown := [one for one in chosen if not any(one in held for held in free.values())]:
+    if unknown := [one for one in chosen if not any(one in of_model for of_model in free.values())]:
         raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
     found = {}
     for name in names:

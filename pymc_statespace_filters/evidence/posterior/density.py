@@ -26,18 +26,14 @@ Array = NDArray[np.float64]
 class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    output : TensorVariable
-        Scalar graph of the model's value variables; the noise seeds become arguments.
+    ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
 
     Attributes
     ----------
     seed_names : tuple of str
         Names of the noisy state-space variables, in the order of the columns of a seed array.
     model_seeds : ndarray of int64
-        The seeds that the model holds for them.
+        The model's seeds for them.
     """
 
     def __init__(self, model: pm.Model, output: TensorVariable) -> None:
@@ -77,12 +73,8 @@ class RowFunction:
 class ModelDensity(RowFunction):
     """The compiled log-density of a model.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    moved : bool
-        Whether the chain moved its noise (``correlation``), with the smooth versions of the
-        filters.
+    ``moved`` is whether the chain moved its noise (``correlation``), with the smooth versions of
+    the filters.
     """
 
     def __init__(self, model: pm.Model, *, moved: bool = False) -> None:

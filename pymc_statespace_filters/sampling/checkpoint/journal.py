@@ -68,7 +68,7 @@ class ChainJournal:
     origin : bytes
         Identifies the run and the chain; enters each checksum.
     check : callable
-        Raises if the files belong to another job by now; called before they are touched.
+        Raises if another job has taken the files over; called before they are touched.
     """
 
     def __init__(self, path: Path, origin: bytes, check: Callable[[], None] = lambda: None):
@@ -170,7 +170,7 @@ class ChainJournal:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
         except OSError:
-            self._check()  # says so if the files belong to another job by now
+            self._check()  # another job may have taken the files over
             unfinished.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
@@ -194,7 +194,7 @@ class ChainJournal:
         return self._segments[len(self._segments) - n_small :]
 
     def _merge(self, tail: Sequence[_Segment]) -> None:
-        """Write the last segments anew as a single one, with the last state alone."""
+        """Replace the last segments by a single one, with the last state only."""
         merged = self._write(tail[0].first, tail[-1].last, *_joined(map(self._load_again, tail)))
         self._segments = [*self._segments[: -len(tail)], merged]
         for segment in tail:

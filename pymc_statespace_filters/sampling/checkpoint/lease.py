@@ -9,7 +9,7 @@ suspended for longer finds its file gone and stores nothing more.
 
 SoftFileLease can also take over one common file. That is not used, because it exchanges two file
 names in one step, which NFS, SMB and most parallel file systems refuse: there the lease of a dead
-job would be held for ever. File names that are never used again need no exchange.
+job would never expire. File names that are never used again need no exchange.
 """
 
 import errno

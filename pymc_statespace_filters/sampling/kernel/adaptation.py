@@ -217,11 +217,11 @@ def _learn_covariance(state: AdaptationState) -> None:
     n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
     dim = base.shape[0]
     weight = moved / (moved + PRIOR_MOVES * dim)
-    learnt = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
+    factor = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):
         for j in range(i + 1):
-            cov[i, j] = learnt * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
+            cov[i, j] = factor * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
             cov[j, i] = cov[i, j]
         mean_variance += cov[i, i] / dim
     for i in range(dim):

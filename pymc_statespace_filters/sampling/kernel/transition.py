@@ -209,18 +209,18 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
     Returns the number of iterations made: fewer than n if a pause was requested or the model
     raised. The state is that after the last of them.
     """
-    learnt = unpack(state.adaptation, state.position.size)
-    scaling = _scaling(learnt.chol)
+    adapted = unpack(state.adaptation, state.position.size)
+    scaling = _scaling(adapted.chol)
     done = 0
     while done < n and control[PAUSE_REQUESTED] == 0:
         at, k = row + done, first + done
         counts, numbers = draws.counts[at], draws.numbers[at]
         if settings.screened:
             acceptance = _screened_move(
-                settings, target, screen, state, learnt.chol, random, k, counts
+                settings, target, screen, state, adapted.chol, random, k, counts
             )
         else:
-            acceptance = _move(settings, target, state, learnt.chol, random, k, counts)
+            acceptance = _move(settings, target, state, adapted.chol, random, k, counts)
         if counts[FAILURE] == RAISED:
             break
         _copy(state.position, draws.positions[at])
@@ -230,10 +230,10 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
         numbers[ACCEPTANCE], numbers[SCALING] = acceptance, scaling
         if at < draws.covs.shape[0]:
             for i in range(state.position.size):
-                _copy(learnt.cov[i], draws.covs[at, i])
+                _copy(adapted.cov[i], draws.covs[at, i])
         if settings.adapts:
-            learn(settings.adapt_every, settings.continuous, learnt, state.position, counts[STAGE])
-            scaling = _scaling(learnt.chol)
+            learn(settings.adapt_every, settings.continuous, adapted, state.position, counts[STAGE])
+            scaling = _scaling(adapted.chol)
         done += 1
         control[N_DONE] += 1
     return done

@@ -1,6 +1,6 @@
 """Whole chains as the DataTree that ``pm.sample`` returns.
 
-PyMC's own converter makes the DataTree, so that groups, dimensions, coordinates, data and
+PyMC's converter makes the DataTree, so that groups, dimensions, coordinates, data and
 attributes follow its conventions. Its input is traces filled in bulk instead of draw by draw.
 """
 
@@ -83,7 +83,7 @@ def to_datatree(
     def convert(positions: np.ndarray, stats: dict[str, np.ndarray]) -> DataTree:
         varying = {name: values for name, values in stats.items() if name not in fixed}
         trace = MultiTrace([_ChainTrace(0, deterministics(positions), varying)])
-        # There is no public way: PyMC's own driver sets these.
+        # There is no public way: PyMC's driver sets these.
         trace.report._n_tune = min(tune, skipped + length)
         trace.report._n_draws = skipped + length - trace.report._n_tune
         trace.report._t_sampling = sampling_time

@@ -21,7 +21,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
 )
 from pymc_statespace_filters.sampling.target.target import Target
 
-# PyMC's own names: it renames the first to "lp", and logs and removes the second.
+# PyMC's names: it renames the first to "lp", and logs and removes the second.
 MODEL_LOGP, WARNING = "model_logp", "warning"
 
 

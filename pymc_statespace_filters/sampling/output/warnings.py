@@ -31,7 +31,7 @@ STUCK = 0.005
 LONG_DWELL, LEAST_DWELL = 0.2, 100
 
 # Factor by which the proposals may be wider than the draws from the prior. With a proper prior they
-# are narrower; under a flat one draws around the model's initial point stand in for its draws.
+# are narrower; under a flat one draws around the model's initial point replace its draws.
 TOLERATED_GROWTH = 1e3
 
 # Fraction of the draws whose particles may have collapsed: a rare surprise only costs mixing.

@@ -3,7 +3,7 @@
 Types on the way of a draw, from the request to the DataTree:
 
 `SamplingRequest`
-    what the user asked for, and on which the draws depend; `ExecutionOptions` has the rest
+    the user's arguments on which the draws depend; `ExecutionOptions` has the others
 `ModelTask`
     the request applied to one model: target, starts, results, DataTree
 `ChainTask`
@@ -109,7 +109,7 @@ def _prepare(tasks: Sequence[ModelTask]) -> None:
 
 
 def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
-    """Ranks of a group: as many as there are if more were asked for, as on a laptop."""
+    """Number of ranks in a group: ``ranks_per_chain``, or all of them if there are fewer."""
     size = min(ranks_per_chain, n_ranks)
     if n_ranks % size:
         raise ModelError(

@@ -123,7 +123,7 @@ class ModelTask:
         self._ended = time.monotonic()
 
     def load_missing_results(self) -> None:
-        """Take what the checkpoint holds for chains that never ran, as after an interruption."""
+        """Load chains that never ran from the checkpoint, as after an interruption."""
         for index in set(range(self.request.chains)) - set(self._results):
             self._results[index] = self.chain_task(index).result()
 

@@ -1,6 +1,6 @@
-"""What the user asks of a run, checked once: what to draw, and how to execute it.
+"""The user's arguments of a run, checked once: what to draw, and how to execute it.
 
-`SamplingRequest` holds all that the draws depend on, apart from the model; `ExecutionOptions` holds
+`SamplingRequest` has all that the draws depend on, apart from the model; `ExecutionOptions` has
 threads, ranks and output, on which they do not depend.
 """
 

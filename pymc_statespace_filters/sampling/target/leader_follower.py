@@ -135,8 +135,8 @@ class Leader:
         for answer in answers:
             if answer.kind == _FAILED:
                 raise ParallelError(
-                    f"rank {answer.source} of the {self._comm.size} that share a chain cannot "
-                    f"evaluate its likelihood: {answer.value}"
+                    f"rank {answer.source} of the {self._comm.size} that run a chain together "
+                    f"cannot evaluate its likelihood: {answer.value}"
                 )
 
 
@@ -203,7 +203,7 @@ def _evaluate_or_abort(comm: Communicator, evaluate: Callable, *arguments: Any) 
     try:
         evaluate(*arguments)
     except BaseException as error:
-        error.add_note(f"on rank {comm.rank} of the {comm.size} that share a chain")
+        error.add_note(f"on rank {comm.rank} of the {comm.size} that run a chain together")
         comm.abort(error)
         raise
 

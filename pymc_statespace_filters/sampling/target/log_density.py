@@ -137,7 +137,7 @@ class LogDensity:
         return self._native
 
     def bind(self) -> "BoundLogDensity":
-        """Make the log-density callable from one thread, with its own arrays."""
+        """Make the log-density callable from one thread, with separate arrays."""
         native = self._native or self.prepare()
         position, others = self._start.copy(), [value.copy() for value in self._others]
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
@@ -172,7 +172,7 @@ class LogDensity:
         return [position, *others, *first, *normals, *each_seed]
 
     def _first_normals(self) -> list[np.ndarray]:
-        """The stored normals; none if ranks share the particles, as each makes its own."""
+        """The stored normals; none if ranks divide the particles, as each draws its part."""
         if self._leader is not None:
             return [np.empty(0) for _ in range(self._n_noises)]
         noise = self._make_noise()

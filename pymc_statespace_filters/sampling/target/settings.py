@@ -49,7 +49,7 @@ class DRAMSettings:
         return cls(**arguments)
 
     def __post_init__(self) -> None:
-        for field in fields(self):  # settings that are equal shall look equal
+        for field in fields(self):  # equal settings must have equal representations
             if isinstance(value := getattr(self, field.name), np.generic):
                 object.__setattr__(self, field.name, value.item())
         object.__setattr__(self, "stages", _stage_pair(self.stages))
