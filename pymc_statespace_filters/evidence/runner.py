@@ -67,7 +67,7 @@ def run_estimators(
         """An estimator's random numbers, independent of which others run."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
-    with row_progress(density, enabled=progressbar) as announce:
+    with row_progress(density.calls, enabled=progressbar) as announce:
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood

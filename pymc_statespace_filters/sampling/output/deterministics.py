@@ -8,7 +8,6 @@ are evaluated by one compiled function, called for each position.
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Protocol
 
 import numpy as np
 from pymc.model import Model
@@ -81,14 +80,6 @@ NUMPY_MODE = Mode(
 ).register((in2out(_binary_sums_and_products), 100.0))
 
 
-class _Evaluator(Protocol):
-    """Evaluates some of the variables: positions, shape (n, d), to arrays of shape (n, ...)."""
-
-    names: list[str]
-
-    def __call__(self, positions: np.ndarray) -> list[np.ndarray]: ...
-
-
 class Deterministics:
     """The variables of a trace, in the order of ``pm.sample``, evaluated at positions of a chain.
 
@@ -100,7 +91,7 @@ class Deterministics:
         self.names = [variable.name for variable in wanted]
         vectorized = _Vectorized([v for v in wanted if _is_vectorizable(v)], raveled)
         rest = [v for v in wanted if v.name not in vectorized.names]
-        self._evaluators: list[_Evaluator] = [vectorized]
+        self._evaluators: list[_Vectorized | _PerPosition] = [vectorized]
         if rest:
             self._evaluators.append(_PerPosition(rest, raveled))
 

@@ -44,7 +44,7 @@ class ModelTask:
     Raises
     ------
     ModelError
-        If the log-density draws random numbers from an internal generator.
+        If the log-density draws random numbers.
     """
 
     def __init__(

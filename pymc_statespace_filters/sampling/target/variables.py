@@ -70,8 +70,8 @@ def check_no_generators(model: Model) -> None:
     for name, term in log_density_terms(model):
         if any(isinstance(v.type, RandomType) for v in graph_inputs([term])):
             raise ModelError(
-                f"the log-density of {name!r} draws random numbers of its own, from a generator "
-                "shared by all chains: the draws would not be a function of random_seed. "
+                f"the log-density of {name!r} draws random numbers from a generator that all "
+                "chains would use: the draws would not be a function of random_seed. "
                 "pm.sample(step=psf.DRAM()) accepts such a model"
             )
 
