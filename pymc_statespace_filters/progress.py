@@ -134,7 +134,7 @@ class ChainProgress(ProgressBarManager):
 
 
 class _RowProgress:
-    """A bar that appears once its task has taken two seconds, and goes with the next task."""
+    """A bar that appears once its task has taken two seconds, and disappears with the next task."""
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack

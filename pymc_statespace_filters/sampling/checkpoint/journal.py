@@ -1,9 +1,9 @@
-"""Draws and states of a chain on disk: immutable segments that no kill of the writer can tear.
+"""Draws and states of a chain on disk, in immutable segments that survive a kill of the writer.
 
 A segment is one file: the names of its arrays as JSON, the arrays in NumPy's npy format, and a
 checksum of the run, the chain, the numbers of the records in it, and the content. It is written
-under another name, brought to the disk and renamed: it is there as a whole or not at all, and a
-damaged file or one of another chain is recognised.
+under another name, flushed to disk and renamed: it exists as a whole or not at all, and a damaged
+file or one of another chain is recognised.
 
 A record has the draws since the one before, and the whole state of the chain. The last segments are
 merged whenever 16 of them have similar lengths, so a chain of n records has at most some
@@ -105,7 +105,7 @@ class ChainJournal:
         Raises
         ------
         OSError
-            If the disk refuses, for example because it is full. The record is not kept.
+            If the record cannot be written, for example because the disk is full.
         ValueError
             If an array has Python objects.
         """
@@ -211,7 +211,7 @@ class ChainJournal:
 
     def _discard(self, segments: Sequence[_Segment], n_good: int) -> None:
         first = segments[0]
-        for segment in reversed(segments):  # the first last: if we are killed, it is found again
+        for segment in reversed(segments):  # the first last: a killed process leaves it to the next
             segment.path.unlink()
         resumes = f"the chain resumes after record {n_good}" if n_good else "the chain begins anew"
         warnings.warn(
@@ -228,7 +228,7 @@ class ChainJournal:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring a folder's list of files to the disk, where the system has a way to ask for it."""
+    """Flush a folder's list of files to disk, on systems that can."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except OSError:

@@ -116,7 +116,7 @@ def _has_ended(path: Path) -> bool:
     pid = _lease(path).pid
     if pid is None or not path.name.startswith(f"{PREFIX}{_process_table()}-"):
         return False
-    if os.name == "nt":  # removing the file will tell
+    if os.name == "nt":  # removing the file fails if it has not
         return True
     with suppress(PermissionError):  # a process of another user
         try:
@@ -127,7 +127,7 @@ def _has_ended(path: Path) -> bool:
 
 
 def _expired(leases: list[Path]) -> list[Path]:
-    """Those of these leases that are not touched for a while; raise if one is."""
+    """Leases that are not touched for a while; raise if one of them is touched."""
     touched = {path: time for path in leases if (time := _last_touched(path)) is not None}
     for _ in range(_N_POLLS):  # counted, so that a process suspended between two polls misses none
         if not touched:

@@ -96,7 +96,7 @@ class Deterministics:
             self._evaluators.append(_PerPosition(rest, raveled))
 
     def __call__(self, positions: np.ndarray) -> dict[str, np.ndarray]:
-        """Values (n, ...) by name at positions (n, d); equal rows in succession count once."""
+        """Values (n, ...) by name at positions (n, d); repeated rows are evaluated once."""
         moved = np.ones(len(positions), dtype=np.bool_)
         moved[1:] = (positions[1:] != positions[:-1]).any(axis=1)
         distinct, place = positions[moved], np.cumsum(moved) - 1
