@@ -40,7 +40,7 @@ def run_estimators(
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> dict[str, Evidence]:
-    """Run estimators with different names on the same draws; an `Evidence` by each name.
+    """Run estimators with different names on the same draws, and report an `Evidence` for each.
 
     The other arguments are those of `chib_jeliazkov`.
 

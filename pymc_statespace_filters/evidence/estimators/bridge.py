@@ -216,7 +216,7 @@ def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float
         lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
         return float(upper - lower - log_odds)
 
-    # The evidence lies within the ratios, lowered at most by the log fraction of those possible.
+    # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
     possible = at_proposals[~np.isneginf(at_proposals)]
     log_fraction = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
     least = min(at_draws.min(), possible.min()) + log_fraction - 1

@@ -104,9 +104,9 @@ def check_overlap(log_density: Array) -> None:
 def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
     """Combine the draws of `idata` with the compiled density of their model.
 
-    ``sample_stats`` may have the log-density ``lp`` of each draw; it, or the noise seeds
-    ``<name>_seed``, must be there if the noise was refreshed along the chain. Also returns the
-    treatment of the noise: "none", "refreshed" or "held", as in `Evidence`.
+    ``sample_stats`` may have the log-density ``lp`` of each draw; it must have it, or the noise
+    seeds ``<name>_seed``, if the noise was refreshed along the chain. Also returns the treatment of
+    the noise: "none", "refreshed" or "held", as in `Evidence`.
 
     Raises
     ------

@@ -211,7 +211,8 @@ class ChainJournal:
 
     def _discard(self, segments: Sequence[_Segment], n_good: int) -> None:
         first = segments[0]
-        for segment in reversed(segments):  # the first last: a killed process leaves it to the next
+        # The first last: if the process is killed meanwhile, the next read finds it again.
+        for segment in reversed(segments):
             segment.path.unlink()
         resumes = f"the chain resumes after record {n_good}" if n_good else "the chain begins anew"
         warnings.warn(

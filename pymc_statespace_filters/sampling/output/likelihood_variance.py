@@ -114,7 +114,8 @@ def acceptance_share(variance: float) -> float:
 def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
     """Advise the user if the variance is far outside the range in which chains work best.
 
-    None between variances of 0.05 and 10, and without noise; `where` it was measured is named.
+    None between variances of 0.05 and 10, and without noise. ``where`` says where it was measured,
+    such as "at the start".
     """
     found = f"Chain {chain}, {where}: the estimated log-likelihood"
     if spread.n_failed > spread.n or spread.variance == np.inf:
