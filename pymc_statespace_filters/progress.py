@@ -11,7 +11,7 @@ from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
 from rich.theme import Theme
 
-# Below this share of accepted proposals a bar turns red.
+# Below this fraction of accepted proposals a bar turns red.
 MIN_ACCEPT_RATE = 0.01
 
 PATIENCE = 2.0  # seconds without a progress bar
@@ -85,8 +85,8 @@ class ChainProgress(ProgressBarManager):
         stats["marker_pos"] = [self._tune] * n_chains
         self._backend = self._create_backend(self._total, columns, stats)
         if isinstance(self._backend, RichProgressBackend):
-            # PyMC gives each column a share of the terminal, and cuts its text to it: let the bar
-            # alone take what the texts leave.
+            # PyMC gives each column a fraction of the terminal's width, and cuts its text to it:
+            # let the bar alone take what the texts leave.
             for column in self._backend._progress.columns[1:]:
                 column.get_table_column().ratio = None
 
@@ -134,7 +134,7 @@ class ChainProgress(ProgressBarManager):
 
 
 class _RowProgress:
-    """A bar that appears once its task has taken two seconds, and goes with the next task."""
+    """A bar that appears once its task has taken two seconds, and disappears with the next task."""
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack

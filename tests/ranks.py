@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.parallel.communicator import Message
+from pymc_statespace_filters.parallel.communicator import Communicator, Message
 
 _EXCHANGE = ctypes.CFUNCTYPE(
     None, ctypes.POINTER(ctypes.c_double), ctypes.c_ssize_t, ctypes.c_ssize_t, ctypes.c_ssize_t
@@ -38,6 +38,8 @@ class FakeRank:
     def send(self, to: int, kind: str, value: Any = None) -> None:
         """Send a message, by value as MPI does."""
         self._letters[to].put(pickle.dumps(Message(self.rank, kind, value)))
+
+    send_to_others = Communicator.send_to_others
 
     def receive(self) -> Message | None:
         """Take the next message, if there is one."""

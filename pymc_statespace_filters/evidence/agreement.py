@@ -42,17 +42,7 @@ class Agreement:
 
 
 def assess_agreement(evidences: Mapping[str, Evidence]) -> Agreement:
-    """Compare estimates of one evidence; those without a standard error are ignored.
-
-    Parameters
-    ----------
-    evidences : mapping of str to Evidence
-        By the name of the estimator.
-
-    Returns
-    -------
-    Agreement
-    """
+    """Compare estimates of one evidence; those without a standard error are ignored."""
     compared = {name: e for name, e in evidences.items() if np.isfinite(e.se)}
     if len(compared) < 2:
         return Agreement(1.0, 0.0, "")

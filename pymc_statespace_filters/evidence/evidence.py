@@ -113,12 +113,12 @@ class Evidence:
         return " ".join(notes)
 
     def __repr__(self) -> str:
-        held = "" if self.noise == "none" else f", noise={self.noise!r}"
+        noise = "" if self.noise == "none" else f", noise={self.noise!r}"
         improper = f", improper={self.improper!r}" if self.improper else ""
         return (
             f"Evidence(log_evidence={self.log_evidence:.3f} ± {self.se:.3f}, "
             f"estimator={self.estimator!r}, k={self.n_parameters}, "
-            f"J={self.n_observations}{held}{improper})"
+            f"J={self.n_observations}{noise}{improper})"
         )
 
     def _repr_html_(self) -> str:
@@ -128,14 +128,8 @@ class Evidence:
 def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, float]) -> None:
     """Store `evidence` in the group of `idata`, replacing an earlier one of the same estimator.
 
-    Parameters
-    ----------
-    idata : xarray.DataTree
-        Modified in place. The group has the dimension ``estimator``.
-    evidence : Evidence
-        Each field becomes a variable.
-    settings : dict of str to float
-        Settings and diagnostics of the estimator, further variables.
+    The group has the dimension ``estimator``. Each field becomes a variable, and so do the settings
+    and diagnostics of the estimator.
     """
     record = {field.name: getattr(evidence, field.name) for field in fields(evidence)} | settings
     name = record.pop("estimator")
@@ -152,24 +146,9 @@ def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, f
 
 
 def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
-    """Read the evidences stored in `idata`.
+    """Read the evidences stored in `idata`, by estimator; a `ModelError` if there are none.
 
-    Parameters
-    ----------
-    idata : xarray.DataTree
-        With the group ``evidence``.
-    name : str
-        Name of `idata` in error messages.
-
-    Returns
-    -------
-    dict of str to Evidence
-        By estimator.
-
-    Raises
-    ------
-    ModelError
-        If there is no such group.
+    ``name`` is that of `idata` in the message.
     """
     if GROUP not in idata.children:
         raise ModelError(

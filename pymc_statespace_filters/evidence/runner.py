@@ -40,19 +40,9 @@ def run_estimators(
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> dict[str, Evidence]:
-    """Run estimators on the same draws and report each result as an `Evidence`.
+    """Run estimators with different names on the same draws, and report an `Evidence` for each.
 
-    Parameters
-    ----------
-    idata, model, random_seed, extend_inferencedata, progressbar
-        As in `chib_jeliazkov`.
-    estimators : iterable of Estimator
-        With different names.
-
-    Returns
-    -------
-    dict of str to Evidence
-        By name of the estimator.
+    The other arguments are those of `chib_jeliazkov`.
 
     Warns
     -----
@@ -77,7 +67,7 @@ def run_estimators(
         """An estimator's random numbers, independent of which others run."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
-    with row_progress(density, enabled=progressbar) as announce:
+    with row_progress(density.calls, enabled=progressbar) as announce:
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood

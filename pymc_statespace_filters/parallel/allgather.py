@@ -45,12 +45,12 @@ class ColumnAllgather:
         except BaseException as error:
             self.error = error
 
-    def _allgather(self, *what: Any) -> None:
-        if what not in self._layouts:
+    def _allgather(self, *key: int) -> None:
+        if key not in self._layouts:
             if len(self._layouts) >= _MAX_LAYOUTS:
                 self._layouts.clear()
-            self._layouts[what] = self._layout(*what)
-        array, ends, counts, starts, buffer = self._layouts[what]
+            self._layouts[key] = self._layout(*key)
+        array, ends, counts, starts, buffer = self._layouts[key]
         if buffer is None:
             self._comm.Allgatherv(mpi().IN_PLACE, [array, counts, starts, mpi().DOUBLE])
             return

@@ -37,15 +37,7 @@ class Message(NamedTuple):
 class Communicator:
     """A group of MPI ranks, as seen from one of them; a context manager.
 
-    Parameters
-    ----------
-    comm : mpi4py.MPI.Comm, optional
-        Default: this process alone.
-
-    Attributes
-    ----------
-    rank : int
-    size : int
+    Without a communicator of mpi4py it is this process alone.
     """
 
     def __init__(self, comm: Any = None):
@@ -129,6 +121,12 @@ class Communicator:
         self._sent = [request for request in self._sent if not request.Test()]
         self._sent.append(self._comm.isend((kind, value), to))
 
+    def send_to_others(self, kind: str, value: Any = None) -> None:
+        """Send a message to every other rank."""
+        for rank in range(self.size):
+            if rank != self.rank:
+                self.send(rank, kind, value)
+
     def receive(self) -> Message | None:
         """Receive the next message, if there is one."""
         if self._comm is None:
@@ -158,20 +156,15 @@ class Communicator:
     def groups(self, size: int) -> "tuple[Communicator, Communicator | None]":
         """Divide the ranks into groups of consecutive ones.
 
-        Returns
-        -------
-        Communicator
-            The group of this rank.
-        Communicator or None
-            The first ranks of all groups; None on the other ranks.
+        Returns the group of this rank, and the first ranks of all groups (None on other ranks).
         """
         if self._comm is None or size == 1:
             return Communicator(), Communicator(self._comm)
         self.run_collectively(check_threads)
-        group = Communicator._owning(self._comm.Split(self.rank // size, self.rank))
+        group = Communicator._wrapping(self._comm.Split(self.rank // size, self.rank))
         leads = self.rank % size == 0
         leaders = self._comm.Split(0 if leads else mpi().UNDEFINED, self.rank)
-        return group, Communicator._owning(leaders) if leads else None
+        return group, Communicator._wrapping(leaders) if leads else None
 
     def node_local(self, value: Any = None) -> tuple[int, list[Any]]:
         """Rank among those on this computer, and the values of all of them."""
@@ -183,11 +176,11 @@ class Communicator:
         return rank, values
 
     @classmethod
-    def _owning(cls, comm: Any) -> "Communicator":
+    def _wrapping(cls, comm: Any) -> "Communicator":
         """Wrap a communicator without duplicating it."""
-        owner = cls()
-        owner._comm, owner.rank, owner.size = comm, comm.Get_rank(), comm.Get_size()
-        return owner
+        wrapper = cls()
+        wrapper._comm, wrapper.rank, wrapper.size = comm, comm.Get_rank(), comm.Get_size()
+        return wrapper
 
     # Allgather of array columns by machine code
 

@@ -20,13 +20,8 @@ def available_cores() -> int:
 def cores_per_process(process: int, allowed: Sequence[set[int]]) -> int:
     """Number of cores for one of several processes on a computer, at least 1.
 
-    A launcher may bind each process to different cores, or let all use all of them.
-
-    Parameters
-    ----------
-    process : int
-    allowed : sequence of set of int
-        For every process, the numbers of the cores that it may use.
+    A launcher may bind each process to different cores, or let all use all of them: ``allowed`` has
+    the numbers of the cores of every process.
 
     Examples
     --------

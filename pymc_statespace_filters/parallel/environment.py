@@ -10,15 +10,7 @@ from numba.core.registry import cpu_target
 
 from pymc_statespace_filters.errors import ParallelError, ParallelWarning
 
-_PACKAGES = (
-    "pymc-statespace-filters",
-    "pymc",
-    "pytensor",
-    "numba",
-    "llvmlite",
-    "numpy",
-    "scipy",
-)
+_PACKAGES = ("pymc-statespace-filters", "pymc", "pytensor", "numba", "llvmlite", "numpy", "scipy")
 _PROCESSOR = "processor"
 # Without the instructions of newer processors; no loss of speed was measured.
 _ADVICE = (
@@ -46,9 +38,9 @@ def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep:
     Parameters
     ----------
     reports : list of dict
-        The environment of every rank, by `describe_environment`.
+        `describe_environment` of every rank.
     rank : int
-        Of this process.
+        That of this process.
     in_lockstep : bool
         Whether several ranks evaluate one likelihood, so that their results must be bitwise equal.
         Otherwise each runs whole chains, which are correct in any environment.
@@ -69,7 +61,7 @@ def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep:
     found += "." + (_ADVICE if _PROCESSOR in found else "")
     if in_lockstep:
         raise ParallelError(
-            f"ranks that share a likelihood must have the same environment, got {found}"
+            f"ranks that evaluate one likelihood must have the same environment, got {found}"
         )
     if rank == 0:
         warnings.warn(
@@ -84,11 +76,11 @@ def _differences(reports: list[dict[str, str]]) -> list[str]:
     """For each property that differs between ranks, its values and their ranks."""
     differences = []
     for name in reports[0]:
-        holders: dict[str, list[int]] = {}
+        by_value: dict[str, list[int]] = {}
         for rank, report in enumerate(reports):
-            holders.setdefault(report[name], []).append(rank)
-        if len(holders) > 1:
-            values = (f"{value} on {_named(ranks)}" for value, ranks in holders.items())
+            by_value.setdefault(report[name], []).append(rank)
+        if len(by_value) > 1:
+            values = (f"{value} on {_named(ranks)}" for value, ranks in by_value.items())
             differences.append(f"{name} {', '.join(values)}")
     return differences
 

@@ -1,6 +1,6 @@
 """Access to MPI: the communicator for the argument ``comm``, with advice when it cannot be had.
 
-The only module that imports mpi4py, and only if a communicator is asked for.
+The only module that imports mpi4py, and only if a communicator is requested.
 """
 
 import os
@@ -14,20 +14,13 @@ WORLD = "world"
 # Variables with the number of ranks, set by the mpiexec of Open MPI, of MPICH and its derivatives,
 # of MVAPICH, and by SLURM's srun.
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
-# Set by any launcher that uses PMIx.
-_RANKS = ("PMIX_RANK",)
+_RANK = "PMIX_RANK"  # set by any launcher that uses PMIx
 # Modules that are loaded if the user's script, or `python -m mpi4py`, uses MPI.
 _MPI_MODULES = ("mpi4py.MPI", "mpi4py.run")
 
 
 def mpi() -> Any:
-    """Return the module ``mpi4py.MPI``.
-
-    Raises
-    ------
-    ParallelError
-        If mpi4py or an MPI library is missing.
-    """
+    """Return the module ``mpi4py.MPI``; a `ParallelError` if it or an MPI library is missing."""
     try:
         from mpi4py import MPI
     except ModuleNotFoundError as error:
@@ -38,24 +31,16 @@ def mpi() -> Any:
         raise ParallelError(
             f"mpi4py finds no MPI library ({str(error).splitlines()[0]}). Install one by "
             "`pip install 'pymc-statespace-filters[mpi]'` or `apt install openmpi-bin`; on a "
-            "cluster load its own first, as by `module load openmpi`."
+            "cluster load its MPI first, as by `module load openmpi`."
         ) from error
     return MPI
 
 
 def mpi_communicator(comm: Any) -> Any:
-    """Resolve the argument ``comm`` of public functions to a communicator of mpi4py.
+    """Resolve the argument ``comm`` of public functions to a communicator of mpi4py, or None.
 
-    Parameters
-    ----------
-    comm : None, "world", or mpi4py.MPI.Intracomm
-        "world" is all ranks that were started together, or this process alone if it was started
-        neither by mpiexec nor by ``python -m mpi4py``, in which case mpi4py is not imported.
-
-    Returns
-    -------
-    mpi4py.MPI.Intracomm or None
-        None stands for this process alone.
+    "world" is all ranks that were started together, or this process alone (None) if it was started
+    neither by mpiexec nor by ``python -m mpi4py``, in which case mpi4py is not imported.
 
     Raises
     ------
@@ -88,17 +73,11 @@ def mpi_communicator(comm: Any) -> Any:
 
 
 def check_threads() -> None:
-    """Check that several threads of this process may call MPI at once.
-
-    Raises
-    ------
-    ParallelError
-        If they may not.
-    """
+    """Raise a `ParallelError` unless several threads of this process may call MPI at once."""
     loaded = mpi()
     if loaded.Query_thread() < loaded.THREAD_MULTIPLE:
         raise ParallelError(
-            "Ranks that share a chain need an MPI that several threads may call at once "
+            "Ranks that run a chain together need an MPI that several threads may call at once "
             "(MPI_THREAD_MULTIPLE), but it was initialized for a lower thread level. Leave "
             "`mpi4py.rc.threads` and `mpi4py.rc.thread_level`, or the variables MPI4PY_RC_THREADS "
             "and MPI4PY_RC_THREAD_LEVEL, at their defaults; if they are, use another MPI library, "
@@ -109,7 +88,7 @@ def check_threads() -> None:
 def _was_launched() -> bool:
     return (
         any(module in sys.modules for module in _MPI_MODULES)
-        or any(name in os.environ for name in _RANKS)
+        or _RANK in os.environ
         or any(size > 1 for size in _launched_sizes().values())
     )
 

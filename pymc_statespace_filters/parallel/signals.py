@@ -15,11 +15,7 @@ def deferred_interrupts() -> Iterator[Event]:
     are never interrupted.
     """
     interrupted = Event()
-
-    def handle(*_: Any) -> None:
-        interrupted.set()
-
-    with _handled_by(handle):
+    with _handled_by(lambda *_: interrupted.set()):
         yield interrupted
 
 

@@ -33,10 +33,8 @@ def canvas(
 
     Parameters
     ----------
-    data : xarray.Dataset
-    backend : str or None
-    pc_kwargs : mapping
-        Keyword arguments of the public function.
+    data, backend, pc_kwargs
+        As in the public functions.
     aes : mapping of str to list of str
         Aesthetics and the dimensions that they encode.
     height : float

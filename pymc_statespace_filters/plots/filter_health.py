@@ -136,7 +136,8 @@ def plot_filter_health(
     )
     collection.map(band, "expected", data=expected, **EXPECTED)
     collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
-    collection.map(bars, "seen", data=_from_zero(seen[["autocorrelation"]]), width=2, **SEEN)
+    lags = seen[["autocorrelation"]]
+    collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
     collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
     legend = {"95 % if calibrated": {**EXPECTED, "width": 8}}
     if effective is not None:
@@ -233,10 +234,6 @@ def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataT
 def label_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
     """Set positions and labels of the ticks at the y axis."""
     backend_from_object(target).yticks(ticks["values"], ticks["labels"], target)
-
-
-def _from_zero(values: xr.Dataset) -> xr.Dataset:
-    return interval(xr.zeros_like(values), values)
 
 
 def _label_panels(collection: PlotCollection, data: xr.Dataset, time: xr.DataArray) -> None:

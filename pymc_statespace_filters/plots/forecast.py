@@ -7,11 +7,11 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
 
-from pymc_statespace_filters.plots.canvas import canvas
 from pymc_statespace_filters.plots.marks import (
     DATA,
     TRUTH,
     add_legend,
+    canvas_over_time,
     draw_bands,
     draw_bars,
     label_axes,
@@ -107,16 +107,7 @@ def plot_forecast(
     record = data_of(idata, name)
 
     data = draws.to_dataset(name="observations")
-    collection = canvas(
-        data,
-        backend=backend,
-        pc_kwargs=pc_kwargs,
-        aes={},
-        size=(7.0, 1.3 + 2.0 * len(observables) ** 0.9),
-        n_panels=len(observables),
-        panels_in_line=1,
-        cols=["observable"],
-    )
+    collection = canvas_over_time(data, "observable", backend=backend, pc_kwargs=pc_kwargs)
     legend = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
     if record is not None:
         past = record.tail(time=_n_past(record, draws) if n_past is None else n_past)

@@ -11,7 +11,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, labelled_y
 
-from pymc_statespace_filters.plots.canvas import BOUND, band, curve, interval
+from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, interval
 from pymc_statespace_filters.plots.results import SAMPLE_DIMS
 
 # Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
@@ -24,6 +24,23 @@ MAX_IN_LINE = 5  # legend entries
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
+
+
+def canvas_over_time(
+    data: xr.Dataset, dim: str, *, backend: str | None, pc_kwargs: Mapping[str, Any]
+) -> PlotCollection:
+    """Make a figure with one panel per entry of `dim`, below each other."""
+    n_panels = data.sizes[dim]
+    return canvas(
+        data,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={},
+        size=(7.0, 1.3 + 2.0 * n_panels**0.9),
+        n_panels=n_panels,
+        panels_in_line=1,
+        cols=[dim],
+    )
 
 
 def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:

@@ -22,12 +22,9 @@ from pymc_statespace_filters.plots.marks import (
 )
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
-    are_paths,
-    group_of,
-    rename_last_dims,
     select_names,
+    states_of,
     truth_of,
-    variable_of,
 )
 from pymc_statespace_filters.system.checks import check_count
 
@@ -100,10 +97,7 @@ def plot_phase(
     >>> loop.savefig("loop.png")  # doctest: +SKIP
     """
     check_count("n_draws", n_draws, 0)
-    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
-    group, results = group_of(idata, *groups)
-    name = variable_of(results, var_name, "_states")
-    states = rename_last_dims(results[f"{name}_states"], "time", "state")
+    _, states, _, are_paths = states_of(idata, group, var_name)
     both = [_quantity("x", x, states), _quantity("y", y, states)]
     sizes = [dict(quantity.sizes) for quantity in both]
     if sizes[0] != sizes[1]:
@@ -114,8 +108,8 @@ def plot_phase(
     collection = canvas(data, backend=backend, pc_kwargs=pc_kwargs, aes={}, size=(6.0, 5.0))
     legend = {}
     if n_draws:
-        mark, style = (path_xy, PATHS) if are_paths(group, results) else (points_xy, DOTS)
-        style = {**style, "alpha": 0.25}  # the median must stand out
+        mark, style = (path_xy, PATHS) if are_paths else (points_xy, DOTS)
+        style = {**style, "alpha": 0.25}  # paler than the median
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
         legend["draws"] = {**PATHS, "width": 1.5}
     median = over_draws(data).sel(quantile=0.5)

@@ -1,7 +1,7 @@
 """Read and check the inputs of plots of states: groups, variables, observations, the truth."""
 
 from collections.abc import Hashable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -51,9 +51,23 @@ def data_of(idata: xr.DataTree, name: str) -> xr.DataArray | None:
     return None if record is None else rename_last_dims(record, "time", "observable")
 
 
-def are_paths(group: str, results: xr.Dataset) -> bool:
-    """Whether the draws are joint paths at every step, which may be drawn as lines."""
-    return group != "filtered_states" and results.attrs.get("at") != "observations"
+class States(NamedTuple):
+    """The drawn states of a StateSpace variable."""
+
+    name: str
+    draws: xr.DataArray  # dimensions (chain, draw, time, state)
+    at_observations: bool  # at observation times only
+    are_paths: bool  # joint paths at every step, which may be drawn as lines
+
+
+def states_of(idata: Any, group: str | None, var_name: str | None) -> States:
+    """Read the states of a group, by default the smoothed ones if there are any."""
+    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
+    group, results = group_of(idata, *groups)
+    name = variable_of(results, var_name, "_states")
+    draws = rename_last_dims(results[f"{name}_states"], "time", "state")
+    at_observations = results.attrs.get("at") == "observations"
+    return States(name, draws, at_observations, group != "filtered_states" and not at_observations)
 
 
 def select_names(argument: str, names: Any, available: Sequence[str]) -> list[str]:
@@ -75,20 +89,11 @@ def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -
 def truth_of(
     truth: Any, simulated: str, along: str, names: Sequence[str], times: np.ndarray
 ) -> xr.DataArray:
-    """Return the user's `truth` with dimensions "time" and `along`.
+    """Return the user's `truth` with dimensions "time" and `along` ("state" or "observable").
 
-    Parameters
-    ----------
-    truth : xarray.Dataset, xarray.DataArray or array_like
-        Result of `simulate`; array with the dimension `along` and another whose coordinate is time;
-        or array of shape (len(times), len(names)).
-    simulated : str
-        The variable of a result of `simulate`.
-    along : {"state", "observable"}
-    names : sequence of str
-        Names in the results, in order.
-    times : numpy.ndarray
-        Times of the results.
+    It is a result of `simulate`, of which the variable `simulated` is taken; an array with the
+    dimension `along` and another whose coordinate is time; or an array of shape (times, names),
+    those of the results.
     """
     if isinstance(truth, xr.Dataset):
         if simulated not in truth:

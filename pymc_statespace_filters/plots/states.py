@@ -7,13 +7,14 @@ import xarray as xr
 from arviz_plots import PlotCollection
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import canvas, curve
+from pymc_statespace_filters.plots.canvas import curve
 from pymc_statespace_filters.plots.marks import (
     DATA,
     DOTS,
     PATHS,
     TRUTH,
     add_legend,
+    canvas_over_time,
     draw_bands,
     draw_bars,
     label_axes,
@@ -23,14 +24,11 @@ from pymc_statespace_filters.plots.marks import (
     thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
-    are_paths,
     check_names,
     data_of,
-    group_of,
-    rename_last_dims,
     select_names,
+    states_of,
     truth_of,
-    variable_of,
 )
 from pymc_statespace_filters.system.checks import check_count
 
@@ -105,10 +103,7 @@ def plot_states(
     >>> collection.savefig("states.png")  # doctest: +SKIP
     """
     check_count("n_draws", n_draws, 0)
-    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
-    group, results = group_of(idata, *groups)
-    name = variable_of(results, var_name, "_states")
-    draws = rename_last_dims(results[f"{name}_states"], "time", "state")
+    name, draws, at_observations, are_paths = states_of(idata, group, var_name)
     all_states = [str(state) for state in draws["state"].values]
     shown = select_names("states", states, all_states)
     record = _record(idata, name, observables, all_states)
@@ -118,22 +113,11 @@ def plot_states(
         truth = truth.where((truth["time"] >= begin) & (truth["time"] <= end), drop=True)
 
     data = draws.sel(state=shown).to_dataset(name="states")
-    collection = canvas(
-        data,
-        backend=backend,
-        pc_kwargs=pc_kwargs,
-        aes={},
-        size=(7.0, 1.3 + 2.0 * len(shown) ** 0.9),
-        n_panels=len(shown),
-        panels_in_line=1,
-        cols=["state"],
-    )
+    collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
     if n_draws:
-        mark, style = (paths, PATHS) if are_paths(group, results) else (points, DOTS)
+        mark, style = (paths, PATHS) if are_paths else (points, DOTS)
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
-    legend = (draw_bars if results.attrs.get("at") == "observations" else draw_bands)(
-        collection, data
-    )
+    legend = (draw_bars if at_observations else draw_bands)(collection, data)
     if truth is not None:
         true = truth.reindex(state=shown).to_dataset(name="truth")
         collection.map(curve, "truth", data=true, **TRUTH)

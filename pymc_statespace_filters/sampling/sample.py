@@ -113,7 +113,7 @@ def sample_dram(
     ------
     ModelError
         If an argument is not as described, a free variable is discrete, the log-density draws
-        random numbers of its own, or no starting point with finite log-density is found.
+        random numbers, or no starting point with finite log-density is found.
     DataMismatchError
         If the checkpoint belongs to a run with other arguments, another model or other data, if
         ranks differ in these, or if the pilot does not have the parameters of the model.

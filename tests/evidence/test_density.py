@@ -72,7 +72,7 @@ def test_no_points_no_values(noisy):
 
 def test_the_watch_hears_of_every_point(noisy, points, monkeypatch):
     counts = []
-    monkeypatch.setattr(noisy, "on_progress", counts.append)
+    monkeypatch.setattr(noisy.calls, "on_progress", counts.append)
     noisy.evaluate(*points)
     assert sum(counts) == 23
 

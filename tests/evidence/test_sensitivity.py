@@ -207,7 +207,9 @@ class TestWhatIsRefused:
 
     def test_a_model_of_other_draws(self):
         line, plane = Rival(2, 1), Rival(3, 2)
-        with pytest.raises(DataMismatchError, match=r"'w' has shape \(3,\) in the model"):
+        with pytest.raises(
+            DataMismatchError, match=r"'w' in idata must have the model's shape \(3,\)"
+        ):
             prior_sensitivity({"line": line.idata}, models={"line": plane.model})
 
     def test_a_table_of_something_else(self):

@@ -179,7 +179,7 @@ class TestParts:
         alive = np.isfinite(log_likelihood).sum()
         effective = weights.sum() ** 2 / (weights**2).sum()
         assert 0 < raised < 1
-        assert effective / alive == pytest.approx(tempered_smc.ESS_SHARE, rel=1e-4)
+        assert effective / alive == pytest.approx(tempered_smc.ESS_FRACTION, rel=1e-4)
 
     def test_the_last_temperature_is_one(self):
         assert next_temperature(0.3, np.array([-1.0, -1.01, -1.02])) == 1.0

@@ -68,4 +68,4 @@ def test_a_rank_that_fails_in_an_evaluation_ends_the_job(alone, rank):
     assert done.status != 0
     assert "MemoryError: not enough for all members" in done.stderr
     if rank == 1:
-        assert "on rank 1 of the 2 that share a chain" in done.stderr
+        assert "on rank 1 of the 2 that run a chain together" in done.stderr

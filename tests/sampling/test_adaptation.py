@@ -8,7 +8,7 @@ import pymc as pm
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.sampling.kernel.adaptation import STALLED, AdaptationSettings, learn
+from pymc_statespace_filters.sampling.kernel.adaptation import STALLED, learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     pack,
     packed_size,
@@ -21,16 +21,16 @@ from pymc_statespace_filters.sampling.target.target import Target
 
 
 @njit
-def learn_from(settings, continuous, state, position, stage):
-    learn(settings, continuous, state, position, stage)
+def learn_from(adapt_every, continuous, state, position, stage):
+    learn(adapt_every, continuous, state, position, stage)
 
 
-def adapted(continuous, settings, state, position, stage):
+def adapted(continuous, adapt_every, state, position, stage):
     """What is learnt from an iteration, by a state of its own."""
     dim = len(state.cov)
     packed = np.empty(packed_size(dim))
     pack(state, packed)
-    learn_from(settings, continuous, unpack(packed, dim), np.asarray(position), stage)
+    learn_from(adapt_every, continuous, unpack(packed, dim), np.asarray(position), stage)
     return unpack(packed, dim)
 
 
@@ -39,12 +39,12 @@ adapt_continuously = partial(adapted, True)
 BOTH = pytest.mark.parametrize(
     "adapt", [adapt_by_blocks, adapt_continuously], ids=["chain", "continuous"]
 )
-SETTINGS = AdaptationSettings(adapt_every=100)
+ADAPT_EVERY = 100
 
 
 def feed(adapt, state, positions, stages):
     for position, stage in zip(positions, stages, strict=True):
-        state = adapt(SETTINGS, state, position, int(stage))
+        state = adapt(ADAPT_EVERY, state, position, int(stage))
     return state
 
 
@@ -104,7 +104,7 @@ def test_blocks_change_nothing_between_their_ends():
     state = start_adaptation(np.eye(2))
     changes = []
     for k, position in enumerate(positions, start=1):
-        after = adapt_by_blocks(SETTINGS, state, position, 1)
+        after = adapt_by_blocks(ADAPT_EVERY, state, position, 1)
         if not np.array_equal(after.cov, state.cov):
             changes.append(k)
         state = after
@@ -144,7 +144,7 @@ def test_the_state_handed_in_is_not_touched(adapt):
     rng = np.random.default_rng(5)
     state = feed(adapt, start_adaptation(np.eye(2)), rng.normal(size=(99, 2)), np.ones(99))
     copies = [a.copy() for a in (state.cov, state.chol, state.block.mean, state.block.scatter)]
-    adapt(SETTINGS, state, rng.normal(size=2), 1)
+    adapt(ADAPT_EVERY, state, rng.normal(size=2), 1)
     for kept, copy in zip(
         (state.cov, state.chol, state.block.mean, state.block.scatter), copies, strict=True
     ):

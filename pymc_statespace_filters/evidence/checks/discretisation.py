@@ -35,8 +35,8 @@ LOSS = 5.0  # nats per point, by halving the steps
 # Nats per observed scalar. A linear state without overshooting loses at most 0.12, at 1 + a h = 0.
 LOSS_OF_A_SCALAR = 0.15
 BEYOND = 1.5  # factor by which the draws are spread about their mean, to probe beyond them
-MIN_SHARE = 0.05
-MIN_SEPARATION = 0.9  # share of pairs that a parameter must order alike to be named
+MIN_BEYOND = 0.05  # fraction of the posterior
+MIN_SEPARATION = 0.9  # fraction of pairs that a parameter must order alike to be named
 
 Array = NDArray[np.float64]
 
@@ -76,14 +76,14 @@ def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> I
         )
     # The draws have density coarse(x): these weights turn them to the posterior of half the step.
     usable = np.isfinite(coarse_x)
-    share = (
+    unstable = (
         softmax((fine_beyond - coarse_x)[usable])
         @ (overshoots[len(x) :] & (gained > limit))[usable]
     )
-    if share > MIN_SHARE:
+    if unstable > MIN_BEYOND:
         yield (
             "the posterior ends where the integration steps become unstable: with steps half as "
-            f"long about {share:.0%} of it would lie beyond; raise substeps, or give a narrower "
+            f"long about {unstable:.0%} of it would lie beyond; raise substeps, or give a narrower "
             "prior"
         )
 
@@ -116,10 +116,10 @@ def _scalars(
 
 
 def _separation(values: Array, affected: NDArray[np.bool_]) -> float:
-    """Share of pairs, one affected and one not, that are ordered alike by the values (AUC)."""
+    """Fraction of pairs, one affected and one not, that are ordered alike by the values (AUC)."""
     n, m = affected.sum(), (~affected).sum()
-    share = (rankdata(values)[affected].sum() - n * (n + 1) / 2) / (n * m)
-    return float(max(share, 1 - share))
+    auc = (rankdata(values)[affected].sum() - n * (n + 1) / 2) / (n * m)
+    return float(max(auc, 1 - auc))
 
 
 def _range(values: Array) -> str:

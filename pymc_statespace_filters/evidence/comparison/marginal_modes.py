@@ -74,12 +74,12 @@ def marginal_modes(
         )
     posteriors = {name: _posterior(name, idata) for name, idata in models.items()}
     names = [var_names] if isinstance(var_names, str) else list(var_names or [])
-    held = dict.fromkeys(name for posterior in posteriors.values() for name in posterior.data_vars)
-    if unknown := [name for name in names if name not in held]:
+    known = dict.fromkeys(name for posterior in posteriors.values() for name in posterior.data_vars)
+    if unknown := [name for name in names if name not in known]:
         raise ModelError(
-            f"var_names must be among {list(held)}, the variables of the posteriors, got {unknown}"
+            f"var_names must be among {list(known)}, the variables of the posteriors, got {unknown}"
         )
-    rows = [_modes(posterior, names or held) for posterior in posteriors.values()]
+    rows = [_modes(posterior, names or known) for posterior in posteriors.values()]
     return pd.DataFrame(rows, index=pd.Index(posteriors, name="model"))
 
 

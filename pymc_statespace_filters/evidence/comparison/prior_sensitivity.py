@@ -4,8 +4,8 @@ The model probabilities of the thesis depend strongly on its correction for the 
 (after Eq. 3.7), and on the priors. These curves show both.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -36,6 +36,7 @@ WIDTHS = np.geomspace(0.25, 4, 17)
 REQUIRED_COLUMNS = ("log_evidence", "se", "n_parameters", "n_observations", "prior")
 
 Array = NDArray[np.float64]
+Reweighting = Callable[[float], ReweightedEvidence]
 
 
 def prior_sensitivity(
@@ -89,7 +90,7 @@ def prior_sensitivity(
         below 100, if the Pareto shape k is above 0.5 (the posterior is nearly as wide as the prior,
         and the mean of the weights has no standard error), or if more than 2 per cent of the
         evidence may lie outside the bounds of the original prior, where there are no draws.
-        ``width_beyond`` is an upper bound of that share, from the draws in the outermost 5 per cent
+        ``width_beyond`` is an upper bound of that part, from the draws in the outermost 5 per cent
         of a bounded support, provided that likelihood and prior do not increase outwards from
         there. Where one evidence is NaN, the probabilities of all models are.
 
@@ -134,10 +135,11 @@ def prior_sensitivity(
         raise ModelError(
             "models must be given with widths or var_names: the pm.Model of each idata"
         )
-    drawn = None if models is None else _drawn(evidences, models, list(table.index), var_names)
+    names = list(table.index)
+    reweighted = None if models is None else _reweightings(evidences, models, names, var_names)
     found = _over_exponents(table, alphas, ci_prob)
-    if drawn is not None:
-        found = found.merge(_over_widths(table, drawn, factors, ci_prob))
+    if reweighted is not None:
+        found = found.merge(_over_widths(table, reweighted, factors, ci_prob))
     return found.assign_attrs(ci_prob=ci_prob)
 
 
@@ -150,9 +152,9 @@ def _over_exponents(table: pd.DataFrame, exponents: Array, ci_prob: float) -> xr
 
 
 def _over_widths(
-    table: pd.DataFrame, drawn: Mapping[str, "_Drawn"], widths: Array, ci_prob: float
+    table: pd.DataFrame, reweighted: Mapping[str, Reweighting], widths: Array, ci_prob: float
 ) -> xr.Dataset:
-    found = [[drawn[name].reweighted(width) for width in widths.tolist()] for name in table.index]
+    found = [[reweighted[name](width) for width in widths.tolist()] for name in table.index]
     known = np.array([[one.is_reliable for one in of_model] for of_model in found])
     ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
     log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
@@ -217,25 +219,13 @@ def _table(
     return evidences.assign(prior=prior_weights(prior, list(evidences.index)))
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Draws of a model, and its priors to be scaled (None if it has none of them)."""
-
-    posterior: xr.Dataset
-    priors: ScaledPrior | None
-
-    def reweighted(self, width: float) -> ReweightedEvidence:
-        if self.priors is None:
-            return UNCHANGED
-        return self.priors.reweighted(self.posterior, width)
-
-
-def _drawn(
+def _reweightings(
     evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     models: Mapping[str, pm.Model],
     names: list[str],
     var_names: str | Iterable[str] | None,
-) -> dict[str, _Drawn]:
+) -> dict[str, Reweighting]:
+    """For each model, the function from a width to the evidence under its scaled priors."""
     if not (
         isinstance(models, Mapping)
         and set(models) == set(names)
@@ -250,12 +240,15 @@ def _drawn(
         )
     free = {name: [rv.name for rv in models[name].free_RVs] for name in names}
     chosen = [var_names] if isinstance(var_names, str) else list(var_names or [])
-    if unknown := [one for one in chosen if not any(one in held for held in free.values())]:
+    if unknown := [one for one in chosen if not any(one in of_model for of_model in free.values())]:
         raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
-    found = {}
+    found: dict[str, Reweighting] = {}
     for name in names:
         unconstrained_draws(idatas[name], models[name])  # checks that draws and model match
         scaled = [one for one in free[name] if not chosen or one in chosen]
-        priors = ScaledPrior(models[name], scaled) if scaled else None
-        found[name] = _Drawn(idatas[name]["posterior"].to_dataset(), priors)
+        if scaled:
+            priors, posterior = ScaledPrior(models[name], scaled), idatas[name]["posterior"]
+            found[name] = partial(priors.reweighted, posterior.to_dataset())
+        else:
+            found[name] = lambda width: UNCHANGED
     return found

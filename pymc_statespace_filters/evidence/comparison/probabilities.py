@@ -52,11 +52,11 @@ def prior_weights(prior: Mapping[str, float] | None, names: list[str]) -> Array:
         weights = np.array([prior[name] for name in names], dtype=np.float64)
     except (TypeError, ValueError):
         weights = np.array(np.nan)
-    # Divide by the largest first: the sum may overflow. Shares may still underflow to zero.
-    share = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
-    if not (np.isfinite(weights).all() and (share > 0).all()):
+    # Divide by the largest first: the sum may overflow. Ratios may still underflow to zero.
+    ratios = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
+    if not (np.isfinite(weights).all() and (ratios > 0).all()):
         raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
-    return share / share.sum()
+    return ratios / ratios.sum()
 
 
 def check_ci_prob(ci_prob: float) -> None:
@@ -70,16 +70,7 @@ def select_evidences(
 ) -> dict[str, Evidence]:
     """Select one evidence for each model, and check that all belong to the same data.
 
-    Parameters
-    ----------
-    given : mapping of str to Evidence, mapping of estimators to Evidence, or xarray.DataTree
-        By model.
-    estimator : str, optional
-        Name of the estimator; may be omitted if a model has only one evidence.
-
-    Returns
-    -------
-    dict of str to Evidence
+    The name of the estimator may be omitted if each model has only one evidence.
 
     Raises
     ------

@@ -34,7 +34,7 @@ from pymc_statespace_filters.evidence.log_mean import (
 )
 from pymc_statespace_filters.evidence.posterior.support import can_sample
 
-EDGE = 0.05  # share of a bounded support, at each end
+EDGE = 0.05  # fraction of a bounded support, at each end
 # Limits beyond which the reweighted evidence is unreliable.
 MAX_PARETO_K = 0.5  # above, the weights have no variance and their mean no standard error
 MAX_BEYOND = 0.02
@@ -43,25 +43,13 @@ Array = NDArray[np.float64]
 
 
 class ReweightedEvidence(NamedTuple):
-    """The evidence under scaled priors relative to that under the original ones.
+    """The evidence under scaled priors relative to that under the original ones."""
 
-    Attributes
-    ----------
-    log_ratio, error : float
-        ln Z_w - ln Z and its standard error.
-    n_effective : float
-        Effective number of draws: of independent terms of relative variance one.
-    pareto_k : float
-        Shape of the upper tail of the weights.
-    beyond : float
-        Upper bound of the share of Z_w where the original prior is zero.
-    """
-
-    log_ratio: float
-    error: float
-    n_effective: float
-    pareto_k: float
-    beyond: float
+    log_ratio: float  # ln Z_w - ln Z
+    error: float  # its standard error
+    n_effective: float  # effective number of draws: of independent terms of relative variance one
+    pareto_k: float  # shape of the upper tail of the weights
+    beyond: float  # upper bound of the fraction of Z_w where the original prior is zero
 
     @property
     def is_reliable(self) -> bool:
@@ -78,12 +66,6 @@ UNCHANGED = ReweightedEvidence(0.0, 0.0, np.inf, -np.inf, 0.0)
 
 class ScaledPrior:
     """The priors of some free variables of a model, scaled by a common factor.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    names : iterable of str
-        The variables.
 
     Raises
     ------
@@ -114,15 +96,7 @@ class ScaledPrior:
         )
 
     def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
-        """Compute the evidence under the scaled priors.
-
-        Parameters
-        ----------
-        posterior : xarray.Dataset
-            Constrained draws of all free variables.
-        width : float
-            w.
-        """
+        """Compute the evidence under priors scaled by ``width``, from draws of all variables."""
         shape = posterior.sizes["chain"], posterior.sizes["draw"]
         rows = [
             np.concatenate(posterior[name].transpose("chain", "draw", ...).values).astype(dtype)
@@ -134,23 +108,16 @@ class ScaledPrior:
 
 
 def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
-    """Average the ratios p_w / p of draws (chain, draw), with diagnostics.
-
-    Parameters
-    ----------
-    log_ratio : ndarray (chain, draw)
-    beyond : ndarray
-        As many values of `_beyond`.
-    """
+    """Average the ratios p_w / p of draws (chain, draw), with diagnostics from their `_beyond`."""
     peak = log_ratio.max()
     if np.isneginf(peak):
         return ReweightedEvidence(-np.inf, np.inf, 0.0, np.inf, 0.0)
-    beyond_share = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
+    fraction = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
     if np.ptp(log_ratio) < SAME:  # a wider Uniform prior: all weights are equal
-        return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, beyond_share)
+        return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, fraction)
     mean = log_mean_of_chains(log_ratio)
     return ReweightedEvidence(
-        mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), beyond_share
+        mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), fraction
     )
 
 
@@ -201,10 +168,10 @@ def _beyond(
     centre: TensorVariable,
     width: TensorVariable,
 ) -> TensorVariable:
-    """Bound the share that a wider prior adds outside a bounded support, where there are no draws.
+    """Bound the fraction that a wider prior adds outside a bounded support, without draws there.
 
     If neither the likelihood nor the prior increases outwards from the `EDGE` of the support, the
-    share is at most that of the draws in the edge, times the number of edges that fit outside.
+    fraction is at most that of the draws in the edge, times the number of edges that fit outside.
     """
     length = upper - lower
     n_edges = pt.maximum(width - 1, 0) / EDGE

@@ -188,14 +188,9 @@ def _walk(
 ) -> Run:
     """Sample the free coordinates given the others, by independent Metropolis walkers.
 
-    A proposal rotates a walker by a random angle towards a new draw of N(centre, I), which leaves
+    The walkers start at y (walker, k), resampled from the previous run with the stored estimates. A
+    proposal rotates a walker by a random angle towards a new draw of N(centre, I), which leaves
     N(centre, I) invariant: large angles suit a nearly Gaussian posterior, small ones any other.
-
-    Parameters
-    ----------
-    target : callable
-    y, log_density : ndarray (walker, k), (walker,)
-        Starting points with their stored estimates, resampled from the previous run.
     """
     n_kept = -(-n_draws // len(y))
     kept_y, kept_log_density, n_moves = [], [], 0.0

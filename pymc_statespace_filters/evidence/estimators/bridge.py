@@ -50,7 +50,6 @@ from scipy.optimize import brentq
 from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
-from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.whitening import moments
 from pymc_statespace_filters.evidence.log_mean import (
@@ -59,7 +58,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 
 FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, in both halves
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # the error of `MIN_EFFECTIVE` terms of relative variance one
@@ -146,11 +145,7 @@ class Bridge:
             averaged = averaged.thinned(MOST_TERMS // 2)
             pooled = (mean, pooled[1])  # the reflection was about this mean
         at_proposals = self._warp(averaged, proposals, at_proposals, mean, rng)
-        if np.isneginf(at_proposals).all():
-            raise DataMismatchError(
-                f"all {n_proposals} proposals around the draws have zero density: idata belongs "
-                "to another model or to other data"
-            )
+        check_overlap(at_proposals)
         draws = averaged.draws.reshape(-1, len(mean))
         at_draws = self._warp(averaged, draws, averaged.log_density.ravel(), mean, rng)
         shape = averaged.log_density.shape
@@ -181,9 +176,9 @@ class _Fold:
     log_evidence: float
     draws: LogMean
     proposals: LogMean
-    common: float  # part of the draws' error that the two halves share
+    common: float  # part of the draws' error that is common to both halves
     n_effective: float  # effective number of draws
-    zero_density: float  # share of the proposals
+    zero_density: float  # fraction of the proposals
 
 
 def _bridge(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
@@ -221,10 +216,10 @@ def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float
         lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
         return float(upper - lower - log_odds)
 
-    # The evidence lies within the ratios, lowered at most by the share of zero-density proposals.
+    # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
     possible = at_proposals[~np.isneginf(at_proposals)]
-    share = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
-    least = min(at_draws.min(), possible.min()) + share - 1
+    log_fraction = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
+    least = min(at_draws.min(), possible.min()) + log_fraction - 1
     most = max(at_draws.max(), possible.max()) + 1
     return float(brentq(excess, least, most, xtol=1e-9))
 

@@ -39,7 +39,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.block_ordinates import (
     BlockEstimate,
     estimate_in_blocks,
@@ -56,7 +56,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 from pymc_statespace_filters.system.checks import check_count
 
 MIN_PROPOSALS = 100
@@ -146,7 +146,7 @@ class OneBlockEstimate:
     scale: float
     numerator: LogMean
     denominator: LogMean
-    zero_density: float  # share of the proposals
+    zero_density: float  # fraction of the proposals
 
     @property
     def se(self) -> float:
@@ -164,17 +164,11 @@ def estimate_in_one_block(
     )
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
-    log_alpha = proposal.log_alpha_from_center(
-        posterior.evaluate(proposal.sample(n_proposals, rng), rng)
-    )
-    denominator = log_mean_of_independent(log_alpha)
-    if np.isneginf(denominator.value):
-        raise DataMismatchError(
-            f"all {n_proposals} proposals around the draws have zero density: idata belongs to "
-            "another model or to other data"
-        )
+    log_density = posterior.evaluate(proposal.sample(n_proposals, rng), rng)
+    check_overlap(log_density)
+    denominator = log_mean_of_independent(proposal.log_alpha_from_center(log_density))
     log_evidence = proposal.log_density - numerator.value + denominator.value
-    zero_density = float(np.isneginf(log_alpha).mean())
+    zero_density = float(np.isneginf(log_density).mean())
     return OneBlockEstimate(log_evidence, proposal.scale, numerator, denominator, zero_density)
 
 

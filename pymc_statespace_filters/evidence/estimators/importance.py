@@ -21,7 +21,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
 from pymc_statespace_filters.evidence.log_mean import (
@@ -29,7 +28,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_independent,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 
 FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000
 MAX_PARETO_K = 0.7
@@ -60,11 +59,7 @@ class Importance:
         q = choose_mixture(posterior, rng)
         proposals = q.sample(n_proposals, rng)
         log_density = posterior.evaluate(proposals, rng)
-        if np.isneginf(log_density).all():
-            raise DataMismatchError(
-                f"all {n_proposals} proposals around the draws have zero density: idata belongs "
-                "to another model or to other data"
-            )
+        check_overlap(log_density)
         log_weights = log_density - q.log_density(proposals)
         evidence = log_mean_of_independent(log_weights)
         tail = pareto_k(log_weights)

@@ -22,23 +22,16 @@ N_SIMPLEX = 200  # evaluations per parameter of a simplex search along an edge
 # For noisy likelihoods: fresh estimates per candidate to select the best, and to evaluate it.
 N_CHOOSING, N_VALUING = 40, 100
 N_EVALUATIONS = 6 * N_CHOOSING + N_VALUING
-N_NEIGHBOURS, N_THINNED, SHARE_NEAR = 30, 2000, 0.2
+N_NEIGHBOURS, N_THINNED, FRACTION_NEAR = 30, 2000, 0.2
 
 Array = NDArray[np.float64]
 
 
 class MaximumLikelihood(NamedTuple):
-    """The largest log-likelihood found, and its point.
-
-    Attributes
-    ----------
-    log_likelihood : float
-    point : ndarray (k,)
-        Unconstrained.
-    """
+    """The largest log-likelihood found, and its point."""
 
     log_likelihood: float
-    point: Array
+    point: Array  # (k,), unconstrained
 
 
 def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> MaximumLikelihood:
@@ -55,17 +48,6 @@ def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> Maximu
     is evaluated by further ones, independent of the selection. The value is therefore the
     likelihood at a point near the maximum, an unbiased average of `N_VALUING` estimates; it lies
     below the maximum by the misfit of the quadratic.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        With its prior.
-    rng : numpy.random.Generator
-        Seeds the noise of the likelihood.
-
-    Returns
-    -------
-    MaximumLikelihood
     """
     coordinates = moments_within_chains(posterior.draws)
 
@@ -133,7 +115,7 @@ def _candidates(draws: Array, values: Array) -> Array:
     _, neighbours = KDTree(draws[thinned]).query(draws[thinned], min(N_NEIGHBOURS, len(thinned)))
     dense = draws[thinned[values[thinned][neighbours].mean(axis=1).argmax()]]
     distance = np.linalg.norm(draws - dense, axis=1)
-    near = distance <= np.quantile(distance, SHARE_NEAR)
+    near = distance <= np.quantile(distance, FRACTION_NEAR)
     fitted = (*_quadratic_maxima(draws, values), *_quadratic_maxima(draws[near], values[near]))
     return np.stack([np.zeros_like(dense), dense, *fitted])
 

@@ -80,16 +80,10 @@ def plan_proposal(
 ) -> ProposalPlan:
     """Choose x*, the scale s and the number of proposals for the smallest predicted error.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        Not the draws to be averaged: a plan fitted to them would bias the estimate.
-    n_proposals : int, optional
-        By default the number for which the denominator's error is a third of the numerator's, or
-        negligible. It is fixed before the first proposal is drawn, so that there is no optional
-        stopping.
-    most : int
-        Upper bound of the default.
+    The draws must not be those to be averaged: a plan fitted to them would bias the estimate. By
+    default the number of proposals is that for which the denominator's error is a third of the
+    numerator's, or negligible, and at most ``most``. It is fixed before the first proposal is
+    drawn, so that there is no optional stopping.
     """
     candidates = _candidates(posterior, rng)
     log_evidence = _pilot(posterior, rng)

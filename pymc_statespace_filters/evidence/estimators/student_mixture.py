@@ -23,7 +23,7 @@ MIN_GAIN = 0.02  # in the log of the weights' second moment, to accept a further
 PATIENCE = 2  # further numbers of components tried after the best
 MOST_FITTED = 4000  # draws used for the fit
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
-WIDE_SHARE, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
+WIDE_WEIGHT, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class StudentMixture:
         """Add a component wider than the standardised draws."""
         k = self.means.shape[-1]
         return StudentMixture(
-            np.append((1 - WIDE_SHARE) * self.weights, WIDE_SHARE),
+            np.append((1 - WIDE_WEIGHT) * self.weights, WIDE_WEIGHT),
             np.concatenate([self.means, np.zeros((1, k))]),
             np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
         )

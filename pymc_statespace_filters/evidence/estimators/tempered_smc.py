@@ -9,14 +9,14 @@ temperature :math:`\beta` increases from 0 to 1. At each stage they are weighted
 
     \hat p(D) = \prod_t \frac{1}{N} \sum_{i=1}^N L(x_i)^{\beta_{t+1} - \beta_t},
 
-which is unbiased for any moves (Del Moral, Doucet and Jasra 2006). Several runs share the
+which is unbiased for any moves (Del Moral, Doucet and Jasra 2006). Several runs have the same
 temperatures, chosen for all particles together; proposals are fitted to the particles of other
 runs. The evidences of the runs are averaged, not their logarithms, and their spread gives the
 error.
 
-The next temperature is that at which the effective sample size has fallen to a given share (Jasra,
-Stephens, Doucet and Tsagaris 2011). The particles are moved until a further move hardly increases
-their distance from the starting points.
+The next temperature is that at which the effective sample size has fallen to a given fraction
+(Jasra, Stephens, Doucet and Tsagaris 2011). The particles are moved until a further move hardly
+increases their distance from the starting points.
 
 With a noisy likelihood an estimate is made when a point is proposed and stored with it; L and its
 powers denote the stored estimate. On the space of points x and noise u, with density g(u) and
@@ -51,8 +51,8 @@ from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from pymc_statespace_filters.system.checks import check_count, is_integer
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
-ESS_SHARE = 0.85  # left by a step of the temperature; longer steps miss tails
-# Move until the squared distance from the start grows by less than a share of itself.
+ESS_FRACTION = 0.85  # left by a step of the temperature; longer steps miss tails
+# Move until the squared distance from the start grows by less than a fraction of itself.
 MIN_MOVES, MAX_MOVES, MIN_GAIN = 2, 50, 0.1
 ACCEPTANCE = 0.25  # target rate of the random walk
 SCALES = (0.1, 2.0)  # bounds for the random walk, relative to the optimum for a Gaussian
@@ -132,16 +132,16 @@ class TemperedSMC:
 
 
 def next_temperature(temperature: float, log_likelihood: Array) -> float:
-    """The temperature at which the effective sample size has fallen to `ESS_SHARE`; at most one.
+    """The temperature at which the effective sample size has fallen to `ESS_FRACTION`; at most one.
 
-    The share refers to particles of positive likelihood: all others are lost at the first step,
+    The fraction refers to particles of positive likelihood: all others are lost at the first step,
     however small.
     """
     alive = log_likelihood[np.isfinite(log_likelihood)]
 
     def surplus(step: float) -> float:
         log_effective = 2 * logsumexp(step * alive) - logsumexp(2 * step * alive)
-        return math.exp(log_effective) / len(alive) - ESS_SHARE
+        return math.exp(log_effective) / len(alive) - ESS_FRACTION
 
     if surplus(1 - temperature) >= 0:
         return 1.0

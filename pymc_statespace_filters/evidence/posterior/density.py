@@ -5,8 +5,6 @@ noise seeds of its estimate, so that the values depend neither on the order nor 
 threads.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -26,18 +24,15 @@ Array = NDArray[np.float64]
 class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    output : TensorVariable
-        Scalar graph of the model's value variables; the noise seeds become arguments.
+    ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
 
     Attributes
     ----------
     seed_names : tuple of str
         Names of the noisy state-space variables, in the order of the columns of a seed array.
     model_seeds : ndarray of int64
-        The seeds that the model holds for them.
+        The model's seeds for them.
+    calls : ParallelMap
     """
 
     def __init__(self, model: pm.Model, output: TensorVariable) -> None:
@@ -52,16 +47,7 @@ class RowFunction:
         function = compile_pymc(inputs, [output], on_unused_input="ignore")
         function.trust_input = True
         point = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
-        self._calls = ParallelMap(function, [point, *self.model_seeds])
-
-    @property
-    def on_progress(self) -> Callable[[int], None]:
-        """Called in the main thread with the number of points evaluated since the last call."""
-        return self._calls.on_progress
-
-    @on_progress.setter
-    def on_progress(self, on_progress: Callable[[int], None]) -> None:
-        self._calls.on_progress = on_progress
+        self.calls = ParallelMap(function, [point, *self.model_seeds])
 
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
         """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.
@@ -70,19 +56,15 @@ class RowFunction:
         """
         if seeds is None:
             seeds = np.broadcast_to(self.model_seeds, (len(x), self.model_seeds.size))
-        values = self._calls(x, *seeds.T)[:, 0]
+        values = self.calls(x, *seeds.T)[:, 0]
         return np.where(np.isnan(values), -np.inf, values)
 
 
 class ModelDensity(RowFunction):
     """The compiled log-density of a model.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    moved : bool
-        Whether the chain moved its noise (``correlation``), with the smooth versions of the
-        filters.
+    ``moved`` is whether the chain moved its noise (``correlation``), with the smooth versions of
+    the filters.
     """
 
     def __init__(self, model: pm.Model, *, moved: bool = False) -> None:

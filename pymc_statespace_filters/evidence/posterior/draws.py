@@ -92,22 +92,21 @@ def log_likelihood_of(log_density: Array, log_prior: Array) -> Array:
     return np.subtract(log_density, log_prior, out=np.full_like(log_density, -np.inf), where=finite)
 
 
+def check_overlap(log_density: Array) -> None:
+    """Raise a `DataMismatchError` if the density of a model is zero at all proposals (m,)."""
+    if np.isneginf(log_density).all():
+        raise DataMismatchError(
+            f"all {len(log_density)} proposals around the draws have zero density: idata belongs "
+            "to another model or to other data"
+        )
+
+
 def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterior, str]:
     """Combine the draws of `idata` with the compiled density of their model.
 
-    Parameters
-    ----------
-    idata : xarray.DataTree
-        Posterior draws. ``sample_stats`` may hold the log-density ``lp`` of each draw; it must hold
-        it, or the noise seeds ``<name>_seed``, if the noise was refreshed along the chain.
-    density : ModelDensity
-        The compiled model.
-
-    Returns
-    -------
-    Posterior
-    str
-        The treatment of the noise: "none", "refreshed" or "held", as in `Evidence`.
+    ``sample_stats`` may have the log-density ``lp`` of each draw; it must have it, or the noise
+    seeds ``<name>_seed``, if the noise was refreshed along the chain. Also returns the treatment of
+    the noise: "none", "refreshed" or "held", as in `Evidence`.
 
     Raises
     ------

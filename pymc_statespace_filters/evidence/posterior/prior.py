@@ -16,12 +16,7 @@ Array = NDArray[np.float64]
 
 
 class ModelPrior:
-    """The distribution of a model's free variables; Potentials belong to the likelihood.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    """
+    """The distribution of a model's free variables; Potentials belong to the likelihood."""
 
     def __init__(self, model: pm.Model) -> None:
         self._model = model

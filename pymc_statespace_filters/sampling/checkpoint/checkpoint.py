@@ -4,11 +4,10 @@ The settings are written once (see `manifest`), and stored chains are immutable 
 `journal`); each file appears whole. So a process that is killed at any moment leaves a folder that
 is not yet a checkpoint, or a good one up to the last record.
 
-Several ranks share a folder that all of them see: the first opens it, and the others join with its
+Several ranks use one folder that all of them see: the first opens it, and the others join with its
 ticket. When a job has died, one of its ranks may still be writing while the next job opens the
 folder. Two things prevent damage: a rank checks the lease of its job before it writes, and each job
-moves the files to a subfolder of its own and removes the former one, so that a write on its way
-fails.
+moves the files to a new subfolder and removes the former one, so that a write in progress fails.
 """
 
 import os
@@ -44,14 +43,8 @@ class Ticket(NamedTuple):
 class Checkpoint:
     """An open checkpoint; a context manager that releases the folder at its end.
 
-    Made by `open_checkpoint`, or by `join_checkpoint` on other ranks, which release nothing.
-
-    Attributes
-    ----------
-    path : Path
-        The folder.
-    ticket : Ticket
-        For `join_checkpoint` on other ranks, until this one is closed.
+    Made by `open_checkpoint`, or by `join_checkpoint` on other ranks, which release nothing. Other
+    ranks join with the ``ticket``, until this checkpoint is closed.
     """
 
     def __init__(self, ticket: Ticket, lease: FolderLease | None = None):
@@ -144,18 +137,10 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
 
 
 def join_checkpoint(ticket: Ticket) -> Checkpoint:
-    """Open a checkpoint on a rank other than the first, which has opened it already.
+    """Open a checkpoint on a rank other than the first, with the ticket of the first.
 
-    Parameters
-    ----------
-    ticket : Ticket
-        Of the first rank's checkpoint.
-
-    Returns
-    -------
-    Checkpoint
-        For the journals of the chains that this rank runs, as long as the first rank holds the
-        folder.
+    It gives the journals of the chains that this rank runs, as long as the first rank has the
+    folder open.
 
     Raises
     ------
@@ -183,19 +168,10 @@ def join_checkpoint(ticket: Ticket) -> Checkpoint:
 
 
 def folder_name(name: str) -> str:
-    """A folder name for any text.
+    """A folder name for any text: its letters and digits, and a hash of the whole.
 
     Readable, and different for different texts also where case is ignored, or where an accent can
     be written in two ways.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    str
-        Letters and digits of the text, and a hash of the whole.
 
     Examples
     --------
@@ -215,13 +191,13 @@ def _subfolder_of(lease: Path) -> Path:
 
 def _take_chains(folder: Path, lease: Path) -> None:
     """Move the chains of former jobs to the subfolder of this one."""
-    own = _subfolder_of(lease)
-    own.mkdir()
+    current = _subfolder_of(lease)
+    current.mkdir()
     for former in folder.glob("chains.*"):
-        if former != own:
+        if former != current:
             for path in former.glob("*.segment"):
-                path.rename(own / path.name)
+                path.rename(current / path.name)
             check_held(lease)
             shutil.rmtree(former)  # with unfinished files
-    sync_folder(own)
+    sync_folder(current)
     sync_folder(folder)

@@ -16,25 +16,18 @@ from pymc_statespace_filters.system.graph_digest import described, digest, graph
 def model_fingerprint(model: pm.Model) -> str:
     """Hash everything that the draws of a model depend on, except for the numbers in its data.
 
-    Parameters
-    ----------
-    model : pymc.Model
-
-    Returns
-    -------
-    str
-        Hexadecimal SHA-256: the same for every build of the model, in every process of the same
-        versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
-        deterministic, name, dimension, coordinate and initial value, with the equations of a
-        `StateSpace` and with the settings of its filter. Of observed values and other data it holds
-        type and name: see `model_data_fingerprint`. Of an operation of the user's own it holds the
-        properties or attributes, not the Python code.
+    The hexadecimal SHA-256 is the same for every build of the model, in every process of the same
+    versions of PyMC and PyTensor. It changes with any constant, prior, transform, potential,
+    deterministic, name, dimension, coordinate and initial value, with the equations of a
+    `StateSpace` and with the settings of its filter. Of observed values and other data it includes
+    type and name: see `model_data_fingerprint`. Of a user-defined operation it includes the
+    properties or attributes, not the Python code.
 
     Raises
     ------
     ModelError
-        If an operation holds something that has no text which is the same in every process, such
-        as a Python function without a name; the message names both.
+        If an operation has an attribute without a text that is the same in every process, such as
+        a Python function without a name; the message names both.
     """
     known = {value: digest("value of", rv.name) for rv, value in _roots(model).items()}
     names = {
@@ -53,17 +46,10 @@ def model_fingerprint(model: pm.Model) -> str:
 def model_data_fingerprint(model: pm.Model) -> str:
     """Hash all numbers that a model was given as data, with their names.
 
-    Parameters
-    ----------
-    model : pymc.Model
-
-    Returns
-    -------
-    str
-        Hexadecimal SHA-256 of the names, types and bytes of observed values, of `pymc.Data`, and
-        of every other shared variable that the model uses, including the noise seeds of its
-        likelihoods. (The ``data_fingerprint`` of an evidence is another one: that of the observed
-        values alone, which rival models share under any name.)
+    The hexadecimal SHA-256 of the names, types and bytes of observed values, of `pymc.Data`, and of
+    every other shared variable that the model uses, including the noise seeds of its likelihoods.
+    (The ``data_fingerprint`` of an evidence is another one: that of the observed values alone,
+    which are the same in rival models, under any name.)
     """
     constants = {
         f"observed {rv.name}": value.data

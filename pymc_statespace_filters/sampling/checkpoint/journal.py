@@ -1,9 +1,9 @@
-"""Draws and states of a chain on disk: immutable segments that no kill of the writer can tear.
+"""Draws and states of a chain on disk, in immutable segments that survive a kill of the writer.
 
 A segment is one file: the names of its arrays as JSON, the arrays in NumPy's npy format, and a
 checksum of the run, the chain, the numbers of the records in it, and the content. It is written
-under another name, brought to the disk and renamed: it is there as a whole or not at all, and a
-damaged file or one of another chain is recognised.
+under another name, flushed to disk and renamed: it exists as a whole or not at all, and a damaged
+file or one of another chain is recognised.
 
 A record has the draws since the one before, and the whole state of the chain. The last segments are
 merged whenever 16 of them have similar lengths, so a chain of n records has at most some
@@ -38,18 +38,10 @@ _CHECKSUM_SIZE = 4
 
 
 class StoredChain(NamedTuple):
-    """What a journal holds of its chain.
+    """The stored arrays of a chain, by name."""
 
-    Attributes
-    ----------
-    draws : dict of str to ndarray, shape (draws, ...)
-        All draws, from the first record to the last.
-    state : dict of str to ndarray
-        The state of the chain after the last of them.
-    """
-
-    draws: dict[str, np.ndarray]
-    state: dict[str, np.ndarray]
+    draws: dict[str, np.ndarray]  # all draws, from the first record to the last
+    state: dict[str, np.ndarray]  # the state of the chain after the last of them
 
 
 class _Segment(NamedTuple):
@@ -76,7 +68,7 @@ class ChainJournal:
     origin : bytes
         Identifies the run and the chain; enters each checksum.
     check : callable
-        Raises if the files belong to another job by now; called before they are touched.
+        Raises if another job has taken the files over; called before they are touched.
     """
 
     def __init__(self, path: Path, origin: bytes, check: Callable[[], None] = lambda: None):
@@ -87,10 +79,7 @@ class ChainJournal:
     def read(self) -> StoredChain | None:
         """Read all records up to the first that is missing or damaged; the later ones are removed.
 
-        Returns
-        -------
-        StoredChain or None
-            None if there is no good record.
+        None if there is no good record.
 
         Warns
         -----
@@ -116,7 +105,7 @@ class ChainJournal:
         Raises
         ------
         OSError
-            If the disk refuses, for example because it is full. The record is not kept.
+            If the record cannot be written, for example because the disk is full.
         ValueError
             If an array has Python objects.
         """
@@ -157,7 +146,7 @@ class ChainJournal:
         return sorted(found, key=lambda segment: (segment.first, -segment.last))
 
     def _load(self, segment: _Segment) -> StoredChain | None:
-        """What a segment holds, None if it is damaged or another one."""
+        """The arrays in a segment, None if it is damaged or another one."""
         content = memoryview(segment.path.read_bytes())
         body, checksum = content[:-_CHECKSUM_SIZE], content[-_CHECKSUM_SIZE:]
         if checksum != self._checksum(segment.path, body):
@@ -181,7 +170,7 @@ class ChainJournal:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
         except OSError:
-            self._check()  # says so if the files belong to another job by now
+            self._check()  # another job may have taken the files over
             unfinished.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
@@ -205,7 +194,7 @@ class ChainJournal:
         return self._segments[len(self._segments) - n_small :]
 
     def _merge(self, tail: Sequence[_Segment]) -> None:
-        """Write the last segments anew as a single one, with the last state alone."""
+        """Replace the last segments by a single one, with the last state only."""
         merged = self._write(tail[0].first, tail[-1].last, *_joined(map(self._load_again, tail)))
         self._segments = [*self._segments[: -len(tail)], merged]
         for segment in tail:
@@ -222,7 +211,8 @@ class ChainJournal:
 
     def _discard(self, segments: Sequence[_Segment], n_good: int) -> None:
         first = segments[0]
-        for segment in reversed(segments):  # the first last: if we are killed, it is found again
+        # The first last: if the process is killed meanwhile, the next read finds it again.
+        for segment in reversed(segments):
             segment.path.unlink()
         resumes = f"the chain resumes after record {n_good}" if n_good else "the chain begins anew"
         warnings.warn(
@@ -239,7 +229,7 @@ class ChainJournal:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring a folder's list of files to the disk, where the system has a way to ask for it."""
+    """Flush a folder's list of files to disk, on systems that can."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except OSError:

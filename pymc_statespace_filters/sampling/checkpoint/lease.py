@@ -1,7 +1,7 @@
 """A lease on a folder, so that one job at a time writes there.
 
-Each job puts a lease file of its own into the folder, and then looks at those of other jobs: of two
-jobs at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
+Each job puts a new lease file into the folder, and then looks at those of other jobs: of two jobs
+at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
 which names the process and its host, and touches it every few seconds in a thread. The lease of an
 ended process of this computer is removed at once. Any other is watched, and removed if it is not
 touched for 20 s; only changes count, the clocks of two computers are never compared. A job that was
@@ -9,7 +9,7 @@ suspended for longer finds its file gone and stores nothing more.
 
 SoftFileLease can also take over one common file. That is not used, because it exchanges two file
 names in one step, which NFS, SMB and most parallel file systems refuse: there the lease of a dead
-job would be held for ever. File names that are never used again need no exchange.
+job would never expire. File names that are never used again need no exchange.
 """
 
 import errno
@@ -36,21 +36,12 @@ _N_POLLS_FOR_NEW_FILE = 60
 
 
 class FolderLease:
-    """Hold a folder until `release`.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Attributes
-    ----------
-    path : Path
-        The lease file. Its name is never used again.
+    """A lease on a folder until `release`; ``path`` is its file, whose name is never used again.
 
     Raises
     ------
     ModelError
-        If a living process holds the folder.
+        If a living process has a lease on the folder.
     OSError
         If the folder is not writable.
     """
@@ -125,7 +116,7 @@ def _has_ended(path: Path) -> bool:
     pid = _lease(path).pid
     if pid is None or not path.name.startswith(f"{PREFIX}{_process_table()}-"):
         return False
-    if os.name == "nt":  # removing the file will tell
+    if os.name == "nt":  # removing the file fails if it has not
         return True
     with suppress(PermissionError):  # a process of another user
         try:
@@ -136,7 +127,7 @@ def _has_ended(path: Path) -> bool:
 
 
 def _expired(leases: list[Path]) -> list[Path]:
-    """Those of these leases that are not touched for a while; raise if one is."""
+    """Leases that are not touched for a while; raise if one of them is touched."""
     touched = {path: time for path in leases if (time := _last_touched(path)) is not None}
     for _ in range(_N_POLLS):  # counted, so that a process suspended between two polls misses none
         if not touched:

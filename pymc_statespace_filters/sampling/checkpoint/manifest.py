@@ -22,12 +22,8 @@ _CURE = "delete the folder or give another path"
 def write_or_compare(folder: Path, settings: str) -> None:
     """Write the manifest of a new checkpoint; raise unless that of an old one has these settings.
 
-    Parameters
-    ----------
-    folder : Path
-        Held by this process. A new checkpoint begins in an empty folder.
-    settings : str
-        As `canonical` writes them.
+    The lease of ``folder`` belongs to this process; a new checkpoint begins in an empty folder.
+    ``settings`` are a text made by `canonical`.
 
     Raises
     ------
@@ -57,8 +53,8 @@ def canonical(value: Any) -> str:
 
 
 def _write(folder: Path, settings: str) -> None:
-    own = {_UNFINISHED, *(path.name for path in folder.glob(f"{PREFIX}*"))}
-    if foreign := sorted(path.name for path in folder.iterdir() if path.name not in own):
+    known = {_UNFINISHED, *(path.name for path in folder.glob(f"{PREFIX}*"))}
+    if foreign := sorted(path.name for path in folder.iterdir() if path.name not in known):
         raise ModelError(
             f"checkpoint={str(folder)!r} is not a checkpoint: it holds {', '.join(foreign[:3])}"
             f"{', ...' if len(foreign) > 3 else ''} but no {_MANIFEST}; give another path"

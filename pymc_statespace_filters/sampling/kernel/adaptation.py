@@ -36,8 +36,6 @@ A. Gelman, G. Roberts and W. Gilks (1996). Efficient Metropolis jumping rules. B
 5, 599-607.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
@@ -70,21 +68,9 @@ JITTER = 1e-8
 _internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-class AdaptationSettings(NamedTuple):
-    """Settings that are constant while a chain runs.
-
-    Attributes
-    ----------
-    adapt_every : int
-        Iterations in a block.
-    """
-
-    adapt_every: int
-
-
 @_internal
 def learn(
-    settings: AdaptationSettings,
+    adapt_every: int,
     continuous: bool,
     state: AdaptationState,
     position: np.ndarray,
@@ -94,7 +80,8 @@ def learn(
 
     Parameters
     ----------
-    settings : AdaptationSettings
+    adapt_every : int
+        Iterations in a block.
     continuous : bool
         The scheme: ``"continuous"`` or ``"chain"``.
     state : AdaptationState
@@ -107,9 +94,9 @@ def learn(
     _include(state.block, 1.0, position)
     block[MOVED] += 1.0 if stage > 0 else 0.0
     block[FIRST] += 1.0 if stage == 1 else 0.0
-    if _has_stalled(settings, state.numbers, block):
+    if _has_stalled(adapt_every, state.numbers, block):
         _forget_block(state)
-    elif block[N] >= settings.adapt_every:
+    elif block[N] >= adapt_every:
         _close_block(state)
         _learn_covariance(state)
     elif continuous and state.numbers[N_BLOCKS] > 0.0:
@@ -168,11 +155,10 @@ def _clear(moments: Moments) -> None:
 
 
 @_internal
-def _has_stalled(settings: AdaptationSettings, numbers: np.ndarray, block: np.ndarray) -> bool:
-    if numbers[N_BLOCKS] == 0.0 and block[MOVED] == 0.0 and 4 * block[N] >= settings.adapt_every:
+def _has_stalled(adapt_every: int, numbers: np.ndarray, block: np.ndarray) -> bool:
+    if numbers[N_BLOCKS] == 0.0 and block[MOVED] == 0.0 and 4 * block[N] >= adapt_every:
         return True
-    full = block[N] >= settings.adapt_every
-    return full and block[MOVED] < LEAST_MOVED * block[N]
+    return block[N] >= adapt_every and block[MOVED] < LEAST_MOVED * block[N]
 
 
 @_internal
@@ -231,11 +217,11 @@ def _learn_covariance(state: AdaptationState) -> None:
     n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
     dim = base.shape[0]
     weight = moved / (moved + PRIOR_MOVES * dim)
-    learnt = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
+    factor = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):
         for j in range(i + 1):
-            cov[i, j] = learnt * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
+            cov[i, j] = factor * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
             cov[j, i] = cov[i, j]
         mean_variance += cov[i, i] / dim
     for i in range(dim):

@@ -11,21 +11,11 @@ N, MOVED, FIRST = range(3)
 
 
 class Moments(NamedTuple):
-    """Running moments of a piece of a chain, for its covariance.
+    """Running moments of a piece of a chain, for its covariance."""
 
-    Attributes
-    ----------
-    counts : ndarray, shape (3,)
-        Iterations; those that moved; those that moved by the first stage.
-    mean : ndarray, shape (d,)
-        Mean of the positions.
-    scatter : ndarray, shape (d, d)
-        Sum of the outer products of the deviations from the mean.
-    """
-
-    counts: np.ndarray
-    mean: np.ndarray
-    scatter: np.ndarray
+    counts: np.ndarray  # (3,): iterations; those that moved; those that moved by the first stage
+    mean: np.ndarray  # (d,), of the positions
+    scatter: np.ndarray  # (d, d), sum of outer products of the deviations from the mean
 
     @property
     def n(self) -> float:
@@ -36,33 +26,20 @@ class Moments(NamedTuple):
 class AdaptationState(NamedTuple):
     """State of the adaptation.
 
-    Attributes
-    ----------
-    numbers : ndarray, shape (3,)
-        Cell SCALE: factor, at most 1, of the standard deviations of the proposals relative to
-        ``2.38 / sqrt(d)`` times those of the draws, reduced at low acceptance. N_BLOCKS: complete
-        blocks that were used for a covariance. N_STALLS: blocks in a row with almost no moves.
-    cov : ndarray, shape (d, d)
-        Proposal covariance of the first stage, all factors included.
-    chol : ndarray, shape (d, d)
-        Its lower Cholesky factor.
-    base : ndarray, shape (d, d)
-        The proposal covariance when the block began.
-    first_cov : ndarray, shape (d, d)
-        The first proposal covariance of the chain.
-    block, recent, older : Moments
-        The current block; the complete blocks since their number was last a power of two; and
-        those between the previous two powers of two.
+    Its numbers are SCALE, a factor of at most 1 for the standard deviations of the proposals
+    relative to ``2.38 / sqrt(d)`` times those of the draws, reduced at low acceptance; N_BLOCKS,
+    the complete blocks that were used for a covariance; and N_STALLS, the blocks in a row with
+    almost no moves.
     """
 
-    numbers: np.ndarray
-    cov: np.ndarray
-    chol: np.ndarray
-    base: np.ndarray
-    first_cov: np.ndarray
-    block: Moments
-    recent: Moments
-    older: Moments
+    numbers: np.ndarray  # (3,)
+    cov: np.ndarray  # (d, d), of the first stage's proposals, all factors included
+    chol: np.ndarray  # (d, d), its lower Cholesky factor
+    base: np.ndarray  # (d, d), the proposal covariance when the block began
+    first_cov: np.ndarray  # (d, d), the first proposal covariance of the chain
+    block: Moments  # the current block
+    recent: Moments  # the complete blocks since their number was last a power of two
+    older: Moments  # those between the previous two powers of two
 
     @property
     def scale(self) -> float:
@@ -71,17 +48,7 @@ class AdaptationState(NamedTuple):
 
 
 def start_adaptation(cov: np.ndarray) -> AdaptationState:
-    """Make the initial state.
-
-    Parameters
-    ----------
-    cov : ndarray, shape (d, d)
-        Covariance of the first proposals, positive definite.
-
-    Returns
-    -------
-    AdaptationState
-    """
+    """Make the initial state, with the positive definite covariance of the first proposals."""
     dim = len(cov)
     state = unpack(np.zeros(packed_size(dim)), dim)
     state.numbers[SCALE] = 1.0

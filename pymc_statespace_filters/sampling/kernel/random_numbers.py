@@ -13,20 +13,7 @@ BLOCK = 256
 
 
 def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:
-    """Draw the random numbers of iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``.
-
-    Parameters
-    ----------
-    key : ndarray of uint64, shape (2,)
-        Of the chain.
-    index : int
-    n_stages, dim, n_noisy : int
-        Maximal number of stages, dimension d, number of noisy variables.
-
-    Returns
-    -------
-    RandomBlock
-    """
+    """Draw a chain's random numbers for iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``."""
     # Consecutive indices start 2^128 numbers apart.
     rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
     return RandomBlock(

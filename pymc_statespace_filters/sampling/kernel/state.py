@@ -26,23 +26,12 @@ PAUSE_REQUESTED, N_DONE = range(2)
 
 
 class NativeLogDensity(NamedTuple):
-    """A log-density as machine code calls it.
+    """A log-density as machine code calls it, and the arrays that the call reads."""
 
-    Attributes
-    ----------
-    call : Call
-        Its results are the log-density, the health of each filter, and the noise it used if the
-        chain carries its noise.
-    position : ndarray, shape (d,)
-        Read by the call.
-    seeds : ndarray of int64, shape (noisy,)
-        Read by the call.
-    n_healths : int
-    """
-
+    # Returns the log-density, the health of each filter, and the noise if the chain carries it.
     call: Call
-    position: np.ndarray
-    seeds: np.ndarray
+    position: np.ndarray  # (d,)
+    seeds: np.ndarray  # int64 (noisy,)
     n_healths: int
 
 
@@ -60,29 +49,16 @@ class PhaseSettings(NamedTuple):
 class ChainState(NamedTuple):
     """The state of a chain: plain arrays, changed in place.
 
-    Attributes
-    ----------
-    position : ndarray, shape (d,)
-        On the unconstrained space.
-    seeds : ndarray of int64, shape (noisy,)
-        Noise seeds of the estimate.
-    numbers : ndarray, shape (3,)
-        Log-density as estimated when the point was accepted; smallest effective number of particles
-        of the estimate (infinity without noise); log-density of the screen.
-    adaptation : ndarray
-        State of the adaptation, see `adaptation_state.unpack`.
-    carried : ndarray
-        The noise itself, if proposals are correlated with it.
-    key : ndarray of uint64, shape (2,)
-        Key of the chain's random numbers.
+    Its numbers are the log-density as estimated when the point was accepted, the smallest effective
+    number of particles of the estimate (infinity without noise), and the log-density of the screen.
     """
 
-    position: np.ndarray
-    seeds: np.ndarray
-    numbers: np.ndarray
-    adaptation: np.ndarray
-    carried: np.ndarray
-    key: np.ndarray
+    position: np.ndarray  # (d,), on the unconstrained space
+    seeds: np.ndarray  # int64 (noisy,), of the estimate
+    numbers: np.ndarray  # (3,), columns LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN
+    adaptation: np.ndarray  # packed, see `adaptation_state.unpack`
+    carried: np.ndarray  # the noise itself, if proposals are correlated with it
+    key: np.ndarray  # uint64 (2,), of the chain's random numbers
 
     @property
     def proposal_cov(self) -> np.ndarray:
@@ -91,62 +67,31 @@ class ChainState(NamedTuple):
 
 
 class RandomBlock(NamedTuple):
-    """Random numbers of consecutive iterations, along the first axis.
+    """Random numbers of consecutive iterations, along the first axis."""
 
-    Attributes
-    ----------
-    normals : ndarray, shape (iterations, stages, d)
-        Standard normals, for the proposals.
-    log_uniforms : ndarray, shape (iterations, stages + 1)
-        Logs of uniforms for acceptance: of each stage, and of a screened move.
-    seeds : ndarray of int64, shape (iterations, stages, noisy)
-        Noise seeds of the estimated likelihoods.
-    """
-
-    normals: np.ndarray
-    log_uniforms: np.ndarray
-    seeds: np.ndarray
+    normals: np.ndarray  # (iterations, stages, d), for the proposals
+    log_uniforms: np.ndarray  # (iterations, stages + 1), to accept a stage or a screened move
+    seeds: np.ndarray  # int64 (iterations, stages, noisy), of the estimated likelihoods
 
 
 class Draws(NamedTuple):
-    """Record of the iterations of a chain, along the first axis.
+    """Record of the iterations of a chain, along the first axis."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (n, d)
-    numbers : ndarray, shape (n, 4)
-        Columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING.
-    counts : ndarray of int64, shape (n, 6)
-        Columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS, N_FAILED, FAILURE
-        (the last failure code), N_SCREENED, N_SCREEN_FAILED.
-    seeds : ndarray of int64, shape (n, noisy)
-    covs : ndarray, shape (n_covs, d, d)
-        Covariance of the first stage's proposals, in the first iterations only.
-    """
-
-    positions: np.ndarray
-    numbers: np.ndarray
+    positions: np.ndarray  # (n, d)
+    numbers: np.ndarray  # (n, 4), columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING
+    # int64 (n, 6), columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS,
+    # N_FAILED, FAILURE (the last failure code), N_SCREENED, N_SCREEN_FAILED
     counts: np.ndarray
-    seeds: np.ndarray
-    covs: np.ndarray
+    seeds: np.ndarray  # int64 (n, noisy)
+    covs: np.ndarray  # (n_covs, d, d), of the first stage's proposals, in the first iterations only
 
 
 class Evaluation(NamedTuple):
-    """Result of one evaluation of a log-density.
+    """Result of one evaluation of a log-density."""
 
-    Attributes
-    ----------
-    log_density : float
-        Never NaN or plus infinity; minus infinity after a failure.
-    failure : int
-        0, or the failure code: a key of ``inspection.FAILURES``, or ``NOT_A_NUMBER``.
-    n_effective : float
-        Smallest effective number of particles in any filter, infinity without noisy filters.
-    """
-
-    log_density: float
-    failure: int
-    n_effective: float
+    log_density: float  # never NaN or plus infinity; minus infinity after a failure
+    failure: int  # 0, or the failure code: a key of `inspection.FAILURES`, or `NOT_A_NUMBER`
+    n_effective: float  # smallest number of particles in any filter, infinity without noisy filters
 
 
 def failure_reason(code: int) -> str:

@@ -24,7 +24,7 @@ from numba import njit
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
-from pymc_statespace_filters.sampling.kernel.adaptation import AdaptationSettings, learn
+from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.kernel.state import (
@@ -209,19 +209,18 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
     Returns the number of iterations made: fewer than n if a pause was requested or the model
     raised. The state is that after the last of them.
     """
-    learnt = unpack(state.adaptation, state.position.size)
-    adaptation = AdaptationSettings(settings.adapt_every)
-    scaling = _scaling(learnt.chol)
+    adapted = unpack(state.adaptation, state.position.size)
+    scaling = _scaling(adapted.chol)
     done = 0
     while done < n and control[PAUSE_REQUESTED] == 0:
         at, k = row + done, first + done
         counts, numbers = draws.counts[at], draws.numbers[at]
         if settings.screened:
             acceptance = _screened_move(
-                settings, target, screen, state, learnt.chol, random, k, counts
+                settings, target, screen, state, adapted.chol, random, k, counts
             )
         else:
-            acceptance = _move(settings, target, state, learnt.chol, random, k, counts)
+            acceptance = _move(settings, target, state, adapted.chol, random, k, counts)
         if counts[FAILURE] == RAISED:
             break
         _copy(state.position, draws.positions[at])
@@ -231,10 +230,10 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
         numbers[ACCEPTANCE], numbers[SCALING] = acceptance, scaling
         if at < draws.covs.shape[0]:
             for i in range(state.position.size):
-                _copy(learnt.cov[i], draws.covs[at, i])
+                _copy(adapted.cov[i], draws.covs[at, i])
         if settings.adapts:
-            learn(adaptation, settings.continuous, learnt, state.position, counts[STAGE])
-            scaling = _scaling(learnt.chol)
+            learn(settings.adapt_every, settings.continuous, adapted, state.position, counts[STAGE])
+            scaling = _scaling(adapted.chol)
         done += 1
         control[N_DONE] += 1
     return done

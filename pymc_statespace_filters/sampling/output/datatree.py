@@ -1,6 +1,6 @@
 """Whole chains as the DataTree that ``pm.sample`` returns.
 
-PyMC's own converter makes the DataTree, so that groups, dimensions, coordinates, data and
+PyMC's converter makes the DataTree, so that groups, dimensions, coordinates, data and
 attributes follow its conventions. Its input is traces filled in bulk instead of draw by draw.
 """
 
@@ -41,28 +41,25 @@ def to_datatree(
 ) -> DataTree:
     """Convert whole chains to the DataTree that ``pm.sample`` returns.
 
+    Without a group ``posterior`` if no chain finished its warm-up.
+
     Parameters
     ----------
     model : pymc.Model
     raveled : RaveledVariables
         All value variables of the model, in the order of the positions.
-    chains : list of (positions, statistics)
-        Warm-up and draws: positions, shape (n, d), and statistics by name, shape (n, ...). The list
-        is emptied, to release memory early. If chains were interrupted at different iterations,
-        those are kept, and cut to one length, that give the most draws in all.
+    chains : list of ChainArrays
+        Warm-up and draws. The list is emptied, to release memory early. If chains were interrupted
+        at different iterations, those are kept, and cut to one length, that give the most draws in
+        all.
     tune : int
         Iterations of warm-up, at the beginning of each chain.
     keep_warmup : bool
-        Whether the warm-up is kept, in its own groups.
+        Whether the warm-up is kept, in separate groups.
     sampling_time : float
         In seconds.
     attrs : mapping of str to any, optional
         Attributes of the groups with draws and statistics, in addition to PyMC's.
-
-    Returns
-    -------
-    xarray.DataTree
-        Without a group ``posterior`` if no chain finished its warm-up.
 
     Raises
     ------
@@ -86,7 +83,7 @@ def to_datatree(
     def convert(positions: np.ndarray, stats: dict[str, np.ndarray]) -> DataTree:
         varying = {name: values for name, values in stats.items() if name not in fixed}
         trace = MultiTrace([_ChainTrace(0, deterministics(positions), varying)])
-        # There is no public way: PyMC's own driver sets these.
+        # There is no public way: PyMC's driver sets these.
         trace.report._n_tune = min(tune, skipped + length)
         trace.report._n_draws = skipped + length - trace.report._n_tune
         trace.report._t_sampling = sampling_time
@@ -118,15 +115,7 @@ def _concatenated(trees: list[DataTree], attrs: Mapping[str, Any]) -> DataTree:
 
 
 class _ChainTrace(IBaseTrace):
-    """A whole chain as a trace, the input of PyMC's converter.
-
-    Parameters
-    ----------
-    chain : int
-    values : dict of str to ndarray, shape (n, ...)
-        Values of the variables.
-    stats : dict of str to ndarray, shape (n, ...)
-    """
+    """A whole chain as a trace, the input of PyMC's converter."""
 
     def __init__(self, chain: int, values: dict[str, np.ndarray], stats: dict[str, np.ndarray]):
         self.chain = chain

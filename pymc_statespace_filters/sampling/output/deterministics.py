@@ -8,7 +8,6 @@ are evaluated by one compiled function, called for each position.
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Protocol
 
 import numpy as np
 from pymc.model import Model
@@ -81,27 +80,10 @@ NUMPY_MODE = Mode(
 ).register((in2out(_binary_sums_and_products), 100.0))
 
 
-class _Evaluator(Protocol):
-    """Evaluates some of the variables: positions, shape (n, d), to arrays of shape (n, ...)."""
-
-    names: list[str]
-
-    def __call__(self, positions: np.ndarray) -> list[np.ndarray]: ...
-
-
 class Deterministics:
-    """The variables of a trace, evaluated at all positions of a chain.
+    """The variables of a trace, in the order of ``pm.sample``, evaluated at positions of a chain.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-        All value variables of the model.
-
-    Attributes
-    ----------
-    names : list of str
-        In the order in which ``pm.sample`` has them.
+    ``raveled`` has all value variables of the model.
     """
 
     def __init__(self, model: Model, raveled: RaveledVariables):
@@ -109,22 +91,12 @@ class Deterministics:
         self.names = [variable.name for variable in wanted]
         vectorized = _Vectorized([v for v in wanted if _is_vectorizable(v)], raveled)
         rest = [v for v in wanted if v.name not in vectorized.names]
-        self._evaluators: list[_Evaluator] = [vectorized]
+        self._evaluators: list[_Vectorized | _PerPosition] = [vectorized]
         if rest:
             self._evaluators.append(_PerPosition(rest, raveled))
 
     def __call__(self, positions: np.ndarray) -> dict[str, np.ndarray]:
-        """Evaluate.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (n, d)
-            Repeated rows, as after a rejection, are evaluated once.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n, ...)
-        """
+        """Values (n, ...) by name at positions (n, d); repeated rows are evaluated once."""
         moved = np.ones(len(positions), dtype=np.bool_)
         moved[1:] = (positions[1:] != positions[:-1]).any(axis=1)
         distinct, place = positions[moved], np.cumsum(moved) - 1

@@ -55,26 +55,14 @@ N_STUCK = 100
 
 
 class SeedSpread(NamedTuple):
-    """Moments of the estimates of the log-density at one point, over noise seeds.
+    """Moments of the estimates of the log-density at one point, over noise seeds."""
 
-    Attributes
-    ----------
-    n : int
-        Number of finite estimates, of which the moments are taken.
-    mean, variance : float
-        Minus infinity and infinity if fewer than three are finite.
-    variance_low, variance_high : float
-        A 95 % interval for the variance.
-    n_failed : int
-        Number of estimates that are minus infinity.
-    """
-
-    n: int
-    mean: float
-    variance: float
-    variance_low: float
+    n: int  # finite estimates, of which the moments are taken
+    mean: float  # minus infinity if fewer than three are finite
+    variance: float  # infinity if fewer than three are finite
+    variance_low: float  # ends of a 95 % interval for the variance
     variance_high: float
-    n_failed: int
+    n_failed: int  # estimates that are minus infinity
 
 
 def seed_spread(
@@ -83,20 +71,9 @@ def seed_spread(
     others: Sequence[np.ndarray],
     seeds: np.ndarray,
 ) -> SeedSpread:
-    """Measure the spread of the estimates at one point.
+    """Measure the spread of the estimates at one point, one for each row of seeds (R, noisy).
 
-    Parameters
-    ----------
-    log_density : callable
-        ``(position, others, seeds) -> Evaluation``, such as `BoundLogDensity`.
-    position : ndarray, shape (d,)
-    others : sequence of ndarray
-    seeds : ndarray of int64, shape (R, noisy)
-        A row for each evaluation.
-
-    Returns
-    -------
-    SeedSpread
+    ``log_density(position, others, seeds)`` gives an `Evaluation`, such as `BoundLogDensity`.
     """
     rows = (tuple(np.asarray(seed) for seed in row) for row in seeds)
     return spread_of(np.array([log_density(position, others, row).log_density for row in rows]))
@@ -137,17 +114,8 @@ def acceptance_share(variance: float) -> float:
 def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
     """Advise the user if the variance is far outside the range in which chains work best.
 
-    Parameters
-    ----------
-    spread : SeedSpread
-    where : str
-        Where it was measured, such as "at the start".
-    chain : int
-
-    Returns
-    -------
-    str or None
-        None between variances of 0.05 and 10, and without noise.
+    None between variances of 0.05 and 10, and without noise. ``where`` says where it was measured,
+    such as "at the start".
     """
     found = f"Chain {chain}, {where}: the estimated log-likelihood"
     if spread.n_failed > spread.n or spread.variance == np.inf:
@@ -201,26 +169,10 @@ def spread_at_highest_draw(
     measure: Callable[[np.ndarray, np.ndarray], SeedSpread],
     keys: Sequence[np.ndarray],
 ) -> tuple[SeedSpread, SamplerWarning | None]:
-    """Measure the variance at the draw of highest density of all chains.
+    """Measure the variance at the draw of highest density of all chains, after the warm-up.
 
-    The estimate there is an overestimate, but the point is typical of the centre.
-
-    Parameters
-    ----------
-    draws : sequence of Draws
-        Of each chain, with its warm-up.
-    tune : int
-        Iterations of warm-up, which are left out.
-    measure : callable
-        ``(position, seeds) -> SeedSpread``.
-    keys : sequence of ndarray
-        Keys of the chains' random numbers.
-
-    Returns
-    -------
-    SeedSpread
-    SamplerWarning or None
-        If the variance is far outside the range in which chains work best.
+    The estimate there is an overestimate, but the point is typical of the centre. The warning is
+    given if the variance is far outside the range in which chains work best.
     """
     densities = [of_chain.numbers[tune:, LOG_DENSITY] for of_chain in draws]
     chain = int(np.argmax([of_chain.max() for of_chain in densities]))

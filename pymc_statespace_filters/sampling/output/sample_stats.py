@@ -21,7 +21,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
 )
 from pymc_statespace_filters.sampling.target.target import Target
 
-# PyMC's own names: it renames the first to "lp", and logs and removes the second.
+# PyMC's names: it renames the first to "lp", and logs and removes the second.
 MODEL_LOGP, WARNING = "model_logp", "warning"
 
 
@@ -70,16 +70,7 @@ def dtypes_shapes(target: Target) -> dict[str, tuple[Any, Any]]:
 def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     """Statistics of one iteration, as numbers, or of several, as arrays.
 
-    Parameters
-    ----------
-    target : Target
-    draws : Draws
-    rows : int or slice
-
-    Returns
-    -------
-    dict
-        Without ``accept_rate``, which depends on earlier iterations, and the warning.
+    Without ``accept_rate``, which depends on earlier iterations, and the warning.
     """
     stats = {name: draws.numbers[rows, column] for name, column in _NUMBERS.items()}
     stats |= {name: draws.counts[rows, column] for name, column in _COUNTS.items()}
@@ -103,20 +94,7 @@ def whole_chain(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Positions and statistics of a whole chain, as copies.
 
-    Parameters
-    ----------
-    target : Target
-    draws : Draws
-    state : ChainState
-        After the last iteration.
-    tune : int
-        Iterations of warm-up.
-
-    Returns
-    -------
-    ndarray, shape (n, d)
-    dict of str to ndarray, shape (n, ...)
-        ``proposal_cov`` is a view without a stride if the covariances of the warm-up were not kept.
+    ``proposal_cov`` is a view without a stride if the covariances of the warm-up were not kept.
     """
     n = len(draws.positions)
     stats = {name: values.copy() for name, values in of_draws(target, draws, slice(0, n)).items()}

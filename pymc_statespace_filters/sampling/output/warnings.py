@@ -31,7 +31,7 @@ STUCK = 0.005
 LONG_DWELL, LEAST_DWELL = 0.2, 100
 
 # Factor by which the proposals may be wider than the draws from the prior. With a proper prior they
-# are narrower; under a flat one draws around the model's initial point stand in for its draws.
+# are narrower; under a flat one draws around the model's initial point replace its draws.
 TOLERATED_GROWTH = 1e3
 
 # Fraction of the draws whose particles may have collapsed: a rare surprise only costs mixing.
@@ -39,33 +39,17 @@ TOLERATED_COLLAPSES = 0.5
 
 
 class PhaseStatistics(NamedTuple):
-    """Counts of a chain in one phase, warm-up or sampling.
-
-    Attributes
-    ----------
-    iterations, moved : int
-        Iterations, and those that accepted a proposal.
-    evaluations : int
-        Evaluations of the model.
-    failures : tuple of (int, int)
-        Pairs of a failure code and its count.
-    collapsed : int
-        Iterations that ended at an estimate with an effective number of particles near one.
-    screened, screen_failed : int
-        Evaluations of the screen, and those that failed.
-    dwell, longest_dwell : int
-        Dwell times, in iterations: at the current point, and the longest at any point.
-    """
+    """Counts of a chain in one phase, warm-up or sampling."""
 
     iterations: int = 0
-    moved: int = 0
-    evaluations: int = 0
-    failures: tuple[tuple[int, int], ...] = ()
-    collapsed: int = 0
-    screened: int = 0
+    moved: int = 0  # iterations that accepted a proposal
+    evaluations: int = 0  # of the model
+    failures: tuple[tuple[int, int], ...] = ()  # failure codes and their counts
+    collapsed: int = 0  # iterations at an estimate with an effective number of particles near one
+    screened: int = 0  # evaluations of the screen
     screen_failed: int = 0
-    dwell: int = 0
-    longest_dwell: int = 0
+    dwell: int = 0  # iterations at the current point
+    longest_dwell: int = 0  # at any point
 
     def include(self, draws: Draws, row: int) -> "PhaseStatistics":
         """Add an iteration."""
@@ -123,17 +107,8 @@ def closing_warning(
 ) -> SamplerWarning | None:
     """Warn of what went wrong after warm-up, if anything did.
 
-    Parameters
-    ----------
-    statistics : PhaseStatistics
-        Of all iterations after warm-up.
-    growth : Growth, optional
-        Of the proposals learnt during warm-up.
-
-    Returns
-    -------
-    pymc.stats.convergence.SamplerWarning or None
-        PyMC logs it in the main process, in whichever process the chain ran.
+    ``growth`` is that of the adapted proposals. PyMC logs the warning in the main process, in
+    whichever process the chain ran.
     """
     message = (
         _mobility_problem(statistics) or _growth_problem(growth) or _failure_problem(statistics)

@@ -25,34 +25,17 @@ SETTINGS = DRAMSettings(adapt_every=50, refresh_noise=False)
 
 
 class Pilot(NamedTuple):
-    """Distinct draws of the pilot's chains, the highest density first.
+    """Distinct draws of the pilot's chains, the highest density first."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (m, d)
-    shares : ndarray, shape (m,)
-        For each, the fraction of all draws whose density is no higher.
-    """
-
-    positions: np.ndarray
-    shares: np.ndarray
+    positions: np.ndarray  # (m, d)
+    fractions: np.ndarray  # (m,), of all draws, those whose density is no higher
 
 
 def run_pilot(target: Target, start: np.ndarray, rng: np.random.Generator) -> Pilot:
-    """Sample the posterior with fixed noise, by two chains of DRAM.
+    """Sample the posterior with fixed noise, by two chains of DRAM with `SETTINGS`.
 
-    Parameters
-    ----------
-    target : Target
-        With `SETTINGS`.
-    start : ndarray, shape (d,)
-        Start of the chains, unless it is the model's initial point.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Pilot
-        Without a chain that has not come near the best point of the other.
+    They begin at ``start``, shape (d,), unless it is the model's initial point. A chain that has
+    not come near the best point of the other is left out.
     """
     target.prepare()
     entropy = rng.integers(2**32, size=4).tolist()
@@ -74,5 +57,5 @@ def run_pilot(target: Target, start: np.ndarray, rng: np.random.Generator) -> Pi
     positions = np.concatenate([positions for positions, _ in near or chains])
     densities = np.concatenate([densities for _, densities in near or chains])
     _, at, counts = np.unique(densities, return_index=True, return_counts=True)
-    shares = np.cumsum(counts) / densities.size
-    return Pilot(positions[at[::-1]], shares[::-1])
+    fractions = np.cumsum(counts) / densities.size
+    return Pilot(positions[at[::-1]], fractions[::-1])

@@ -20,41 +20,19 @@ _MARGIN = 1.2
 
 
 class Row(NamedTuple):
-    """Measurements with one number of particles.
-
-    Attributes
-    ----------
-    n_particles : int
-    centre : SeedSpread
-    tail : float
-        Largest variance at the tail points; NaN if it was not measured.
-    n_failed : int
-        Failed evaluations, at all points.
-    seconds : float
-        CPU time of one evaluation at the centre.
-    """
+    """Measurements with one number of particles."""
 
     n_particles: int
     centre: SeedSpread
-    tail: float
-    n_failed: int
-    seconds: float
+    tail: float  # largest variance at the tail points; NaN if it was not measured
+    n_failed: int  # evaluations, at all points
+    seconds: float  # CPU time of one evaluation at the centre
 
 
 def search(measure: Callable[[int], Row], first: int, target: tuple[float, float]) -> list[Row]:
     """Measure numbers of particles until the variance at the centre brackets the target.
 
-    Parameters
-    ----------
-    measure : callable
-    first : int
-        The first number.
-    target : (float, float)
-
-    Returns
-    -------
-    list of Row
-        Seven at most, from the smallest number to the largest.
+    The rows, seven at most, are in the order of the numbers.
     """
     rows = [measure(first)]
     while len(rows) < MOST_NUMBERS:
@@ -68,11 +46,7 @@ def search(measure: Callable[[int], Row], first: int, target: tuple[float, float
 def choose(rows: Sequence[Row], target: tuple[float, float]) -> tuple[Row, str | None]:
     """Choose the smallest number with a variance in the target, and below 10 in the tail.
 
-    Returns
-    -------
-    Row
-    str or None
-        The problem with the choice, if there is one.
+    Also the problem with the choice, if there is one.
     """
     low, high = target
     inside = [row for row in rows if low <= row.centre.variance <= high]

@@ -36,7 +36,7 @@ _FIRST, _CENTRE, _TAIL = 25, 100, 30
 # Beyond this factor from the target the first estimate suffices.
 _NEAR = 4.0
 # The tail points among the pilot's draws: fractions of the draws of lower density.
-_TAIL_SHARES = (0.01, 0.02, 0.03, 0.04, 0.05)
+_TAIL_FRACTIONS = (0.01, 0.02, 0.03, 0.04, 0.05)
 # The best of the pilot's draws, compared by the mean of their estimates.
 _N_BEST, _PER_BEST = 5, 12
 # Particles of the pilot: least, most, and the most by which they are multiplied.
@@ -170,13 +170,7 @@ def suggest_particles(
 
 
 class _NoisyLikelihood:
-    """The log-density of a model for any number of particles of one noisy variable.
-
-    Attributes
-    ----------
-    name : str
-    filter : filter
-    """
+    """The log-density of a model for any number of particles of one noisy variable."""
 
     def __init__(self, model: Model, var_name: str | None, rng: np.random.Generator):
         self.name, self.filter = _noisy_variable(model, var_name)
@@ -197,7 +191,7 @@ class _NoisyLikelihood:
             n = round(n * min(variance, _PILOT_GROWTH))
             pilot = self._pilot(n, centre)
             centre, _ = self._best(n, pilot)
-        tail = [int(np.argmin(np.abs(pilot.shares - share))) for share in _TAIL_SHARES]
+        tail = [int(np.argmin(np.abs(pilot.fractions - f))) for f in _TAIL_FRACTIONS]
         return centre, [pilot.positions[i] for i in dict.fromkeys(tail)]
 
     def spread(self, n_particles: int, position: np.ndarray, n_seeds: int) -> SeedSpread:

@@ -46,25 +46,15 @@ class StopRequested(Exception):
 
 
 class Chain:
-    """A Markov chain of a target.
+    """A Markov chain of a prepared target.
 
     Parameters
     ----------
     target : Target
-        Prepared.
     key : ndarray of uint64, shape (2,)
         Key of the chain's random numbers.
-    n_rows : int
-        Number of iterations whose draws are kept.
-    n_covs : int
-        Number of these, the first ones, whose proposal covariance is kept.
-
-    Attributes
-    ----------
-    state : ChainState
-    draws : Draws
-    control : ndarray of int64, shape (2,)
-        Control block: cells `state.PAUSE_REQUESTED` and `state.N_DONE`.
+    n_rows, n_covs : int
+        Iterations whose draws are kept, and those, the first ones, whose proposal covariance is.
     """
 
     def __init__(self, target: Target, key: np.ndarray, n_rows: int, n_covs: int):
@@ -89,6 +79,7 @@ class Chain:
             np.empty((n_rows, n_noisy), dtype=np.int64),
             np.empty((n_covs, dim, dim)),
         )
+        # The control block, with the cells PAUSE_REQUESTED and N_DONE.
         self.control = np.zeros(2, dtype=np.int64)
         self._block: tuple[int, RandomBlock] | None = None
 
@@ -103,20 +94,10 @@ class Chain:
         others: Sequence[np.ndarray],
         rng: np.random.Generator,
     ) -> tuple[int, ...]:
-        """Move to the best of the candidates, each evaluated with its own noise.
+        """Move to the best of the candidates, each evaluated with new noise.
 
-        Parameters
-        ----------
-        candidates : sequence of ndarray, shape (d,)
-            The last one is the point given by the user or the model.
-        others : sequence of ndarray
-            Values of the variables that other step methods move.
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        tuple of int
-            For each evaluation made, 0 or its failure code.
+        The last candidate is the point given by the user or the model; ``others`` are the values of
+        variables that other step methods move. Returns 0 or the failure code of each evaluation.
 
         Raises
         ------
@@ -169,27 +150,10 @@ class Chain:
         return value.failure
 
     def advance(self, tune: bool, iteration: int, row: int, n: int) -> int:
-        """Make up to n iterations, within one block of random numbers, and record them.
+        """Make up to n iterations, within one block of random numbers, and record them from a row.
 
-        Parameters
-        ----------
-        tune : bool
-        iteration : int
-            Number of the first iteration since the start of the chain.
-        row : int
-            Row of the draws for the first iteration.
-        n : int
-
-        Returns
-        -------
-        int
-            Iterations made: fewer than asked for at the end of the block, or after a pause was
-            requested.
-
-        Raises
-        ------
-        Exception
-            What the model raised.
+        Returns the number of iterations made: fewer at the end of the block, or after a pause was
+        requested. ``iteration`` counts from the start of the chain. Raises what the model raised.
         """
         random, first = self._random_numbers(iteration)
         n = min(n, BLOCK - first)

@@ -1,4 +1,4 @@
-"""A chain run from its start, or from its checkpoint, to its end, in a thread of its own.
+"""A chain run from its start, or from its checkpoint, to its end, in one thread.
 
 The thread spends nearly all its time in machine code, without the interpreter lock. It returns to
 Python for the next block of random numbers, and when the main thread has requested a pause: to
@@ -43,7 +43,6 @@ class ChainTask:
     target : Target
         Prepared.
     tune, draws : int
-        Iterations of warm-up and after it.
     candidates : callable
         From the chain's generator to the candidates for its start.
     seed : numpy.random.SeedSequence
@@ -56,12 +55,6 @@ class ChainTask:
     keeps_warmup : bool
     measures_noise : bool
         Whether the variance of the estimated log-likelihood is measured at the start.
-
-    Attributes
-    ----------
-    chain : Chain
-    seconds : float
-        Duration of a finished chain; 0 if a checkpoint had begun it.
     """
 
     def __init__(
@@ -89,7 +82,7 @@ class ChainTask:
             self.chain.restore(*stored)
         self._n_saved = self.n_done
         self._saved_at = time.monotonic()
-        self.seconds = 0.0
+        self.seconds = 0.0  # duration of a finished chain; 0 if it was resumed from a checkpoint
         self._start_warning: SamplerWarning | None = None
 
     @property

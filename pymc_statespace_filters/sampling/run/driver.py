@@ -3,7 +3,7 @@
 Types on the way of a draw, from the request to the DataTree:
 
 `SamplingRequest`
-    what the user asked for, and on which the draws depend; `ExecutionOptions` has the rest
+    the user's arguments on which the draws depend; `ExecutionOptions` has the others
 `ModelTask`
     the request applied to one model: target, starts, results, DataTree
 `ChainTask`
@@ -43,25 +43,9 @@ def sample_models(
     options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
-    """Sample models on all ranks of a communicator.
+    """Sample models on all ranks of a communicator; None on ranks that do not get the result.
 
-    Parameters
-    ----------
-    models : mapping of str to pymc.Model
-    request : SamplingRequest
-    options : ExecutionOptions
-    checkpoints : sequence of str or path
-        A folder for each model, or none.
-
-    Returns
-    -------
-    dict of str to xarray.DataTree
-        None on ranks that do not get it.
-
-    Raises
-    ------
-    ModelError, DataMismatchError, ParallelError
-        As in ``sample_dram``.
+    ``checkpoints`` has a folder for each model, or none. Errors are those of ``sample_dram``.
     """
     options.check()
     with communicator_of(options.comm, in_lockstep=options.ranks_per_chain > 1) as comm:
@@ -99,7 +83,7 @@ def _run(
     n_threads = 1  # followers evaluate for one chain at a time
     if not tasks[0].is_distributed:
         n_threads = options.cores or cores_per_process(local_rank, cores)
-    n_chains = sum(task.n_chains for task in tasks)
+    n_chains = sum(task.request.chains for task in tasks)
     with ExitStack() as stack:
         if checkpoints:
             _open_checkpoints(tasks, checkpoints, comm, stack)
@@ -125,7 +109,7 @@ def _prepare(tasks: Sequence[ModelTask]) -> None:
 
 
 def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
-    """Ranks of a group: as many as there are if more were asked for, as on a laptop."""
+    """Number of ranks in a group: ``ranks_per_chain``, or all of them if there are fewer."""
     size = min(ranks_per_chain, n_ranks)
     if n_ranks % size:
         raise ModelError(

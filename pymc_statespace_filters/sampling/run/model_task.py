@@ -30,7 +30,7 @@ from pymc_statespace_filters.sampling.target.variables import check_no_generator
 
 
 class ModelTask:
-    """The chains of a model.
+    """The chains of a model, stored in its ``checkpoint`` if that is set.
 
     Parameters
     ----------
@@ -41,15 +41,10 @@ class ModelTask:
     group : Communicator, optional
         Ranks that evaluate the likelihoods together, of which this is the first.
 
-    Attributes
-    ----------
-    checkpoint : Checkpoint or None
-        Where chains are stored, if they are.
-
     Raises
     ------
     ModelError
-        If the log-density draws random numbers of its own.
+        If the log-density draws random numbers.
     """
 
     def __init__(
@@ -71,11 +66,6 @@ class ModelTask:
     def is_distributed(self) -> bool:
         """Whether other ranks evaluate likelihoods together with this one."""
         return self._group is not None and self._group.size > 1
-
-    @property
-    def n_chains(self) -> int:
-        """Number of chains."""
-        return self.request.chains
 
     def prepare(self) -> Target:
         """Compile the model and find candidates for the starts, once."""
@@ -128,13 +118,13 @@ class ModelTask:
         self._began = self._began or time.monotonic()
 
     def add_result(self, index: int, draws: Draws, state: ChainState) -> None:
-        """Keep the result of a chain, from this rank or another."""
+        """Keep the result of a chain, from any rank."""
         self._results[index] = draws, state
         self._ended = time.monotonic()
 
     def load_missing_results(self) -> None:
-        """Take what the checkpoint holds for chains that never ran, as after an interruption."""
-        for index in set(range(self.n_chains)) - set(self._results):
+        """Load chains that never ran from the checkpoint, as after an interruption."""
+        for index in set(range(self.request.chains)) - set(self._results):
             self._results[index] = self.chain_task(index).result()
 
     def to_datatree(self, *, check_convergence: bool) -> DataTree:
@@ -144,7 +134,7 @@ class ModelTask:
         times.
         """
         target, request = self.prepare(), self.request
-        results = [self._results.pop(index) for index in range(self.n_chains)]
+        results = [self._results.pop(index) for index in range(self.request.chains)]
         warnings = _chain_warnings(target, results, request.tune)
         attrs, noise_warnings = self._measure_noise(target, results)
         warnings += noise_warnings

@@ -1,6 +1,6 @@
-"""What the user asks of a run, checked once: what to draw, and how to execute it.
+"""The user's arguments of a run, checked once: what to draw, and how to execute it.
 
-`SamplingRequest` holds all that the draws depend on, apart from the model; `ExecutionOptions` holds
+`SamplingRequest` has all that the draws depend on, apart from the model; `ExecutionOptions` has
 threads, ranks and output, on which they do not depend.
 """
 
@@ -19,33 +19,20 @@ from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     model_fingerprint,
 )
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.system.checks import is_integer
+from pymc_statespace_filters.system.checks import check_count, is_integer
 
 _GATHER = ("root", "all")
 _FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
 
 
 class SamplingRequest(NamedTuple):
-    """Arguments of ``sample_dram`` that the draws depend on, the same for all models of a run.
-
-    Attributes
-    ----------
-    draws, tune, chains : int
-    entropy : list of int
-        Entropy of the seed sequence from which each chain gets its own.
-    is_seeded : bool
-        Whether the user gave a seed.
-    initvals : mapping, sequence of mappings, or None
-    keeps_warmup : bool
-    proposal_cov : array_like or None
-    settings : DRAMSettings
-    """
+    """Arguments of ``sample_dram`` that the draws depend on, the same for all models of a run."""
 
     draws: int
     tune: int
     chains: int
-    entropy: list[int]
-    is_seeded: bool
+    entropy: list[int]  # of the seed sequence from which each chain spawns its own
+    is_seeded: bool  # whether the user gave a seed
     initvals: Any
     keeps_warmup: bool
     proposal_cov: Any
@@ -102,13 +89,10 @@ class ExecutionOptions(NamedTuple):
             raise ModelError(f"gather must be one of {_GATHER}, got {self.gather!r}")
         if self.cores is not None and (not is_integer(self.cores) or self.cores < 1):
             raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
-        size = self.ranks_per_chain
-        if not is_integer(size) or size < 1:
-            raise ModelError(f"ranks_per_chain must be an integer of at least 1, got {size!r}")
-        if size > 1 and self.comm is None:
+        if check_count("ranks_per_chain", self.ranks_per_chain, 1) > 1 and self.comm is None:
             raise ModelError(
-                f"ranks_per_chain={size} needs comm, got None: comm='world' gives the ranks that "
-                "mpiexec started"
+                f"ranks_per_chain={self.ranks_per_chain} needs comm, got None: comm='world' gives "
+                "the ranks that mpiexec started"
             )
 
 
@@ -131,8 +115,7 @@ def sampling_request(
         If a setting has an unknown name.
     """
     for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
-        if not is_integer(value) or value < least:
-            raise ModelError(f"{name} must be an integer of at least {least}, got {value!r}")
+        check_count(name, value, least)
     if draws + tune * keeps_warmup == 0:
         raise ModelError(
             f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, tune={tune}, "

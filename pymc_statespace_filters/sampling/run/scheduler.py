@@ -45,18 +45,9 @@ def run_chains(
 ) -> None:
     """Run all chains of all models to their end, or until the user interrupts.
 
-    The results are added to the tasks of rank 0. After an interruption (Ctrl-C) some chains have
-    made fewer iterations, or none.
-
-    Parameters
-    ----------
-    tasks : sequence of ModelTask
-        The same on all ranks, prepared on rank 0, with the same request.
-    comm : Communicator
-    n_threads : int
-        Chains that this rank runs at a time.
-    progressbar : bool or str
-        As in ``pm.sample``; shown by rank 0.
+    The tasks are the same on all ranks, with the same request, and prepared on rank 0, to whose
+    tasks the results are added. After an interruption (Ctrl-C) some chains have made fewer
+    iterations, or none. This rank runs ``n_threads`` chains at a time; rank 0 shows the progress.
 
     Raises
     ------
@@ -80,20 +71,15 @@ def _release_workers(comm: Communicator) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        own = f"rank 0 of {comm.size} has stopped the run: {describe_error(error)}"
-        _send_all(comm, _OVER, str(error) if isinstance(error, ParallelError) else own)
+        message = f"rank 0 of {comm.size} has stopped the run: {describe_error(error)}"
+        comm.send_to_others(_OVER, str(error) if isinstance(error, ParallelError) else message)
         raise
-    _send_all(comm, _OVER)
-
-
-def _send_all(comm: Communicator, kind: str, value: str | None = None) -> None:
-    for rank in range(1, comm.size):
-        comm.send(rank, kind, value)
+    comm.send_to_others(_OVER)
 
 
 def _chain_task(tasks: Sequence[ModelTask], number: int) -> ChainTask:
     """The task of a chain; chains are numbered through all models."""
-    model, chain = divmod(number, tasks[0].n_chains)
+    model, chain = divmod(number, tasks[0].request.chains)
     return tasks[model].chain_task(chain)
 
 
@@ -108,7 +94,7 @@ class _Manager:
         progressbar: bool | str,
     ):
         self._tasks, self._comm, self._pool = tasks, comm, pool
-        self._n_per_model = tasks[0].n_chains
+        self._n_per_model = tasks[0].request.chains
         costs = [task.cost() if len(tasks) > 1 else 0.0 for task in tasks]
         self._n_unfinished = self._n_per_model * len(tasks)
         # The longest first, so that none runs alone at the end.
@@ -130,7 +116,7 @@ class _Manager:
                 self._add_result(number, *task.result())
             self._schedule.clear()
             if self._n_unfinished:
-                _send_all(self._comm, _STOP)
+                self._comm.send_to_others(_STOP)
             while self._workers:
                 time.sleep(_LISTENING_SECONDS)
                 self._receive()

@@ -15,17 +15,8 @@ _REFRESH_SECONDS = 0.1
 class ChainPool:
     """Threads that run chains; a context manager that stops them all on exit.
 
-    All methods are called from one thread, the one that may be interrupted. Chains are identified
-    by number.
-
-    Parameters
-    ----------
-    n_threads : int
-
-    Attributes
-    ----------
-    running : dict of int to ChainTask
-        Chains that run, and chains that were stopped.
+    All methods are called from one thread, the one that may be interrupted. ``running`` has the
+    chains that run, and those that were stopped, by number.
     """
 
     def __init__(self, n_threads: int):

@@ -25,14 +25,7 @@ def warm_started(
 ) -> SamplingRequest:
     """Start chains at draws of a pilot, with proposals from its chains or its draws.
 
-    Parameters
-    ----------
-    request : SamplingRequest
-    model : pymc.Model
-    pilot : xarray.DataTree
-        Draws of all free variables of the model.
-    adapts : bool
-        Whether the warm-up adapts the proposals, which a short one should not.
+    The warm-up, which may be short, changes the proposals only if ``adapts``.
 
     Raises
     ------

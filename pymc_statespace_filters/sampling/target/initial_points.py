@@ -23,29 +23,14 @@ N_COMPARED = 10
 
 
 class EvaluatedPoint(NamedTuple):
-    """A point and the estimate of its log-density.
-
-    Attributes
-    ----------
-    position : ndarray, shape (d,)
-        On the unconstrained space.
-    seeds : ndarray of int64, shape (noisy,)
-        Noise seeds of the estimate.
-    log_density : float
-    failure : int
-        0, or the failure code if the log-density is minus infinity.
-    n_effective : float
-        Smallest effective number of particles of the estimate; infinity without noise.
-    log_screen : float
-        Log-density of the screen, 0 without one.
-    """
+    """A point on the unconstrained space, and its `Evaluation` with these noise seeds."""
 
     position: np.ndarray
     seeds: np.ndarray
     log_density: float
     failure: int
     n_effective: float = np.inf
-    log_screen: float = 0.0
+    log_screen: float = 0.0  # log-density of the screen, 0 without one
 
 
 class PriorDraws:
@@ -70,18 +55,9 @@ class PriorDraws:
         self._draws = _prior_draws(model, raveled)
 
     def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-        """List candidates for a chain's start: draws from the prior, then the given point.
+        """List candidates for a start: draws from the prior, then the point of user or model.
 
-        Parameters
-        ----------
-        start : ndarray, shape (d,)
-            The start given by the user or the model.
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        list of ndarray, shape (d,)
-            Only ``start`` if the user chose it.
+        Only that point if the user chose it.
         """
         if self._has_initvals or not np.array_equal(start, self._default):
             return [start]
@@ -120,19 +96,7 @@ def best_initial_point(
 
     Far out in the prior an estimated likelihood varies widely, and a chain that starts at an
     overestimate is slow to leave it. The best of a few draws lies closer, and the starts of several
-    chains are still dispersed.
-
-    Parameters
-    ----------
-    candidates : sequence of ndarray, shape (d,)
-        The last one is the start given by the user or the model.
-    evaluate : callable
-
-    Returns
-    -------
-    EvaluatedPoint
-    tuple of int
-        For each evaluation made, 0 or its failure code.
+    chains are still dispersed. Also returns, for each evaluation made, 0 or its failure code.
 
     Raises
     ------
@@ -172,13 +136,10 @@ def chain_candidates(
 
     Parameters
     ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-    prior_draws : PriorDraws
     initvals : None, mapping, or sequence of these
         As in ``pm.sample``.
     seeds : sequence of numpy.random.SeedSequence
-        Of the chains.
+        One for each chain.
     disperse : bool
         Whether candidates are drawn from the prior if no initial values are given.
 

@@ -81,14 +81,10 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
 
 
 class Leader:
-    """The rank of a group that runs its chains.
+    """The rank of a group that runs its chains; the other ranks call `follow`.
 
-    Parameters
-    ----------
-    comm : Communicator
-        The group. The other ranks call `follow`.
-    likelihoods : sequence of (StateSpaceModel, filter)
-        The likelihoods evaluated together, by number, see `inspection.with_likelihood_callback`.
+    The likelihoods, pairs of a system and a filter, are identified by their index in the sequence,
+    see `graph_rewrites.with_likelihood_callback`.
     """
 
     def __init__(self, comm: Communicator, likelihoods: Sequence[tuple[Any, Any]]):
@@ -106,7 +102,7 @@ class Leader:
 
     @property
     def error(self) -> BaseException | None:
-        """Error of an evaluation, after which there is no other."""
+        """Error of an evaluation, after which there are no further evaluations."""
         return self._callback.error
 
     def _evaluate(
@@ -125,7 +121,7 @@ class Leader:
             self._send_record(number, record)
             self._sent[number] = content
         with deferred_interrupts() as interrupted:  # the followers wait in every allgather
-            _send_all(self._comm, _EVALUATE, ((self._name, number), theta, seed))
+            self._comm.send_to_others(_EVALUATE, ((self._name, number), theta, seed))
             values = self._evaluators[number](theta, *record, seed)
         if interrupted.is_set():
             raise KeyboardInterrupt
@@ -134,19 +130,19 @@ class Leader:
     def _send_record(self, number: int, record: _RecordArrays) -> None:
         """Send the followers a likelihood and its record, and wait for the answers of all."""
         likelihood = (self._name, number), *self._likelihoods[number], record
-        _send_all(self._comm, _RECORD, likelihood)
+        self._comm.send_to_others(_RECORD, likelihood)
         answers = [_receive(self._comm) for _ in range(1, self._comm.size)]
         for answer in answers:
             if answer.kind == _FAILED:
                 raise ParallelError(
-                    f"rank {answer.source} of the {self._comm.size} that share a chain cannot "
-                    f"evaluate its likelihood: {answer.value}"
+                    f"rank {answer.source} of the {self._comm.size} that run a chain together "
+                    f"cannot evaluate its likelihood: {answer.value}"
                 )
 
 
 @contextmanager
 def leader_errors(leader: Leader | None) -> Iterator[None]:
-    """Raise the leader's own error instead of the machine code's report that there was one."""
+    """Raise the error of the leader's callback instead of the machine code's report of one."""
     try:
         yield
     except Exception:
@@ -161,20 +157,15 @@ def release_followers(comm: Communicator) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        _send_all(comm, _END, f"the leader of the chain has stopped: {describe_error(error)}")
+        comm.send_to_others(_END, f"the leader of the chain has stopped: {describe_error(error)}")
         if not _is_acknowledged(comm):
             comm.abort(error)
         raise
-    _send_all(comm, _END)
+    comm.send_to_others(_END)
 
 
 def follow(comm: Communicator) -> None:
-    """Take part in the evaluations of the leader, rank 0, until it sends the end.
-
-    Parameters
-    ----------
-    comm : Communicator
-        The group.
+    """Take part in the evaluations of the leader, rank 0 of the group, until it sends the end.
 
     Raises
     ------
@@ -212,7 +203,7 @@ def _evaluate_or_abort(comm: Communicator, evaluate: Callable, *arguments: Any) 
     try:
         evaluate(*arguments)
     except BaseException as error:
-        error.add_note(f"on rank {comm.rank} of the {comm.size} that share a chain")
+        error.add_note(f"on rank {comm.rank} of the {comm.size} that run a chain together")
         comm.abort(error)
         raise
 
@@ -226,12 +217,6 @@ def _is_acknowledged(comm: Communicator) -> bool:
         missing -= message is not None and message.kind == _ACKNOWLEDGED
         time.sleep(0.0 if message else _POLL_SECONDS)
     return not missing
-
-
-def _send_all(comm: Communicator, kind: str, value: Any = None) -> None:
-    """Send to all followers."""
-    for rank in range(1, comm.size):
-        comm.send(rank, kind, value)
 
 
 def _receive(comm: Communicator) -> Message:

@@ -39,6 +39,9 @@ from pymc_statespace_filters.sampling.target.leader_follower import Leader, lead
 class LogDensity:
     """Compiled log-density of a model on its unconstrained space, with its noise as an argument.
 
+    The value variables that are not raveled are further arguments, in the order of their names,
+    ``others``.
+
     Parameters
     ----------
     model : pymc.Model
@@ -51,8 +54,8 @@ class LogDensity:
     compile_kwargs : dict, optional
         Passed to PyMC's compiler.
     fixed_noise : bool
-        Whether every evaluation uses the noise of the model's own seeds. Their normals are then
-        made once, in `prepare`, and the seeds of a call are not read.
+        Whether every evaluation uses the noise of the model's seeds. Their normals are then drawn
+        once, in `prepare`, and the seeds of a call are not read.
     correlation : float, optional
         If given, the normals of an evaluation are ``correlation`` times those carried by the chain
         plus fresh ones, of the same variance.
@@ -61,11 +64,6 @@ class LogDensity:
     group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together. The first, this one, evaluates the
         log-density; the others call `leader_follower.follow`.
-
-    Attributes
-    ----------
-    others : tuple of str
-        Names of the value variables that are not in the vector, in the order of the arguments.
     """
 
     def __init__(
@@ -139,7 +137,7 @@ class LogDensity:
         return self._native
 
     def bind(self) -> "BoundLogDensity":
-        """Make the log-density callable from one thread, with its own arrays."""
+        """Make the log-density callable from one thread, with separate arrays."""
         native = self._native or self.prepare()
         position, others = self._start.copy(), [value.copy() for value in self._others]
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
@@ -174,7 +172,7 @@ class LogDensity:
         return [position, *others, *first, *normals, *each_seed]
 
     def _first_normals(self) -> list[np.ndarray]:
-        """The stored normals; none if ranks share the particles, as each makes its own."""
+        """The stored normals; none if ranks divide the particles, as each draws its part."""
         if self._leader is not None:
             return [np.empty(0) for _ in range(self._n_noises)]
         noise = self._make_noise()
@@ -183,33 +181,20 @@ class LogDensity:
 
 @dataclass(frozen=True)
 class BoundLogDensity:
-    """A log-density with the arrays that its machine code reads and writes.
-
-    Attributes
-    ----------
-    native : NativeLogDensity
-        For machine code.
-    others : list of ndarray
-        Values of the variables that are not in the vector.
-    correlation : ndarray, shape ()
-        Of the noise of an evaluation with the noise in ``carried``; 0 draws fresh noise.
-    carried : ndarray, shape (n_carried,)
-        The normals that the chain carries.
-    raise_error : callable
-        Evaluates again in Python, to raise what the machine code met. It keeps the memory of the
-        machine code's arguments alive.
-    """
+    """A log-density with the arrays that its machine code reads and writes."""
 
     native: NativeLogDensity
-    others: list[np.ndarray]
-    correlation: np.ndarray
-    carried: np.ndarray
+    others: list[np.ndarray]  # values of the variables that are not in the vector
+    correlation: np.ndarray  # (), of an evaluation's noise with that carried; 0 draws fresh noise
+    carried: np.ndarray  # (n_carried,), the normals that the chain carries
+    # Evaluates again in Python, to raise the error of the machine code, and keeps the memory of the
+    # machine code's arguments alive.
     raise_error: Callable[[], None]
 
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: ArrayLike
     ) -> Evaluation:
-        """Evaluate once, from Python.
+        """Evaluate once, from Python; an exception of the model is raised.
 
         Parameters
         ----------
@@ -218,16 +203,7 @@ class BoundLogDensity:
         others : sequence of ndarray
             Values of the other variables.
         seeds : array_like of int64, shape (noisy,)
-            One for each noise seed; not read if the noise is fixed.
-
-        Returns
-        -------
-        Evaluation
-
-        Raises
-        ------
-        Exception
-            What the model raises.
+            The noise seeds; not read if the noise is fixed.
         """
         self.native.position[:] = position
         self.native.seeds[:] = seeds
@@ -242,17 +218,8 @@ class BoundLogDensity:
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:
     """Graph of a cheap log-density: another filter's likelihood, tempered.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    screen : filter
-        Replaces the filter of every StateSpace variable.
-    power : float
-        Exponent of the likelihoods of these variables. Other terms, as priors, have exponent 1.
-
-    Returns
-    -------
-    TensorVariable
+    The screen replaces the filter of every StateSpace variable, and the power is the exponent of
+    the likelihoods of these variables; other terms, as priors, have exponent 1.
 
     Raises
     ------

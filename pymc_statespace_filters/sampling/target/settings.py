@@ -10,33 +10,16 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.inspection import is_filter
-from pymc_statespace_filters.system.checks import is_integer
+from pymc_statespace_filters.system.checks import check_count, is_integer
 
 ADAPTATIONS = ("chain", "continuous")
 
 
 @dataclass(frozen=True)
 class DRAMSettings:
-    """Settings of delayed rejection adaptive Metropolis.
+    """Settings of delayed rejection adaptive Metropolis, described in `DRAM`.
 
-    Attributes
-    ----------
-    stages : tuple of int
-        Stages while tuning and afterwards.
-    stage_scale : float
-        Standard deviation of each stage relative to the one before.
-    adaptation : str
-        One of ``ADAPTATIONS``.
-    adapt_every : int
-        Iterations in a block of warm-up.
-    refresh_noise : bool
-        Whether every proposal has its own noise.
-    correlation : float or None
-        Correlation of a proposal's noise with that of the current point; None draws fresh noise.
-    screen : filter or None
-        Filter whose likelihood screens the proposals.
-    screen_power : float
-        Exponent of that likelihood.
+    ``stages`` becomes a pair, while tuning and afterwards; ``correlation=0`` becomes None.
     """
 
     stages: Any = (2, 1)
@@ -66,10 +49,10 @@ class DRAMSettings:
         return cls(**arguments)
 
     def __post_init__(self) -> None:
-        for field in fields(self):  # settings that are equal shall look equal
+        for field in fields(self):  # equal settings must have equal representations
             if isinstance(value := getattr(self, field.name), np.generic):
                 object.__setattr__(self, field.name, value.item())
-        object.__setattr__(self, "stages", stage_pair(self.stages))
+        object.__setattr__(self, "stages", _stage_pair(self.stages))
         scale = self.stage_scale
         if not _is_real(scale) or not 0.0 < scale < math.inf:
             raise ModelError(f"stage_scale must be a positive number, got {scale!r}")
@@ -78,10 +61,7 @@ class DRAMSettings:
                 f"adaptation must be one of {', '.join(map(repr, ADAPTATIONS))}, got "
                 f"{self.adaptation!r}"
             )
-        if not is_integer(self.adapt_every) or self.adapt_every < 4:
-            raise ModelError(
-                f"adapt_every must be an integer of at least 4, got {self.adapt_every!r}"
-            )
+        check_count("adapt_every", self.adapt_every, 4)
         if not isinstance(self.refresh_noise, bool | np.bool_):
             raise ModelError(f"refresh_noise must be True or False, got {self.refresh_noise!r}")
         if self.screen is not None and not is_filter(self.screen):
@@ -118,22 +98,12 @@ class DRAMSettings:
 
 
 def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
-    """Check the user's proposal covariance.
-
-    Parameters
-    ----------
-    proposal_cov : array_like, shape (d, d)
-    dim : int
-        d.
-
-    Returns
-    -------
-    ndarray of float64, shape (d, d)
+    """Return the user's proposal covariance as a symmetric positive definite matrix.
 
     Raises
     ------
     ModelError
-        If it is not a symmetric positive definite matrix of numbers, d by d.
+        If it is not a symmetric positive definite matrix of numbers, ``dim`` by ``dim``.
     """
     expected = f"proposal_cov must be a symmetric positive definite {dim} x {dim} matrix, got"
     try:
@@ -142,7 +112,8 @@ def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
         raise ModelError(f"{expected} {proposal_cov!r}") from None
     if cov.shape != (dim, dim):
         raise ModelError(f"{expected} shape {cov.shape}")
-    if not np.isfinite(cov).all() or not _is_symmetric(cov):
+    tolerance = {"rtol": 1e-8, "atol": 1e-12 * np.abs(cov).max(initial=0.0)}
+    if not np.isfinite(cov).all() or not np.allclose(cov, cov.T, **tolerance):
         raise ModelError(f"{expected} {cov.tolist()}")
     try:
         np.linalg.cholesky(cov)
@@ -151,14 +122,8 @@ def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
     return 0.5 * (cov + cov.T)
 
 
-def stage_pair(stages: object) -> tuple[int, int]:
-    """Turn an int, or a pair, into the stages while tuning and afterwards.
-
-    Raises
-    ------
-    ModelError
-        If it is neither, or a number is below 1.
-    """
+def _stage_pair(stages: object) -> tuple[int, int]:
+    """Turn an int, or a pair, into the stages while tuning and afterwards."""
     pair = (stages, stages) if is_integer(stages) else stages
     if (
         not isinstance(pair, tuple | list)
@@ -170,10 +135,6 @@ def stage_pair(stages: object) -> tuple[int, int]:
             f"afterwards), got {stages!r}"
         )
     return int(pair[0]), int(pair[1])
-
-
-def _is_symmetric(cov: np.ndarray) -> bool:
-    return np.allclose(cov, cov.T, rtol=1e-8, atol=1e-12 * np.abs(cov).max(initial=0.0))
 
 
 def _is_real(value: object) -> bool:

@@ -29,13 +29,7 @@ from pymc_statespace_filters.sampling.target.variables import (
 
 
 class Growth(NamedTuple):
-    """The variable whose proposals are widest relative to the draws from its prior.
-
-    Attributes
-    ----------
-    name : str
-    factor : float
-    """
+    """The variable whose proposals are widest relative to the draws from its prior."""
 
     name: str
     factor: float
@@ -60,16 +54,8 @@ class Target:
 
     Attributes
     ----------
-    raveled : RaveledVariables
-    prior_draws : PriorDraws
-    density : LogDensity
-    screen : LogDensity or None
-    first_cov : ndarray, shape (d, d)
-        Covariance of the first proposals.
     exact : bool
         Whether the chains target the posterior itself, without the bias of a filter's noise.
-    seed_names : tuple of str
-        Names of the recorded noise seeds.
     samples_all : bool
         Whether no other step method moves continuous variables.
 

@@ -23,18 +23,12 @@ class RaveledVariables:
         Value variables, in the order of the vector.
     point : mapping of str to ndarray
         Any point of the model; only shapes and dtypes are read.
-
-    Attributes
-    ----------
-    variables : tuple of TensorVariable
-    dim : int
-        Length d of the vector.
     """
 
     def __init__(self, variables: Sequence[TensorVariable], point: Mapping[str, np.ndarray]):
         self.variables = tuple(variables)
         self._layout = self._map(point).point_map_info
-        self.dim = sum(size for _, _, size, _ in self._layout)
+        self.dim: int = sum(size for _, _, size, _ in self._layout)
 
     def name_at(self, i: int) -> str:
         """Name of the variable that element i of the vector belongs to."""
@@ -56,13 +50,7 @@ class RaveledVariables:
 def continuous_value_vars(
     vars: Sequence[TensorVariable] | None, model: Model
 ) -> list[TensorVariable]:
-    """Give the value variables of the user's variables, by default of all the model's.
-
-    Raises
-    ------
-    ModelError
-        If one of them is discrete.
-    """
+    """Give the value variables of ``vars``, by default all; a `ModelError` if one is discrete."""
     if vars is None:
         chosen = list(model.value_vars)
     else:
@@ -78,18 +66,12 @@ def continuous_value_vars(
 
 
 def check_no_generators(model: Model) -> None:
-    """Check that the log-density draws no random numbers of its own.
-
-    Raises
-    ------
-    ModelError
-        If a term of it does, as `pymc.Minibatch` and `pymc.Simulator` do.
-    """
+    """Raise a `ModelError` if the log-density draws random numbers, as of `pymc.Minibatch`."""
     for name, term in log_density_terms(model):
         if any(isinstance(v.type, RandomType) for v in graph_inputs([term])):
             raise ModelError(
-                f"the log-density of {name!r} draws random numbers of its own, from a generator "
-                "shared by all chains: the draws would not be a function of random_seed. "
+                f"the log-density of {name!r} draws random numbers from a generator that all "
+                "chains would use: the draws would not be a function of random_seed. "
                 "pm.sample(step=psf.DRAM()) accepts such a model"
             )
 
@@ -98,14 +80,6 @@ def check_noise_dependencies(
     model: Model, sampled: Sequence[TensorVariable], seeds: Mapping[str, TensorVariable]
 ) -> None:
     """Check that no other step method moves a variable of an estimated likelihood.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    sampled : sequence of TensorVariable
-        Value variables that the sampler moves.
-    seeds : mapping of str to shared variable
-        The noise seeds, by the name of their StateSpace variable.
 
     Raises
     ------
