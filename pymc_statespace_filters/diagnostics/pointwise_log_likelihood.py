@@ -41,15 +41,11 @@ def compute_log_likelihood(
     ----------
     idata : xarray.DataTree
         Posterior draws. If ``sample_stats`` holds no seeds, the seed of the model is used.
-    model : pymc.Model, optional
-        The model of the draws; by default that of the ``with`` block.
-    var_name : str, optional
-        Name of a StateSpace variable; all of them by default.
+    model, var_name, progressbar
+        As in `filtered_states`.
     extend_inferencedata : bool
         Whether to add the terms to the group of `idata`, beside those of other variables; otherwise
         the group is returned in a new DataTree.
-    progressbar : bool
-        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------

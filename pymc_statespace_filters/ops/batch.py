@@ -25,14 +25,11 @@ class BatchLogLikelihood(FilterOp):
 
     filter: BatchFilter
     input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
+    output_types = (pt.dmatrix, pt.dmatrix)
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's log-likelihood of many points."""
         return self.filter.compile_batch(system)
-
-    def results(self) -> list[Variable]:
-        """Terms and health of every point."""
-        return [pt.dmatrix(), pt.dmatrix()]
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """A row for every point."""

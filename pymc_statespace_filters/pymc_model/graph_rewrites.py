@@ -1,4 +1,4 @@
-"""Rewrites of a model's graphs that exchange its likelihoods: callbacks, moved noise, filters.
+"""Rewrites of a model's graphs that replace its likelihoods: callbacks, moved noise, other filters.
 
 Every function takes graphs and returns new ones; the model itself is not changed.
 """
@@ -29,15 +29,6 @@ from pymc_statespace_filters.pymc_model.inspection import (
     state_space_nodes,
 )
 from pymc_statespace_filters.system.model import StateSpaceModel
-
-__all__ = [
-    "AutoregressiveNoise",
-    "CallbackLikelihoods",
-    "autoregressive_noise",
-    "smooth_filters",
-    "with_filter",
-    "with_likelihood_callback",
-]
 
 
 class CallbackLikelihoods(NamedTuple):
