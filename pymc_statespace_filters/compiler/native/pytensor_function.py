@@ -32,7 +32,7 @@ _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 
 
 class Call(NamedTuple):
-    """Arguments and results of a call from machine code; each thread needs its own.
+    """Arguments and results of a call from machine code, for one thread at a time.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class NativeFunction:
         if self._is_native:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
-        self._data = [_contiguous(value) for value in shared] if self._is_native else []
+        self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
         self.shapes = [np.shape(result) for result in self(*example)]
 
     @property
@@ -139,10 +139,6 @@ class NativeFunction:
                 out[0] = 0.0
 
         return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(evaluate)
-
-
-def _contiguous(value: np.ndarray) -> np.ndarray:
-    return np.array(value, order="C")
 
 
 @cache

@@ -51,10 +51,11 @@ def density_method(n_active, n_members):
 
 
 class Kernel(NamedTuple):
-    """Mean and bandwidth of the members of a density.
+    """Moments and bandwidth of the members of a density.
 
-    ``mean`` (n,) is that of all states; ``H`` (n_free, n_free) is the lower Cholesky factor of
-    Eqs. 4.38 and 4.39 of the free states. ``active`` marks the directions with any spread.
+    ``mean`` (n,) and ``cov`` (n, n) are those of all states; ``H`` (n_free, n_free) is the lower
+    Cholesky factor of Eqs. 4.38 and 4.39 of the free states. ``active`` marks the directions with
+    any spread.
     """
 
     mean: np.ndarray
@@ -85,11 +86,10 @@ def density_workspace(local, n):
 
 
 @njit_contract
-def scott_bandwidth(local, row, spread, n_effective, free, kernel):
-    """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39); the mean is given.
+def scott_bandwidth(n_effective, free, kernel):
+    """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39) from ``mean`` and ``cov``.
 
-    The covariance is the completed rows of ``sum_products`` of all states over ``spread``. Returns
-    False if the moments are not finite.
+    Returns False if the moments are not finite.
     """
     H, n_active = kernel.H, 0
     floor = np.empty(free.size)
