@@ -1,4 +1,4 @@
-"""Many parameter points and one record: one operation, where a filter moves them side by side."""
+"""The log-likelihood at many parameter points for one record, as a single operation."""
 
 from collections.abc import Sequence
 
@@ -51,7 +51,7 @@ class BatchLogLikelihood(FilterOp):
 
 
 def has_batch(op: LogLikelihood) -> bool:
-    """Whether the operation's filter moves many points side by side."""
+    """Whether the filter of the operation evaluates many points side by side."""
     return isinstance(op.filter, BatchFilter)
 
 
@@ -59,6 +59,8 @@ def vectorized(op: LogLikelihood, theta: Variable, *record: Variable) -> list[Va
     """Terms and health over leading dimensions, of the parameters alone or of any input."""
     cores = [ndim for _, _, ndim in RECORD_INPUTS[1:]]
     extra = [value.type.ndim - ndim for value, ndim in zip(record, cores, strict=True)]
+    if theta.type.ndim == 1 and not any(extra):
+        return op(theta, *record, return_list=True)
     one_record = max(extra) < theta.type.ndim and all(
         length == 1
         for value, n in zip(record, extra, strict=True)

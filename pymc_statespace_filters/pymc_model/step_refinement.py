@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable] | None:
     """A model's log-density with its integration steps, and with steps half as long.
 
-    Both use deterministic filters: the EKF where it can treat the system, else the variable's own.
-    None if no variable has an integrator, or if one has no deterministic filter.
+    Both use deterministic filters: the EKF where it can treat the system, else the filter of the
+    variable. None if no variable has an integrator, or if one has no deterministic filter.
     """
     log_density = model.logp()
     coarse: dict[Variable, Variable] = {}

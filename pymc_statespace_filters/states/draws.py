@@ -95,6 +95,6 @@ def _matching_stats(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:
     if not all(np.isin(values, stats[dim]).all() for dim, values in labels.items()):
         raise ModelError(
             "the draws of the posterior are not among those of sample_stats, so that their noise "
-            "seeds are unknown: select from all groups of idata alike, or drop sample_stats"
+            "seeds are unknown: make the same selection in all groups, or drop sample_stats"
         )
     return stats.sel(labels)

@@ -16,11 +16,7 @@ from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, state_dims
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.record import (
-    check_inputs,
-    n_input_rows,
-    steps_of,
-)
+from pymc_statespace_filters.system.record import check_inputs, n_input_rows, steps_of
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters import FAILURES
+from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 

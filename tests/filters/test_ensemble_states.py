@@ -17,7 +17,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
 from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
-    _share_out,
+    _fill_intervals,
 )
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
@@ -303,7 +303,7 @@ def test_particles_are_chosen_by_weight_and_density():
     assert 0.1 < refused**16 < 0.9
 
     cumulative, begins = np.empty(N), np.empty(N, np.int64)
-    _share_out(w, (cumulative, begins))
+    _fill_intervals(w, (cumulative, begins))
     chosen = np.empty(n_paths, np.int64)
     kernel = (means, roots, log_constants)
     _choose_particles(7, 0, w, (cumulative, begins), kernel, np.tile(x, (n_paths, 1)), chosen)

@@ -10,9 +10,9 @@ from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters import FAILURES
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
+    FAILURES,
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
     NO_PROCESS_NOISE,

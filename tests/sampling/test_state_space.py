@@ -7,7 +7,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import FAILURES
+from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,

@@ -176,6 +176,6 @@ def compiled_of(
     parts: Mapping[str, CompiledFunction],
     recursion: GaussianFilterFunctions,
 ) -> CompiledFunction:
-    """Compile a function that calls these parts; their keys enter its own."""
+    """Compile a function that calls these parts; its key includes theirs."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
     return CompiledFunction(jit(function), key_of(what, *(part.key for part in parts.values())))

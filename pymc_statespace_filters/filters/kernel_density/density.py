@@ -137,7 +137,7 @@ def _whiten(kernel, free, X, first, out):
 
 @inline_always
 def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
-    """Logs of the exact sums at a rank's own targets, which begin at column ``first``."""
+    """Logs of the exact sums at the rank's targets, which begin at column ``first``."""
     complete_points(layout, sources, n_dims)
     y, v = sources.rows[1:], targets.rows[1:]
     _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
@@ -149,8 +149,8 @@ def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
 def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 
-    w, X and V are a rank's own; the density is that of the particles of all ranks. Members of zero
-    weight are ignored and may be NaN. A target that is not finite gets -inf.
+    w, X and V are those of one rank; the density is that of the particles of all ranks. Members of
+    zero weight are ignored and may be NaN. A target that is not finite gets -inf.
     """
     sources, targets, sums = work
     first, last = local.first, local.first + local.size
