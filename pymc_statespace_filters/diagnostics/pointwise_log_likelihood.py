@@ -107,11 +107,6 @@ def sequential_terms(
 
     They are evaluated at the stored, constrained values, so that the estimates of the chain are
     reproduced to the last digit.
-
-    Raises
-    ------
-    ModelError
-        As `compute_log_likelihood`.
     """
     name, noisy = variable.name, variable.filter.noisy
     if noisy and draws.noise_moved:
@@ -121,7 +116,7 @@ def sequential_terms(
         )
     at_draws = VariableAtDraws(model, variable, draws)
     seeds = draws.stored_seeds(name) if noisy else None
-    if seeds is None:  # held by the model, or not used by the filter
+    if seeds is None:  # use the model's seed; a deterministic filter ignores it
         held = variable.seed.eval(mode="FAST_COMPILE")
         seeds = np.full(np.prod(draws.shape), held, dtype=np.int64)
     seed = pt.lscalar("seed")

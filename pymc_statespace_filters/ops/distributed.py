@@ -52,11 +52,6 @@ def distributed_evaluator(system: StateSpaceModel, filter: Filter, comm: Communi
 
     All ranks call it with the same arguments. Each moves its local members, and all get the same
     result, to the bit that of one rank.
-
-    Raises
-    ------
-    ModelError
-        If the filter has no members for so many ranks.
     """
     check_ranks(filter, comm.size)
     if comm.size == 1:
@@ -138,17 +133,9 @@ class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
 class PythonCallback:
     """A Python function that evaluates likelihoods for machine code.
 
-    Parameters
-    ----------
-    evaluate : callable
-        ``(number, theta, steps, observed, inputs, t0, seed) -> (terms, health)``, of copies.
-
-    Attributes
-    ----------
-    address : ndarray of int64, shape ()
-        Address for machine code, valid while this object lives.
-    error : Exception or None
-        What the function raised. From then on it is not called, and every evaluation raises.
+    ``evaluate(number, theta, steps, observed, inputs, t0, seed)`` receives copies and returns terms
+    and health. Machine code calls it at ``address``, which is valid while this object lives. What
+    it raises is stored in ``error``; from then on it is not called, and every evaluation raises.
     """
 
     def __init__(self, evaluate: Evaluate):
@@ -160,20 +147,8 @@ class PythonCallback:
         address = ctypes.cast(self._callback, pointer).value
         self.address = np.array(address, dtype=np.int64)
 
-    def _called(
-        self,
-        number: int,
-        theta: int,
-        steps: int,
-        observed: int,
-        inputs: int,
-        t0: float,
-        seed: int,
-        sizes: int,
-        terms: int,
-        health: int,
-        raised: int,
-    ) -> None:
+    def _called(self, number: int, *arguments: Any) -> None:
+        theta, steps, observed, inputs, t0, seed, sizes, terms, health, raised = arguments
         # An exception cannot pass through machine code.
         try:
             if self.error is None:

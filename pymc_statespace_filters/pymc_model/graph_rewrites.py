@@ -107,11 +107,6 @@ def autoregressive_noise(
     standard normal again (Deligiannidis, Doucet and Pitt 2018). Filters are replaced by their
     smooth versions, whose estimate moves little if the normals do. With rho = 0 the estimate is
     that of the seed.
-
-    Raises
-    ------
-    ModelError
-        If a filter has no smooth version for its system.
     """
     correlation = pt.dscalar("correlation")
     innovation = pt.sqrt(1.0 - correlation**2)
@@ -150,12 +145,6 @@ def with_filter(
     ``filters`` maps names of variables to their new filters. Data, parameters and seed stay the
     same: a deterministic filter ignores the seed, and a noisy filter that replaces a deterministic
     one uses that variable's constant seed.
-
-    Raises
-    ------
-    ModelError
-        If a name is not that of a StateSpace variable, its likelihood is not in the graphs, or the
-        filter cannot treat its system.
     """
     variables = state_space_nodes(model)
     for name, filter in filters.items():

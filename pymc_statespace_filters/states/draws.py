@@ -16,15 +16,9 @@ SAMPLE_DIMS = ("chain", "draw")
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws with the dimensions chain and draw, and their sampler statistics.
+    """Draws with the dimensions chain and draw, and their sampler statistics, which may be empty.
 
-    Attributes
-    ----------
-    posterior : xarray.Dataset
-    stats : xarray.Dataset
-        Empty if there are none.
-    noise_moved : bool
-        Whether the chain moved its noise (``correlation``), so that no seed reproduces it.
+    ``noise_moved``: the chain moved its noise (``correlation``), so that no seed reproduces it.
     """
 
     posterior: xr.Dataset

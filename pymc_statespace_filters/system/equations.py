@@ -49,15 +49,9 @@ class Equation:
 
 
 def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
-    """Read the signature of a user's function.
+    """Read the signature of a user's function, called ``role`` in messages.
 
-    Parameters
-    ----------
-    role : str
-        The function's name in messages.
-    function : callable
-    symbols : sequence of str
-        The reserved names that it may have as arguments; other arguments are parameters.
+    ``symbols`` are the reserved names that it may have as arguments; others are parameters.
     """
     if not callable(function):
         raise ModelError(f"{role} must be a function, got {function!r}")

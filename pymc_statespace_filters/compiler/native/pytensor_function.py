@@ -57,23 +57,8 @@ def make_call(call):
 class NativeFunction:
     """A compiled PyTensor function whose inputs and outputs are arrays of numbers.
 
-    In PyTensor's modes without numba, machine code calls Python instead.
-
-    Parameters
-    ----------
-    function : pytensor.compile.executor.Function
-    example : sequence of ndarray
-        Inputs of a first call, which determines types and shapes.
-
-    Attributes
-    ----------
-    shapes : list of tuple of int
-        Shapes of the results.
-
-    Raises
-    ------
-    Exception
-        Any exception that the function raises at the example.
+    ``example`` holds the inputs of a first call, which determines types and ``shapes`` of the
+    results. In PyTensor's modes without numba, machine code calls Python instead.
     """
 
     def __init__(self, function: Any, example: Sequence[np.ndarray]):
@@ -102,13 +87,9 @@ class NativeFunction:
             return self._function(*inputs)
 
     def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
-        """Prepare a call that reads these contiguous arrays.
+        """A call that reads these contiguous arrays, and the object that holds its memory.
 
-        Returns
-        -------
-        Call
-        object
-            Owns the memory of the call; keep it as long as the call.
+        Keep the object as long as the call.
         """
         out = np.zeros(1 + self.size)
         if not self._is_native:
