@@ -39,7 +39,7 @@ def noise_was_moved(idata: xr.DataTree) -> bool:
 
 
 def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float64]:
-    """The posterior group, checked against the model, in the unconstrained space (chain, draw, k)."""
+    """The posterior group, checked against the model, in unconstrained space (chain, draw, k)."""
     posterior = posterior_group(idata)
     missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
     if missing:
