@@ -55,11 +55,11 @@ def test_the_graph_gives_the_numbers_of_the_filter(mode):
 
     density = model.logp()
     graphs = [density, *health_outputs([density])]
-    replaced, delegable = with_likelihood_callback(graphs, {})
-    kinds += delegable.kinds
+    replaced, likelihoods = with_likelihood_callback(graphs, {})
+    kinds += likelihoods.kinds
     a = model.value_vars[0]
     plain = pytensor.function([a], graphs, mode=mode)
-    shared = pytensor.function([a, delegable.address], replaced, mode=mode)
+    shared = pytensor.function([a, likelihoods.address], replaced, mode=mode)
     callback = PythonCallback(evaluate)
     for value in (0.7, -0.4, 2.0):
         for mine, theirs in zip(shared(value, callback.address), plain(value), strict=True):
@@ -68,13 +68,13 @@ def test_the_graph_gives_the_numbers_of_the_filter(mode):
 
 def test_likelihoods_without_noise_stay():
     model = two_systems(psf.EKF(), FEW)
-    replaced, delegable = with_likelihood_callback([model.logp()], {})
-    assert delegable.kinds == ((FORCED, FEW),)
+    replaced, likelihoods = with_likelihood_callback([model.logp()], {})
+    assert likelihoods.kinds == ((FORCED, FEW),)
     assert filters_in(replaced) == sorted(map(repr, (psf.EKF(), FEW)))
 
 
-def test_twins_are_evaluated_each_with_its_own_seed():
-    """Two variables of one system are told apart by their numbers."""
+def test_equal_systems_are_evaluated_each_with_its_seed():
+    """Two variables of one system differ in the number given to the callback."""
     model = twins(FEW, FEW)
     seen = {}
 
@@ -82,11 +82,11 @@ def test_twins_are_evaluated_each_with_its_own_seed():
         seen[number] = record[-1]
         return np.zeros(STEPS.size), np.array([9.0, 0.0, -1.0])
 
-    replaced, delegable = with_likelihood_callback([model.logp()], {})
-    function = pytensor.function([model.value_vars[0], delegable.address], replaced)
+    replaced, likelihoods = with_likelihood_callback([model.logp()], {})
+    function = pytensor.function([model.value_vars[0], likelihoods.address], replaced)
     callback = PythonCallback(evaluate)
     function(0.3, callback.address)
-    assert len(delegable.kinds) == 2
+    assert len(likelihoods.kinds) == 2
     assert sorted(seen) == [0, 1]
     assert set(seen.values()) == {1, 2}
 
