@@ -10,13 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+    jit,
+)
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariance_check,
-    covariances,
-    followed_by_square_roots,
+    semidefinite_cholesky,
 )
+from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
@@ -221,15 +226,18 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
 def _noise(system: StateSpaceModel) -> CompiledFunction:
     """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (m + p, steps).
 
-    The first m rows of Z have the covariance of q. The covariances may be singular.
+    The first m rows of Z have the covariance of q. The covariances may be singular; that they are
+    covariances at theta has been checked.
     """
-    n, m, n_rows = system.n, system.m, system.m + system.p
-    is_white = system.equations.process_noise is None
-    graphs = covariances(system)
-    graphs.pop("observation_noise", None)
+    equations, n, m = system.equations, system.n, system.m
+    is_white = equations.process_noise is None
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    prepare = followed_by_square_roots([], system, theta, graphs)
-    square_roots = prepare.function
+    covs = [call(equations.initial_cov, system, {"theta": theta})]
+    if not is_white:
+        covs.append(call(equations.process_noise, system, {"theta": theta}))
+    graph = Graph({"theta": theta}, [pt.concatenate([cov.ravel() for cov in covs])])
+    flat = vector_functions({"covariances": VectorFunction("c", graph)})["covariances"]
+    covariances, n_rows = flat.function, m + system.p
     FILL_NORMALS.compile()
     fill, purpose = FILL_NORMALS.external, np.int64(STATES)
 
@@ -238,20 +246,25 @@ def _noise(system: StateSpaceModel) -> CompiledFunction:
         X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
         fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
         fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
-        roots = square_roots(theta)
-        multiply_by_lower(roots[: n * n].reshape(n, n), X)
+        values = covariances(theta)
+        apply_covariance(values, 0, n, X)
         if not is_white:
-            multiply_by_lower(roots[n * n :].reshape(m, m), Z)
+            apply_covariance(values, n * n, m, Z)
         return X, Z
 
-    key = key_of(f"noise of states {n} {m} {n_rows}", prepare.key, FILL_NORMALS.key)
+    key = key_of(f"noise of states {n} {m} {n_rows}", flat.key, FILL_NORMALS.key)
     return CompiledFunction(jit(noise), key)
 
 
 @jit
-def multiply_by_lower(root, Z):
-    """Multiply the first rows of Z by a lower triangular matrix, in place."""
-    for i in range(root.shape[0] - 1, -1, -1):  # last row first: each uses itself and those above
+def apply_covariance(values, first, size, Z):
+    """Multiply ``size`` rows of standard normals by the root of the covariance in ``values``."""
+    root = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            root[i, j] = values[first + i * size + j]
+    semidefinite_cholesky(root)
+    for i in range(size - 1, -1, -1):  # last row first: a row depends on itself and those above
         for member in range(Z.shape[1]):
             total = 0.0
             for j in range(i + 1):
