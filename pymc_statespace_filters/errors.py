@@ -118,8 +118,6 @@ class ParallelWarning(UserWarning):
 
     Examples
     --------
-    To raise an error instead:
-
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
@@ -132,8 +130,6 @@ class FilterWarning(UserWarning):
 
     Examples
     --------
-    To raise an error instead:
-
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
@@ -146,8 +142,6 @@ class EvidenceWarning(UserWarning):
 
     Examples
     --------
-    To silence the warning:
-
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
@@ -160,8 +154,6 @@ class CheckpointWarning(UserWarning):
 
     Examples
     --------
-    To raise an error instead, and inspect the folder:
-
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():

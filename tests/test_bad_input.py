@@ -302,7 +302,7 @@ def test_a_density_alone_cannot_be_simulated():
     system = make(
         observation=..., observation_noise=..., observation_logp=lambda d, x: -(d[0] ** 2)
     )
-    with pytest.raises(psf.ModelError, match="simulating needs `observation`"):
+    with pytest.raises(psf.ModelError, match="simulating needs observation"):
         psf.simulate(system, {"a": 1.0}, steps=[1])
 
 

@@ -31,7 +31,7 @@ def residual_of(pit: Array, n_draws: int) -> Array:
 
 
 def coverage_of(pit: Array, prob: float) -> Array:
-    """Share of observations (J, p) within the central prediction interval, (p,)."""
+    """Fraction of observations (J, p) within the central prediction interval, (p,)."""
     known = np.isfinite(pit)
     inside = np.abs(pit - 0.5) <= prob / 2
     n_known = known.sum(axis=0)

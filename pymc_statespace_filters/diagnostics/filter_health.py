@@ -16,7 +16,7 @@ from pymc_statespace_filters.diagnostics.calibration import (
 )
 from pymc_statespace_filters.diagnostics.truncated_data import observed_values
 from pymc_statespace_filters.evaluation.simulate import observer
-from pymc_statespace_filters.pymc_model.inspection import COLLAPSED
+from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
 from pymc_statespace_filters.states.groups import add_group
@@ -57,22 +57,10 @@ def filter_diagnostics(
 
     Parameters
     ----------
-    idata : xarray.DataTree
-        Posterior draws from any sampler.
-    model : pymc.Model, optional
-        The model of the draws; by default that of the ``with`` block.
-    var_name : str, optional
-        Name of a StateSpace variable; all of them by default.
-    filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter, optional
-        A filter to use instead of the variable's own.
-    n_draws : int, optional
-        Number of draws, spread evenly over every chain; all by default.
+    idata, model, var_name, filter, n_draws, extend_inferencedata, progressbar
+        As in `filtered_states`.
     random_seed : None, int or numpy.random.Generator
         Seed of states, simulated observations and random tie-breaking.
-    extend_inferencedata : bool
-        Whether to add the group to `idata`; otherwise it is returned in a new DataTree.
-    progressbar : bool
-        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------
@@ -83,17 +71,17 @@ def filter_diagnostics(
           drawn given the earlier observations; NaN after a failure of the filter.
         * ``d_n_effective`` (chain, draw, d_time): the effective number of particles or members in
           the update by each observation, infinite for a deterministic filter.
-        * ``d_pit`` (d_time, observable): the share of predictions not above the observation, with
-          ties broken at random so that counts are uniform too; NaN where the observation is
+        * ``d_pit`` (d_time, observable): the fraction of predictions not above the observation,
+          with ties broken at random so that counts are uniform too; NaN where the observation is
           missing.
         * ``d_residual`` (d_time, observable): the standard normal quantile of ``d_pit``.
-        * ``d_coverage`` (interval, observable): the share of observations within the central 50 %
-          and 90 % prediction intervals.
+        * ``d_coverage`` (interval, observable): the fraction of observations within the central
+          50 % and 90 % prediction intervals.
         * ``d_uniformity``, ``d_whiteness`` (observable): p-values of tests that ``d_pit`` is
           uniform (the test of ArviZ's PIT plots), and that ``d_residual`` has no autocorrelation
           (Ljung-Box, up to lag 10, missing ones dropped).
-        * ``d_failed``, ``d_collapsed``: the share of draws at which the filter failed, and at which
-          the effective number of particles fell below 3 at some observation.
+        * ``d_failed``, ``d_collapsed``: the fraction of draws at which the filter failed, and at
+          which the effective number of particles fell below 3 at some observation.
 
         `plot_filter_health` plots the group. ArviZ plots the PIT alone by
         ``az.plot_ecdf_pit(idata, var_names="d_pit", group="filter_diagnostics",
@@ -175,7 +163,7 @@ def _results_by_draw(
     predicted: Array,
     after: States,
 ) -> xr.Dataset:
-    """Predictions and effective sample sizes of every draw, and shares of the draws."""
+    """Predictions and effective sample sizes of every draw; fractions of failed draws."""
     name, (time, observable) = variable.name, variable.dims
     smallest = np.fmin.reduce(after.n_effective, axis=1, initial=np.inf)
     found = draws.dataset(

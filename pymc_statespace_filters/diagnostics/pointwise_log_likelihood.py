@@ -41,15 +41,11 @@ def compute_log_likelihood(
     ----------
     idata : xarray.DataTree
         Posterior draws. If ``sample_stats`` holds no seeds, the seed of the model is used.
-    model : pymc.Model, optional
-        The model of the draws; by default that of the ``with`` block.
-    var_name : str, optional
-        Name of a StateSpace variable; all of them by default.
+    model, var_name, progressbar
+        As in `filtered_states`.
     extend_inferencedata : bool
         Whether to add the terms to the group of `idata`, beside those of other variables; otherwise
         the group is returned in a new DataTree.
-    progressbar : bool
-        Whether to show a progress bar if the work takes more than two seconds.
 
     Returns
     -------
@@ -111,11 +107,6 @@ def sequential_terms(
 
     They are evaluated at the stored, constrained values, so that the estimates of the chain are
     reproduced to the last digit.
-
-    Raises
-    ------
-    ModelError
-        As `compute_log_likelihood`.
     """
     name, noisy = variable.name, variable.filter.noisy
     if noisy and draws.noise_moved:
@@ -125,7 +116,7 @@ def sequential_terms(
         )
     at_draws = VariableAtDraws(model, variable, draws)
     seeds = draws.stored_seeds(name) if noisy else None
-    if seeds is None:  # held by the model, or not used by the filter
+    if seeds is None:  # use the model's seed; a deterministic filter ignores it
         held = variable.seed.eval(mode="FAST_COMPILE")
         seeds = np.full(np.prod(draws.shape), held, dtype=np.int64)
     seed = pt.lscalar("seed")

@@ -1,1 +1,1 @@
-"""Records, likelihoods and filtered states without PyMC."""
+"""Likelihoods, filter runs and simulation without PyMC."""

@@ -68,7 +68,7 @@ def log_likelihood(
     ModelError
         If an argument does not fit the system, or the filter has not enough members for the ranks.
     ParallelError
-        If MPI cannot be had as it was asked for, or the ranks are not alike.
+        If MPI cannot be used as requested, or the ranks differ.
 
     Warns
     -----
@@ -122,8 +122,8 @@ def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.nd
     for rank, theirs in enumerate(digests):
         if theirs != digests[0]:
             raise DataMismatchError(
-                f"rank {rank} of {ranks.size} was asked for the likelihood of other parameters, "
-                f"seeds or data than rank 0, or by another filter: all must make the same call"
+                f"all ranks must make the same call, got other parameters, seeds, data or another "
+                f"filter on rank {rank} of {ranks.size} than on rank 0"
             )
 
 
@@ -135,10 +135,10 @@ def _evaluate(
     seeds: np.ndarray,
     ranks: Communicator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Terms and health of every point: side by side where the filter can, else in turn."""
+    """Terms and health of every point: as a batch if the filter has one, else one by one."""
     check_ranks(filter, ranks.size)
     if len(points) > 1 and has_batch(LogLikelihood(system, filter)):
-        # Such a filter draws nothing: any seed will do.
+        # A filter with batches is deterministic: any seed will do.
         return evaluator(BatchLogLikelihood(system, filter))(points, *record, seeds[0])
     evaluate = distributed_evaluator(system, filter, ranks)
     terms = np.empty((len(points), record[0].size))

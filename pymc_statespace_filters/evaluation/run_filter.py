@@ -1,4 +1,4 @@
-"""A filter at fixed parameters without PyMC: its terms, and the states that it knew."""
+"""A run of a filter at fixed parameters, without PyMC: likelihood terms and filtered states."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -29,7 +29,7 @@ def run_filter(
     seed: int = 0,
     at: str = "observations",
 ) -> xr.Dataset:
-    """Run a filter along a record at one value of each parameter, and keep what it knew.
+    """Run a filter along a record at one value of each parameter, and return terms and states.
 
     Parameters
     ----------
@@ -37,16 +37,8 @@ def run_filter(
     filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter
     params : mapping
         A value for every parameter.
-    observed : array_like, shape (J, p), or (J,) if p = 1
-        The record; NaN marks a missing component.
-    steps : array_like of int, shape (J,)
-        The step of each observation; 0 is where the initial state holds. Or give `times`.
-    times : array_like, shape (J,)
-        Times of the observations, on the grid ``t0 + k * dt`` to a millionth of a step.
-    inputs : array_like, shape (rows, n_inputs)
-        Row k holds during step k.
-    t0 : float
-        Time of step 0.
+    observed, steps, times, inputs, t0
+        The record, as in `log_likelihood`.
     seed : int
         The noise inside the filter, if it has any. The run is that of `log_likelihood` with this
         seed.
@@ -56,7 +48,7 @@ def run_filter(
     Returns
     -------
     xarray.Dataset
-        Of the state given the observations up to its own time: ``mean`` and ``sd`` (time, state),
+        Of the state given the observations up to its time: ``mean`` and ``sd`` (time, state),
         ``cov`` (time, state, state_bis), the covariance. Of EnKF, BootstrapPF and PFEnKF also
         ``particles`` (time, particle, state) and ``weights`` (time, particle), which sum to one,
         before resampling; a particle that is not finite has weight zero, and where none is finite
@@ -126,7 +118,7 @@ def _dataset(
     members: np.ndarray,
     weights: np.ndarray,
 ) -> xr.Dataset:
-    """The states at some times, with members if there are any."""
+    """States by time, with members if the filter has any."""
     variances = np.diagonal(cov, axis1=1, axis2=2)
     found: dict[str, tuple] = {
         "mean": (("time", "state"), mean),

@@ -16,25 +16,21 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import check_finite, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import (
-    check_inputs,
-    check_system,
-    steps_of,
-)
+from pymc_statespace_filters.system.record import check_inputs, check_system, steps_of
 
 
 @lru_cache(maxsize=256)
 def continuation(system: StateSpaceModel) -> CompiledFunction:
     """The function (rng, theta, x, first, steps, inputs, t0) -> states (R, n), observations (R, p).
 
-    It goes on from the state x (n,) of step ``first`` and keeps what it meets at ``steps``, which
-    increase from there on.
+    It starts at the state x (n,) of step ``first`` and returns states and observations at
+    ``steps``, which increase and are not below ``first``.
     """
     compiled, sampler = compile_system(system), _sampler(system)
     prepare, propagate = compiled.prepare.function, compiled.propagate.function
     observe, dt, n, m, p = sampler.function, system.dt, system.n, compiled.m, system.p
 
-    def go_on(rng, theta, x, first, steps, inputs, t0):
+    def run(rng, theta, x, first, steps, inputs, t0):
         c = prepare(theta)
         states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
         now, k = x.copy().reshape(n, 1), first
@@ -47,7 +43,7 @@ def continuation(system: StateSpaceModel) -> CompiledFunction:
         return states, observations
 
     keys = compiled.prepare.key, compiled.propagate.key, sampler.key
-    return _cached(go_on, key_of(f"continuation {dt!r} {n} {m} {p}", *keys))
+    return _cached(run, key_of(f"continuation {dt!r} {n} {m} {p}", *keys))
 
 
 @lru_cache(maxsize=256)
@@ -59,18 +55,18 @@ def observer(system: StateSpaceModel) -> CompiledFunction:
     constants, sampler = compile_system(system).prepare, _sampler(system)
     prepare, observe, dt, p = constants.function, sampler.function, system.dt, system.p
 
-    def look(rng, theta, states, steps, inputs, t0):
+    def run(rng, theta, states, steps, inputs, t0):
         c, observations = prepare(theta), np.empty((steps.size, p))
         for i in range(steps.size):
             x, k = states[i].copy().reshape(-1, 1), steps[i]
             observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
         return observations
 
-    return _cached(look, key_of(f"observer {dt!r} {p}", constants.key, sampler.key))
+    return _cached(run, key_of(f"observer {dt!r} {p}", constants.key, sampler.key))
 
 
 def _cached(function: Callable, key: str | None) -> CompiledFunction:
-    """Compile a function, or load it from disk if any process compiled it before."""
+    """Compile a function, or load it from disk if it was compiled before."""
     compiled = jit(function)
     return CompiledFunction(compiled if key is None else cached_on_disk(compiled, key), key)
 
@@ -78,8 +74,8 @@ def _cached(function: Callable, key: str | None) -> CompiledFunction:
 def _sampler(system: StateSpaceModel) -> CompiledFunction:
     if system.equations.observation is None and system.equations.observation_draw is None:
         raise ModelError(
-            "the system has a density of observations (observation_logp) but nothing to draw "
-            "them from; simulating needs `observation` with `observation_noise` too"
+            "simulating needs observation and observation_noise, or observation_dist, got a system "
+            "with a density of observations alone (observation_logp)"
         )
     return observation_sampler(system)
 

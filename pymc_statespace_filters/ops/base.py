@@ -1,8 +1,8 @@
-"""What every operation on a record has in common: its inputs, their checks, and its machine code.
+"""The base class of all operations on a record: inputs, their checks, and machine code.
 
-All are pure: parameters, data and the noise seed are inputs, and equal inputs give equal outputs.
-Nothing that matters is closed over, so that neither merging of equal nodes nor the cache of
-machine code on disk can mix two data sets up.
+Operations are pure: parameters, data and the noise seed are inputs, and equal inputs give equal
+outputs. No data are closed over, so neither PyTensor's merging of equal nodes nor the cache of
+machine code on disk can confuse two data sets.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +16,7 @@ from pytensor.gradient import grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
+from pytensor.tensor.type import TensorType
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.compiled_system import (
@@ -53,6 +54,7 @@ class FilterOp(Op):
 
     __props__ = ("system", "filter")
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
+    output_types: ClassVar[tuple[TensorType, ...]]
     checks_record: ClassVar[bool] = True
     # How an input is written in the call of the kernel, where not as a number or a copy.
     argument_code: ClassVar[Mapping[str, str]] = {}
@@ -69,13 +71,9 @@ class FilterOp(Op):
         """Compile the function of the inputs."""
         raise NotImplementedError
 
-    def results(self) -> list[Variable]:
-        """Fresh variables for the outputs."""
-        raise NotImplementedError
-
     def make_node(self, *inputs: Any) -> Apply:
         """Apply to symbols or numbers; the names and types are in `input_types`."""
-        return Apply(self, _typed(inputs, self.input_types), self.results())
+        return Apply(self, _typed(inputs, self.input_types), [kind() for kind in self.output_types])
 
     def perform(self, node: Apply, inputs: Sequence, output_storage: Sequence) -> None:
         """Evaluate in PyTensor's modes without numba: by the same machine code."""
@@ -103,8 +101,8 @@ def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
 def evaluator(op: FilterOp) -> Any:
     """A compiled Python function of the operation's inputs; its machine code is cached on disk.
 
-    It is the machine code itself. The object around it keeps the arguments of a call in cells that
-    all callers share, and another thread's arguments would get in between.
+    It calls the machine code directly. PyTensor's function object stores the arguments of a call in
+    cells that all threads would overwrite.
     """
     inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in op.input_types]
     function = pytensor.function(
@@ -120,7 +118,7 @@ def evaluator(op: FilterOp) -> Any:
 
 
 def check_record(system: StateSpaceModel) -> Any:
-    """A compiled check of what `pm.set_data` may have exchanged; a kernel reads on regardless."""
+    """A compiled check of what `pm.set_data` may have replaced; kernels do not check bounds."""
     return _check_of_inputs(system.n_inputs, int(system.observation_uses_inputs))
 
 
@@ -153,7 +151,7 @@ def check_observed(p: int) -> Any:
 
 
 def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None:
-    """What the machine code of this file is made of, on top of a compiled function."""
+    """The key of a compiled function together with the checks of its record."""
     checked = (system.p, system.n_inputs, system.observation_uses_inputs)
     return key_of(f"checked for {checked}", compiled.key)
 
@@ -167,9 +165,7 @@ def kernel(op: FilterOp) -> CompiledFunction:
 class ThetaDerivative(FilterOp):
     """An operation whose result is a cotangent of theta."""
 
-    def results(self) -> list[Variable]:
-        """The derivative by theta."""
-        return [pt.dvector()]
+    output_types = (pt.dvector,)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """The shape of theta."""
@@ -189,19 +185,19 @@ def theta_cotangent_only(op: Op, inputs: Sequence[Variable], theta_bar: Variable
 def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     """Check the record, then call the kernel.
 
-    Kernels are given copies: constants and variables, C and Fortran order differ in type, and every
-    combination of types would be compiled anew, which takes seconds where a copy takes nanoseconds.
-    The function is written out for each operation; one that looped over its inputs would cost time
-    in every call and seconds of compilation.
+    Kernels receive copies: constants and variables, C and Fortran order differ in type, and each
+    combination of types would be compiled separately, which takes seconds where a copy takes
+    nanoseconds. The function is written out for each operation; a loop over the inputs would cost
+    time in every call and seconds of compilation.
     """
     compiled = kernel(op)
     names = [name for name, _, _ in op.input_types]
-    handed = [
+    arguments = [
         op.argument_code.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
         for name, _, ndim in op.input_types
     ]
     checks = ["check(steps, inputs)", "check_observed(steps, observed)"] * op.checks_record
-    lines = [*checks, f"return run({', '.join(handed)})"]
+    lines = [*checks, f"return run({', '.join(arguments)})"]
     source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
     namespace = {
         "__name__": __name__,

@@ -1,4 +1,4 @@
-"""Many parameter points and one record: one operation, where a filter moves them side by side."""
+"""The log-likelihood at many parameter points for one record, as a single operation."""
 
 from collections.abc import Sequence
 
@@ -25,14 +25,11 @@ class BatchLogLikelihood(FilterOp):
 
     filter: BatchFilter
     input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
+    output_types = (pt.dmatrix, pt.dmatrix)
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's log-likelihood of many points."""
         return self.filter.compile_batch(system)
-
-    def results(self) -> list[Variable]:
-        """Terms and health of every point."""
-        return [pt.dmatrix(), pt.dmatrix()]
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """A row for every point."""
@@ -54,7 +51,7 @@ class BatchLogLikelihood(FilterOp):
 
 
 def has_batch(op: LogLikelihood) -> bool:
-    """Whether the operation's filter moves many points side by side."""
+    """Whether the filter of the operation evaluates many points side by side."""
     return isinstance(op.filter, BatchFilter)
 
 
@@ -62,6 +59,8 @@ def vectorized(op: LogLikelihood, theta: Variable, *record: Variable) -> list[Va
     """Terms and health over leading dimensions, of the parameters alone or of any input."""
     cores = [ndim for _, _, ndim in RECORD_INPUTS[1:]]
     extra = [value.type.ndim - ndim for value, ndim in zip(record, cores, strict=True)]
+    if theta.type.ndim == 1 and not any(extra):
+        return op(theta, *record, return_list=True)
     one_record = max(extra) < theta.type.ndim and all(
         length == 1
         for value, n in zip(record, extra, strict=True)

@@ -1,10 +1,10 @@
 """Log-likelihoods that several ranks evaluate together.
 
-`DistributedLogLikelihood` is called by all ranks at once. In a chain that ranks share, one of them
-runs the sampler: there the log-likelihood is a `CallbackLogLikelihood`, which calls a Python
-function, a `PythonCallback`, that makes all ranks evaluate. The address of the callback is an
-argument, so that the surrounding machine code is the same with and without it, and so are its
-numbers, to the bit.
+`DistributedLogLikelihood` is called by all ranks at once. Where several ranks evaluate one chain,
+one of them runs the sampler: there the log-likelihood is a `CallbackLogLikelihood`, which calls a
+Python function, a `PythonCallback`, that makes all ranks evaluate. The address of the callback is
+an argument, so that the surrounding machine code, and its numbers to the bit, are the same with and
+without it.
 """
 
 import ctypes
@@ -37,11 +37,8 @@ class DistributedLogLikelihood(LogLikelihood):
 
     filter: EnsembleFilter
     input_types = (
-        *RECORD_INPUTS,
-        ("rank", "int64", 0),
-        ("n_ranks", "int64", 0),
-        ("exchange", "int64", 0),
-    )
+        *RECORD_INPUTS, ("rank", "int64", 0), ("n_ranks", "int64", 0), ("exchange", "int64", 0),
+    )  # fmt: skip
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str]] = {}
 
@@ -55,11 +52,6 @@ def distributed_evaluator(system: StateSpaceModel, filter: Filter, comm: Communi
 
     All ranks call it with the same arguments. Each moves its local members, and all get the same
     result, to the bit that of one rank.
-
-    Raises
-    ------
-    ModelError
-        If the filter has no members for so many ranks.
     """
     check_ranks(filter, comm.size)
     if comm.size == 1:
@@ -127,9 +119,9 @@ class CallbackLogLikelihood(LogLikelihood):
 
 
 class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
-    """The same with a vector of `StoredNoise` that is read in place of the seed, or is empty.
+    """The same with a vector of `StoredNoise`, which replaces the seed unless it is empty.
 
-    The callback gets the seed only.
+    The callback receives the seed only.
     """
 
     input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_CALLBACK)
@@ -141,17 +133,9 @@ class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
 class PythonCallback:
     """A Python function that evaluates likelihoods for machine code.
 
-    Parameters
-    ----------
-    evaluate : callable
-        ``(number, theta, steps, observed, inputs, t0, seed) -> (terms, health)``. It gets copies.
-
-    Attributes
-    ----------
-    address : ndarray of int64, shape ()
-        Where machine code finds it, while this object lives and no longer.
-    error : Exception or None
-        What the function raised. It is called no more from then on, and every evaluation raises.
+    ``evaluate(number, theta, steps, observed, inputs, t0, seed)`` receives copies and returns terms
+    and health. Machine code calls it at ``address``, which is valid while this object lives. What
+    it raises is stored in ``error``; from then on it is not called, and every evaluation raises.
     """
 
     def __init__(self, evaluate: Evaluate):
@@ -163,20 +147,8 @@ class PythonCallback:
         address = ctypes.cast(self._callback, pointer).value
         self.address = np.array(address, dtype=np.int64)
 
-    def _called(
-        self,
-        number: int,
-        theta: int,
-        steps: int,
-        observed: int,
-        inputs: int,
-        t0: float,
-        seed: int,
-        sizes: int,
-        terms: int,
-        health: int,
-        raised: int,
-    ) -> None:
+    def _called(self, number: int, *arguments: Any) -> None:
+        theta, steps, observed, inputs, t0, seed, sizes, terms, health, raised = arguments
         # An exception cannot pass through machine code.
         try:
             if self.error is None:

@@ -1,8 +1,8 @@
-"""The log-likelihood of a record as a PyTensor operation, and its gradient as a second one.
+"""The log-likelihood of a record and its gradient as PyTensor operations.
 
-`LogLikelihood` and `LogLikelihoodGradient` are complete by themselves, so that a graph may hold
-either alone. Where one graph holds both at the same inputs, a rewrite replaces them by one pass
-forwards that leaves a tape, `TapedLogLikelihood`, and one pass back over it, `TapePullback`.
+A graph may hold `LogLikelihood` or `LogLikelihoodGradient` alone. Where it holds both at the same
+inputs, a rewrite replaces them by one forward pass that leaves a tape, `TapedLogLikelihood`, and
+one backward pass over it, `TapePullback`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,16 +36,13 @@ class LogLikelihood(FilterOp):
     particles, code of the failure, index of the failing observation.
     """
 
+    output_types = (pt.dvector, pt.dvector)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's log-likelihood."""
         return self.filter.compile(system)
-
-    def results(self) -> list[Variable]:
-        """Terms and health."""
-        return [pt.dvector(), pt.dvector()]
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """As many terms as steps."""
@@ -61,10 +58,9 @@ class LogLikelihood(FilterOp):
         if not self.filter.has_gradient:
             what = "is a random estimate without a" if self.filter.noisy else "does not come with a"
             raise GradientUnavailableError(
-                f"The likelihood by {self.filter} {what} gradient, so "
-                f"NUTS, HMC, nutpie and find_MAP cannot use it. Sample with "
-                f"psf.sample_dram() or pm.sample(step=psf.DRAM()), or take psf.EKF() for a "
-                f"likelihood with a gradient."
+                f"The likelihood by {self.filter} {what} gradient, so NUTS, HMC, nutpie and "
+                f"find_MAP cannot use it. Sample with psf.sample_dram() or "
+                f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
             )
         terms_bar = cotangents[0]
         if isinstance(terms_bar.type, DisconnectedType):
@@ -77,13 +73,12 @@ class LogLikelihood(FilterOp):
 class LogLikelihoodGradient(ThetaDerivative):
     """Vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,).
 
-    It runs the filter forwards and then backwards. A graph that holds the likelihood too runs it
-    forwards only once: see `fuse_value_and_gradient`.
+    It makes both passes of the filter. In a graph that holds the likelihood too, the forward pass
+    is made only once: see `fuse_value_and_gradient`.
     """
 
     input_types = (*RECORD_INPUTS, ("terms_bar", "float64", 1))
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
-
     filter: DifferentiableFilter
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
@@ -95,14 +90,11 @@ class TapedLogLikelihood(FilterOp):
     """`LogLikelihood` with a third output, the tape: a state of the filter in each row."""
 
     filter: DifferentiableFilter
+    output_types = (pt.dvector, pt.dvector, pt.dmatrix)
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
-        """The pass forwards."""
+        """The forward pass."""
         return self.filter.compile_taped(system)
-
-    def results(self) -> list[Variable]:
-        """Terms, health and tape."""
-        return [pt.dvector(), pt.dvector(), pt.dmatrix()]
 
 
 class TapePullback(ThetaDerivative):
@@ -115,14 +107,14 @@ class TapePullback(ThetaDerivative):
     argument_code: ClassVar[Mapping[str, str]] = {"tape": "tape"}
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
-        """The pass back."""
+        """The backward pass."""
         return self.filter.compile_pullback(system)
 
 
 @register_specialize
 @node_rewriter([LogLikelihoodGradient])
 def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
-    """Where value and gradient are wanted at the same inputs, run the filter forwards once."""
+    """Make one forward pass where a graph holds value and gradient at the same inputs."""
     *inputs, terms_bar = node.inputs
     system, filter = node.op.system, node.op.filter
     for value, _ in fgraph.clients[inputs[0]]:

@@ -1,14 +1,13 @@
 """The log-likelihood of a noisy filter as a function of its normals instead of their seed.
 
-Reading a normal is many times cheaper than making it. A sampler that holds the noise (common random
-numbers), or moves it a little at a time, makes the normals once.
+Reading a normal is many times cheaper than drawing it. A sampler that holds the noise (common
+random numbers), or moves it a little at a time, draws the normals once.
 """
 
 from collections.abc import Mapping
 from typing import ClassVar
 
 import pytensor.tensor as pt
-from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
@@ -22,15 +21,12 @@ class StoredNoise(FilterOp):
 
     filter: EnsembleFilter
     input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
+    output_types = (pt.dvector,)
     checks_record = False
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
-        """The filter's own layout of its normals."""
+        """The normals, in the filter's layout."""
         return self.filter.stored_noise(system)
-
-    def results(self) -> list[Variable]:
-        """One vector."""
-        return [pt.dvector()]
 
 
 class LogLikelihoodOfNoise(LogLikelihood):

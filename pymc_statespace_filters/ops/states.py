@@ -1,7 +1,6 @@
 """States along a record, and whole runs of a filter: operations without a derivative."""
 
 import pytensor.tensor as pt
-from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
@@ -13,13 +12,13 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 class States(FilterOp):
     """Mean, sd and a draw (R, n) of the state at ``rows``, n_effective (R,), and health (3,).
 
-    ``moment`` is "predicted" (observations at earlier steps than the row's are known), "filtered"
-    (those up to its own) or "smoothed" (all). ``draw_seed`` is the noise of the draw alone.
+    ``moment`` is "predicted" (given the observations at earlier steps than the row's), "filtered"
+    (also at the row's) or "smoothed" (all). ``draw_seed`` is the seed of the draw alone.
     """
 
     __props__ = ("system", "filter", "moment")  # type: ignore[assignment]
     input_types = (*RECORD_INPUTS, ("rows", "int64", 1), ("draw_seed", "int64", 0))
-
+    output_types = (pt.dmatrix, pt.dmatrix, pt.dmatrix, pt.dvector, pt.dvector)
     filter: StatesFilter
 
     def __init__(self, system: StateSpaceModel, filter: StatesFilter, moment: str) -> None:
@@ -30,10 +29,6 @@ class States(FilterOp):
         """The filter's states."""
         return self.filter.compile_states(system, self.moment)
 
-    def results(self) -> list[Variable]:
-        """Three matrices and two vectors."""
-        return [pt.dmatrix(), pt.dmatrix(), pt.dmatrix(), pt.dvector(), pt.dvector()]
-
 
 class FilterRun(FilterOp):
     """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``rows``.
@@ -43,20 +38,9 @@ class FilterRun(FilterOp):
     """
 
     input_types = (*RECORD_INPUTS, ("rows", "int64", 1))
-
+    output_types = (pt.dvector, pt.dvector, pt.dmatrix, pt.dtensor3, pt.dtensor3, pt.dmatrix)
     filter: RunFilter
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's run."""
         return self.filter.compile_run(system)
-
-    def results(self) -> list[Variable]:
-        """Two vectors, and an array for each property of the state."""
-        return [
-            pt.dvector(),
-            pt.dvector(),
-            pt.dmatrix(),
-            pt.dtensor3(),
-            pt.dtensor3(),
-            pt.dmatrix(),
-        ]

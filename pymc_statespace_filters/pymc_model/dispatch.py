@@ -48,13 +48,7 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
     @numba_njit
     def draw(rng, theta, steps, inputs, t0, seed):
         check(steps, inputs)
-        _, observations = simulate(
-            rng,
-            theta.copy(),
-            steps.copy(),
-            inputs.copy(),
-            t0,
-        )
+        _, observations = simulate(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
         return observations
 
     # PyTensor requires an integer as the cache key of a random variable.
@@ -69,7 +63,4 @@ def _log_density(
     (value,) = values
     theta, steps, inputs, t0, seed = params
     likelihood = LogLikelihood(op.system, op.filter)
-    arguments = (theta, steps, value, inputs, t0, seed)
-    core_ndims = (1, 1, 2, 2, 0, 0)
-    batched = any(a.type.ndim > n for a, n in zip(arguments, core_ndims, strict=True))
-    return (vectorized(likelihood, *arguments) if batched else likelihood(*arguments))[0]
+    return vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]

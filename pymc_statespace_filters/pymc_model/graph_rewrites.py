@@ -1,4 +1,4 @@
-"""Rewrites of a model's graphs that exchange its likelihoods: callbacks, moved noise, filters.
+"""Rewrites of a model's graphs that replace its likelihoods: callbacks, moved noise, other filters.
 
 Every function takes graphs and returns new ones; the model itself is not changed.
 """
@@ -29,15 +29,6 @@ from pymc_statespace_filters.pymc_model.inspection import (
     state_space_nodes,
 )
 from pymc_statespace_filters.system.model import StateSpaceModel
-
-__all__ = [
-    "AutoregressiveNoise",
-    "CallbackLikelihoods",
-    "autoregressive_noise",
-    "smooth_filters",
-    "with_filter",
-    "with_likelihood_callback",
-]
 
 
 class CallbackLikelihoods(NamedTuple):
@@ -116,11 +107,6 @@ def autoregressive_noise(
     standard normal again (Deligiannidis, Doucet and Pitt 2018). Filters are replaced by their
     smooth versions, whose estimate moves little if the normals do. With rho = 0 the estimate is
     that of the seed.
-
-    Raises
-    ------
-    ModelError
-        If a filter has no smooth version for its system.
     """
     correlation = pt.dscalar("correlation")
     innovation = pt.sqrt(1.0 - correlation**2)
@@ -159,12 +145,6 @@ def with_filter(
     ``filters`` maps names of variables to their new filters. Data, parameters and seed stay the
     same: a deterministic filter ignores the seed, and a noisy filter that replaces a deterministic
     one uses that variable's constant seed.
-
-    Raises
-    ------
-    ModelError
-        If a name is not that of a StateSpace variable, its likelihood is not in the graphs, or the
-        filter cannot treat its system.
     """
     variables = state_space_nodes(model)
     for name, filter in filters.items():

@@ -12,25 +12,9 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
-
-__all__ = [
-    "COLLAPSED",
-    "FAILURES",
-    "exactness",
-    "health_outputs",
-    "is_filter",
-    "likelihood_nodes",
-    "log_density_terms",
-    "noise_seeds",
-    "noisy_filters",
-    "resized",
-    "state_space_names",
-    "state_space_nodes",
-]
 
 
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:
@@ -52,11 +36,6 @@ def log_density_terms(model: pm.Model) -> list[tuple[str, TensorVariable]]:
     """The terms of a model's log-density, each with the name of its variable."""
     names = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
     return list(zip(names, model.logp(sum=False), strict=True))
-
-
-def state_space_names(model: pm.Model) -> list[str]:
-    """The names of the StateSpace variables."""
-    return list(state_space_nodes(model))
 
 
 def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:

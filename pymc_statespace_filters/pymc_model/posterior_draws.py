@@ -16,13 +16,7 @@ MIN_DRAWS = 20
 
 
 def posterior_group(idata: xr.DataTree) -> xr.Dataset:
-    """The draws, every variable with the dimensions chain and draw.
-
-    Raises
-    ------
-    ModelError
-        If `idata` is not a DataTree, or has no posterior group.
-    """
+    """The posterior group, checked to have the dimensions chain and draw."""
     if not isinstance(idata, xr.DataTree):
         raise ModelError(
             "idata must be a DataTree of posterior draws, as pm.sample and sample_dram return it, "
@@ -45,16 +39,7 @@ def noise_was_moved(idata: xr.DataTree) -> bool:
 
 
 def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float64]:
-    """Map the posterior group to the unconstrained space, shape (chain, draw, k).
-
-    Raises
-    ------
-    ModelError
-        If there is no posterior group, or too few draws in it.
-    DataMismatchError
-        If free variables are missing from it or have other shapes, or if a draw lies outside the
-        support.
-    """
+    """The posterior group, checked against the model, in unconstrained space (chain, draw, k)."""
     posterior = posterior_group(idata)
     missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
     if missing:

@@ -18,17 +18,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 class StateSpaceVariable(NamedTuple):
     """One variable of a model: its system, its filter, and the symbols of its record.
 
-    Attributes
-    ----------
-    name : str
-    system : StateSpaceModel
-    filter : Filter
-    dims : tuple of str
-        Names of its dimensions, time and observable.
-    theta, steps, inputs, t0, seed : TensorVariable
-        Inputs of the likelihood; theta and inputs may depend on the free variables.
-    observed : TensorVariable
-        The data.
+    ``dims`` names time and observables; theta and inputs may depend on the free variables.
     """
 
     name: str

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable] | None:
     """A model's log-density with its integration steps, and with steps half as long.
 
-    Both use deterministic filters: the EKF where it can treat the system, else the variable's own.
-    None if no variable has an integrator, or if one has no deterministic filter.
+    Both use deterministic filters: the EKF where it can treat the system, else the filter of the
+    variable. None if no variable has an integrator, or if one has no deterministic filter.
     """
     log_density = model.logp()
     coarse: dict[Variable, Variable] = {}
@@ -84,22 +84,10 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
 def path_eigenvalues(
     system: StateSpaceModel, theta: Array, steps: Array, inputs: Array, t0: Array
 ) -> NDArray[np.complex128]:
-    """Eigenvalues of the Jacobian of a substep, along the path without noise.
+    """Eigenvalues (m, K, n) of the Jacobian of a substep at K states of the path without noise.
 
-    Parameters
-    ----------
-    system : StateSpaceModel
-        With an integrator.
-    theta : ndarray (m, n_theta)
-    steps : ndarray (m, J)
-    inputs : ndarray (m, rows, n_inputs)
-    t0 : ndarray (m,)
-        Inputs of the likelihood, at m points. The path starts from the initial mean.
-
-    Returns
-    -------
-    ndarray (m, K, n)
-        At K states of the path; NaN where the Jacobian is not finite.
+    The arguments are those of the likelihood at m points. The path starts from the initial mean.
+    Eigenvalues are NaN where the Jacobian is not finite.
     """
     assert system.integrator is not None
     single = system.with_integrator(system.integrator.substep())

@@ -16,15 +16,9 @@ SAMPLE_DIMS = ("chain", "draw")
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws with the dimensions chain and draw, and their sampler statistics.
+    """Draws with the dimensions chain and draw, and their sampler statistics, which may be empty.
 
-    Attributes
-    ----------
-    posterior : xarray.Dataset
-    stats : xarray.Dataset
-        Empty if there are none.
-    noise_moved : bool
-        Whether the chain moved its noise (``correlation``), so that no seed reproduces it.
+    ``noise_moved``: the chain moved its noise (``correlation``), so that no seed reproduces it.
     """
 
     posterior: xr.Dataset
@@ -95,6 +89,6 @@ def _matching_stats(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:
     if not all(np.isin(values, stats[dim]).all() for dim, values in labels.items()):
         raise ModelError(
             "the draws of the posterior are not among those of sample_stats, so that their noise "
-            "seeds are unknown: select from all groups of idata alike, or drop sample_stats"
+            "seeds are unknown: make the same selection in all groups, or drop sample_stats"
         )
     return stats.sel(labels)

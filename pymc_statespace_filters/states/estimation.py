@@ -27,7 +27,7 @@ def filtered_states(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Estimate states given the observations up to their own time, at draws of the posterior.
+    """Estimate states given the observations up to their time, at draws of the posterior.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def filtered_states(
     var_name : str, optional
         Name of a StateSpace variable; all of them by default.
     filter : EKF, EnKF, BootstrapPF, PFEnKF or GridFilter, optional
-        A filter to use instead of the variable's own.
+        A filter to use instead of that of the variable.
     at : {"observations", "steps"}
         Times of the states: those of the observations, or every step from 0 to the last
         observation.
@@ -128,7 +128,7 @@ def smoothed_states(
 
     See Also
     --------
-    filtered_states : States given the observations up to their own time.
+    filtered_states : States given the observations up to their time.
 
     Examples
     --------

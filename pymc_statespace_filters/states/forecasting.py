@@ -16,11 +16,7 @@ from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, state_dims
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.record import (
-    check_inputs,
-    n_input_rows,
-    steps_of,
-)
+from pymc_statespace_filters.system.record import check_inputs, n_input_rows, steps_of
 
 Array = NDArray[np.float64]
 
@@ -47,10 +43,8 @@ def forecast(
 
     Parameters
     ----------
-    idata : xarray.DataTree
-        Posterior draws from any sampler.
-    model : pymc.Model, optional
-        The model of the draws; by default that of the ``with`` block.
+    idata, model, var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar
+        As in `filtered_states`.
     n_steps : int, optional
         Number of steps after the last observation. Give exactly one of `n_steps`, `steps`, `times`.
     steps : array_like of int, shape (R,), optional
@@ -60,8 +54,6 @@ def forecast(
     inputs : array_like, shape (rows, n_inputs), optional
         Inputs from step 0 on, past and future, row k during step k; required if those of the model
         end before the last step.
-    var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar
-        As in `filtered_states`.
 
     Returns
     -------

@@ -9,7 +9,7 @@ from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 
 
 def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
-    """Name of the state dimension of each variable; variables with the same states share one."""
+    """Name of the state dimension of each variable; the same one for the same states."""
     # Observables take precedence: their dimension may be called "state" in the model.
     lists = [v.system.observables for v in variables if "state" in v.dims]
     lists += [v.system.states for v in variables]

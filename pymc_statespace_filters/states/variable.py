@@ -40,20 +40,7 @@ class States(NamedTuple):
 
 
 class VariableAtDraws:
-    """Evaluate graphs of one variable at draws of its model's posterior.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    variable : StateSpaceVariable
-    draws : PosteriorDraws
-
-    Attributes
-    ----------
-    variable : StateSpaceVariable
-    steps : ndarray of int, shape (J,)
-    t0 : float
-    """
+    """Evaluate graphs of one variable at draws of its model's posterior."""
 
     def __init__(
         self, model: pm.Model, variable: StateSpaceVariable, draws: PosteriorDraws

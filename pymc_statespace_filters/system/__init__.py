@@ -1,7 +1,7 @@
-"""What a user writes: equations, forces, integrators, data, parameters; validated here.
+"""What a user writes, validated: equations, forces, integrators, data and parameters.
 
-For integrators of one's own: the contract `Integrator`, `read_equation` for the functions of the
-user, `as_vector` and `as_matrix` for what they return.
+Exported for new integrators: the protocol `Integrator`, `read_equation` for the user's functions,
+and `as_vector` and `as_matrix` for what these return.
 """
 
 from pymc_statespace_filters.system.equations import Equation, as_matrix, as_vector, read_equation

@@ -49,15 +49,9 @@ class Equation:
 
 
 def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:
-    """Read the signature of a user's function.
+    """Read the signature of a user's function, called ``role`` in messages.
 
-    Parameters
-    ----------
-    role : str
-        The function's name in messages.
-    function : callable
-    symbols : sequence of str
-        The reserved names that it may have as arguments; other arguments are parameters.
+    ``symbols`` are the reserved names that it may have as arguments; others are parameters.
     """
     if not callable(function):
         raise ModelError(f"{role} must be a function, got {function!r}")
@@ -118,7 +112,7 @@ def as_symbol(role: str, value: Any) -> TensorVariable:
             return pt.as_tensor(np.zeros(0))
         if len({part.type.ndim for part in parts}) > 1:
             raise ModelError(f"{role} must return entries of one shape, got several")
-        return pt.stack(parts) if all(p.type.ndim for p in parts) else _vector_of(parts)
+        return pt.stack(parts)
     if isinstance(value, Variable):
         symbol = value if isinstance(value, TensorVariable) else pt.as_tensor(value)
         if symbol.type.dtype.startswith("complex"):
@@ -136,10 +130,6 @@ def as_symbol(role: str, value: Any) -> TensorVariable:
         return pt.as_tensor(np.asarray(value, dtype="float64"))
     except (TypeError, ValueError):
         raise ModelError(f"{role} must return symbols or numbers, got {value!r}") from None
-
-
-def _vector_of(parts: Sequence[TensorVariable]) -> TensorVariable:
-    return pt.stack(list(parts))
 
 
 def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariable:
@@ -188,8 +178,26 @@ def _static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
     return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
 
 
-def constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
-    """Check a covariance given as numbers."""
+def read_covariance(role: str, value: Any) -> Any:
+    """A covariance as an `Equation` of parameters alone, or as the numbers given."""
+    return read_equation(role, value, "") if callable(value) else value
+
+
+def trace_covariance(
+    role: str,
+    covariance: Any,
+    size: int | None,
+    values: Mapping[str, Variable],
+    *,
+    definite: bool = False,
+) -> TensorVariable:
+    """The matrix (size, size) of a covariance; numbers are checked."""
+    if isinstance(covariance, Equation):
+        return as_matrix(role, covariance(values), size, size)
+    return pt.as_tensor(_constant_covariance(role, covariance, size, definite=definite))
+
+
+def _constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
     try:
         matrix = np.array(value, dtype="float64")
     except (TypeError, ValueError):

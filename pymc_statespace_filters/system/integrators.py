@@ -105,10 +105,8 @@ class EulerMaruyama:
     substeps: int = 1
 
     def __post_init__(self) -> None:
-        read_equation("drift", self.drift, "xut")
-        if callable(self.diffusion):
-            read_equation("diffusion", self.diffusion, "xut")
-        else:
+        _ = self.equations  # checks the functions
+        if not callable(self.diffusion):
             object.__setattr__(self, "diffusion", _constant_diffusion(self.diffusion))
         check_count("substeps", self.substeps, 1)
 

@@ -8,18 +8,16 @@ from typing import Any
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.graph_digest import describe, digest
 from pymc_statespace_filters.system.integrators import Integrator
-from pymc_statespace_filters.system.signature import carried_names, checked_names, size_of
-from pymc_statespace_filters.system.tracing import (
-    Equations,
-    freeze_equations,
-    read,
-    signature_of,
-    size,
-    trace,
+from pymc_statespace_filters.system.signature import (
+    carried_names,
+    checked_names,
+    read_signature,
+    size_of,
 )
+from pymc_statespace_filters.system.tracing import Equations, read, size, trace
 
 
-@dataclass(init=False, repr=False, eq=False)
+@dataclass(init=False, repr=False)
 class StateSpaceModel:
     r"""A discrete-time dynamical system, observed at some of its steps.
 
@@ -112,10 +110,9 @@ class StateSpaceModel:
             "initial_cov": initial_cov,
         }
         functions = read(**written)
-        signature = signature_of(functions, shapes, inputs)
+        signature = read_signature(functions.equations, shapes, inputs)
         symbols = size(functions, signature)
-        traced = trace(functions, symbols, observables)
-        seen = traced.observation
+        equations, seen = trace(functions, symbols, observables)
         p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
         state_names = checked_names("states", states, [f"x{i}" for i in range(symbols.n)])
         self._set(
@@ -135,13 +132,13 @@ class StateSpaceModel:
             additive_noise=seen.additive,
             gaussian_observation=seen.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
-            equations=freeze_equations(symbols, traced),
+            equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         # For `with_integrator` alone: neither compared nor pickled.
         self._set(_arguments=written | names | {"shapes": shapes, "carried": carried})
 
-    # The fields, which `__init__` sets once, are the identity of a system.
+    # Equality and hash are those of the fields, which `__init__` sets once.
     parameters: tuple[str, ...]
     defaults: tuple[tuple[str, Any], ...]
     parameter_shapes: tuple[tuple[int, ...], ...]
@@ -169,27 +166,16 @@ class StateSpaceModel:
     def __delattr__(self, name: str) -> None:
         raise AttributeError(f"a system is immutable; {name!r} cannot be deleted")
 
-    def _identity(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, Any]:
+        # The fields alone, without the cached hash: hashes of graphs differ between processes.
         return {field.name: self.__dict__[field.name] for field in fields(self)}
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, StateSpaceModel):
-            return NotImplemented
-        return self is other or self._identity() == other._identity()
 
     def __hash__(self) -> int:
         return self._hash
 
     @cached_property
     def _hash(self) -> int:
-        return hash(tuple(self._identity().values()))
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Without the cached hash: hashes of graphs differ between processes.
-        return self._identity()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._set(**state)
+        return hash(tuple(self.__getstate__().values()))
 
     def __repr__(self) -> str:
         return (

@@ -16,11 +16,11 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.equations import (
     Equation,
-    as_matrix,
     as_symbol,
     as_vector,
-    constant_covariance,
+    read_covariance,
     read_equation,
+    trace_covariance,
 )
 from pymc_statespace_filters.system.graph_digest import freeze
 
@@ -70,10 +70,6 @@ def read_observation(
     if observation_dist is None and observation_logp is None:
         if observation is None:
             raise ModelError("give one of observation, observation_dist and observation_logp")
-        if observation_noise is None:
-            raise ModelError(
-                "observation_noise must be the covariance of the observation, got None"
-            )
         return GaussianObservation(observation, observation_noise)
     return DensityObservation(observation, observation_noise, observation_dist, observation_logp)
 
@@ -82,12 +78,12 @@ class GaussianObservation:
     """An observation function with Gaussian noise, additive or inside the function."""
 
     def __init__(self, observation: Callable, covariance: Any) -> None:
+        if covariance is None:
+            raise ModelError(
+                "observation_noise must be the covariance of the observation, got None"
+            )
         self.observation = read_equation("observation", observation, "xeut")
-        self.covariance = (
-            read_equation("observation_noise", covariance, "")
-            if callable(covariance)
-            else covariance
-        )
+        self.covariance = read_covariance("observation_noise", covariance)
 
     @property
     def equations(self) -> tuple[Equation, ...]:
@@ -102,7 +98,7 @@ class GaussianObservation:
         if additive:
             seen = as_vector("observation", self.observation(values), n_observables)
             p = r = seen.type.shape[0]
-        cov = self._trace_covariance(values, r, definite=additive)
+        cov = trace_covariance("observation_noise", self.covariance, r, values, definite=additive)
         noise = pt.tensor("e", shape=(cov.type.shape[0],), dtype="float64")
         if additive:
             seen = seen + noise
@@ -114,14 +110,6 @@ class GaussianObservation:
             raise ModelError("observation must return at least one expression, got none")
         datum = pt.tensor("d", shape=(p,), dtype="float64")
         return TracedObservation(noise, datum, seen, cov, additive=additive)
-
-    def _trace_covariance(
-        self, values: Values, size: int | None, *, definite: bool
-    ) -> TensorVariable:
-        if isinstance(self.covariance, Equation):
-            return as_matrix("observation_noise", self.covariance(values), size, size)
-        role = "observation_noise"
-        return pt.as_tensor(constant_covariance(role, self.covariance, size, definite=definite))
 
 
 class DensityObservation:
@@ -138,10 +126,6 @@ class DensityObservation:
             raise ModelError(
                 "observation_noise must be None without an observation function, got "
                 f"{observation_noise!r}"
-            )
-        if observation is not None and observation_noise is None:
-            raise ModelError(
-                "observation_noise must be the covariance of the observation, got None"
             )
         self.simulated = (
             None if observation is None else GaussianObservation(observation, observation_noise)

@@ -27,8 +27,7 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     """Parameter values as an array of shape S + (k,), S the shape to which they broadcast."""
     check_names(system, params)
     values = dict(system.defaults) | dict(params)
-    if any(name not in values for name in system.parameters):
-        raise _missing_parameters(system, values)
+    _check_complete(system, values)
     parts, batches = [], []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
         part = _numbers(name, values[name])
@@ -51,8 +50,7 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
 
 def symbolic_parameters(system: StateSpaceModel, values: Mapping[str, Any]) -> TensorVariable:
     """Parameter values, numbers or symbols, as a symbolic vector (k,)."""
-    if any(name not in values for name in system.parameters):
-        raise _missing_parameters(system, values)
+    _check_complete(system, values)
     parts = [
         _symbol(name, values[name], shape).ravel()
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
@@ -74,13 +72,13 @@ def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
     return pt.cast(symbol, "float64")
 
 
-def _missing_parameters(system: StateSpaceModel, found: Mapping[str, Any]) -> ModelError:
-    """The error that lists the parameters without a value."""
-    missing = [name for name in system.parameters if name not in found]
-    return ModelError(
-        f"params must give every parameter without a default, {list(system.parameters)}, got no "
-        f"value for the parameters {missing}, only for {sorted(found)}"
-    )
+def _check_complete(system: StateSpaceModel, found: Mapping[str, Any]) -> None:
+    """Raise unless every parameter has a value."""
+    if missing := [name for name in system.parameters if name not in found]:
+        raise ModelError(
+            f"params must give every parameter without a default, {list(system.parameters)}, got "
+            f"no value for the parameters {missing}, only for {sorted(found)}"
+        )
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:

@@ -28,13 +28,20 @@ def read_signature(
     inputs: Sequence[str] | None,
 ) -> Signature:
     """The signature of a system with these functions."""
-    names, defaults = parameter_names(equations)
-    declared = shapes_of(names, shapes)
-    check_defaults(defaults, names, declared)
-    return Signature(names, defaults, declared, checked_names("inputs", inputs, None))
+    names, defaults = _parameter_names(equations)
+    declared = _shapes(names, shapes)
+    _check_defaults(defaults, dict(zip(names, declared, strict=True)))
+    input_names = checked_names("inputs", inputs, None)
+    with_inputs = [equation.role for equation in equations if "u" in equation.symbols]
+    if with_inputs and not input_names:
+        raise ModelError(
+            f"{with_inputs[0]} has the argument u, so inputs must name the inputs "
+            f'(inputs=["..."]), got {inputs!r}'
+        )
+    return Signature(names, defaults, declared, input_names)
 
 
-def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
+def _parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
     """Names of the parameters in order of appearance, and their defaults."""
     names: dict[str, None] = {}
     defaults: dict[str, Any] = {}
@@ -48,7 +55,7 @@ def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tup
     return tuple(names), tuple(defaults.items())
 
 
-def shapes_of(
+def _shapes(
     names: tuple[str, ...], shapes: Mapping[str, Sequence[int]] | None
 ) -> tuple[tuple[int, ...], ...]:
     """The declared shape of every parameter; a parameter is a scalar unless declared."""
@@ -64,15 +71,14 @@ def shapes_of(
     return tuple(tuple(map(int, declared.get(name, ()))) for name in names)
 
 
-def check_defaults(
-    defaults: Sequence[tuple[str, Any]], names: Sequence[str], shapes: Sequence[tuple[int, ...]]
+def _check_defaults(
+    defaults: Sequence[tuple[str, Any]], shapes: Mapping[str, tuple[int, ...]]
 ) -> None:
     """Raise unless every default has the declared shape of its parameter."""
-    shape_of = dict(zip(names, shapes, strict=True))
     for name, value in defaults:
-        if np.shape(value) != shape_of[name]:
+        if np.shape(value) != shapes[name]:
             raise ModelError(
-                f"the default of {name!r} must have the parameter's shape {shape_of[name]}, got "
+                f"the default of {name!r} must have the parameter's shape {shapes[name]}, got "
                 f"shape {np.shape(value)}; declare it with shapes={{{name!r}: {np.shape(value)}}}"
             )
 

@@ -1,8 +1,8 @@
-"""From the functions of a system to its frozen graphs, in four steps: read, size, trace, freeze.
+"""From the functions of a system to its frozen graphs, in three steps: read, size, trace.
 
 `read` checks the functions and their signatures, `size` makes the symbols, whose lengths follow
-from the initial mean and the noises, `trace` calls the functions with these symbols, and
-`freeze_equations` makes immutable graphs of what they return.
+from the initial mean and the noises, and `trace` calls the functions with these symbols and makes
+immutable graphs of what they return.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +18,10 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import check_positive
 from pymc_statespace_filters.system.equations import (
     Equation,
-    as_matrix,
     as_vector,
-    constant_covariance,
+    read_covariance,
     read_equation,
+    trace_covariance,
 )
 from pymc_statespace_filters.system.graph_digest import freeze
 from pymc_statespace_filters.system.integrators import Integrator
@@ -31,12 +31,7 @@ from pymc_statespace_filters.system.observation import (
     TracedObservation,
     read_observation,
 )
-from pymc_statespace_filters.system.signature import (
-    Signature,
-    parameter_symbols,
-    read_signature,
-    size_of,
-)
+from pymc_statespace_filters.system.signature import Signature, parameter_symbols, size_of
 
 Values = Mapping[str, TensorVariable]
 
@@ -79,18 +74,11 @@ class Symbols:
 
 
 @dataclass(frozen=True)
-class Traced:
-    """What the functions return, as expressions of the symbols."""
-
-    transition: TensorVariable
-    process_noise: TensorVariable | None
-    observation: TracedObservation
-    initial_cov: TensorVariable | None
-
-
-@dataclass(frozen=True)
 class Equations:
-    """The traced functions of a system, each a frozen graph of the symbols in ``SYMBOLS``."""
+    """The traced functions of a system, frozen graphs of theta, x, q, u, t, e and d.
+
+    ``process_noise`` is None for an integrator, whose noises are standard normals.
+    """
 
     transition: FrozenFunctionGraph
     process_noise: FrozenFunctionGraph | None
@@ -118,14 +106,14 @@ def read(
     return Functions(
         _read_transition(transition, process_noise, dt),
         read_observation(observation, observation_noise, observation_dist, observation_logp),
-        _read_covariance("process_noise", process_noise),
+        read_covariance("process_noise", process_noise),
         _read_initial_mean(initial_mean),
-        _read_covariance("initial_cov", initial_cov),
+        read_covariance("initial_cov", initial_cov),
     )
 
 
 def size(functions: Functions, signature: Signature) -> Symbols:
-    """Make the symbols; parameters come first, for the lengths of the others depend on them."""
+    """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
     values = parameter_symbols(theta, signature.parameters, signature.shapes)
@@ -143,51 +131,33 @@ def size(functions: Functions, signature: Signature) -> Symbols:
     return Symbols(theta, values | {"q": pt.tensor("q", shape=(m,), dtype="float64")}, m0)
 
 
-def trace(functions: Functions, symbols: Symbols, observables: Sequence[str] | None) -> Traced:
-    """Call the functions with the symbols."""
+def trace(
+    functions: Functions, symbols: Symbols, observables: Sequence[str] | None
+) -> tuple[Equations, TracedObservation]:
+    """Call the functions with the symbols, and freeze what they return."""
     values, n, m = symbols.values, symbols.n, symbols.m
     n_observables = None if observables is None else len(observables)
-    observation = functions.observation.trace(values, n_observables)
-    process_noise = _trace_covariance("process_noise", functions.process_noise, m, values)
-    initial_cov = _trace_covariance("initial_cov", functions.initial_cov, n, values)
+    seen = functions.observation.trace(values, n_observables)
+    noise = functions.process_noise
+    process_noise = None if noise is None else trace_covariance("process_noise", noise, m, values)
+    initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
     transition = as_vector("transition", functions.transition.step(values), n)
-    return Traced(transition, process_noise, observation, initial_cov)
-
-
-def freeze_equations(symbols: Symbols, traced: Traced) -> Equations:
-    """Immutable graphs of everything that was traced, all with the same inputs."""
-    seen = traced.observation
-    inputs = [symbols.theta, *(symbols.values[name] for name in "xqut"), seen.noise, seen.datum]
+    inputs = [symbols.theta, *(values[name] for name in "xqut"), seen.noise, seen.datum]
 
     def frozen(output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output])
 
-    return Equations(
-        transition=freeze(inputs, [traced.transition]),
-        process_noise=frozen(traced.process_noise),
+    equations = Equations(
+        transition=freeze(inputs, [transition]),
+        process_noise=frozen(process_noise),
         observation=frozen(seen.observation),
         observation_noise=frozen(seen.covariance),
         observation_logp=frozen(seen.logp),
         observation_draw=seen.freeze_draw(inputs),
         initial_mean=freeze(inputs, [symbols.initial_mean]),
-        initial_cov=frozen(traced.initial_cov),
+        initial_cov=freeze(inputs, [initial_cov]),
     )
-
-
-def signature_of(
-    functions: Functions,
-    shapes: Mapping[str, Sequence[int]] | None,
-    inputs: Sequence[str] | None,
-) -> Signature:
-    """Names, defaults and shapes of the parameters, and the names of the inputs."""
-    signature = read_signature(functions.equations, shapes, inputs)
-    with_inputs = [e.role for e in functions.equations if "u" in e.symbols]
-    if with_inputs and not signature.inputs:
-        raise ModelError(
-            f"{with_inputs[0]} has the argument u, so inputs must name the inputs "
-            f'(inputs=["..."]), got {inputs!r}'
-        )
-    return signature
+    return equations, seen
 
 
 @dataclass(frozen=True)
@@ -203,7 +173,7 @@ class FunctionTransition:
         return (self.equation,)
 
     def noise_size(self, values: Values) -> int:
-        """Number of process noises where no covariance says it: none."""
+        """Number of process noises without a covariance of them: none."""
         if "q" in self.equation.symbols:
             raise ModelError(
                 "process_noise must be the covariance of q, an argument of transition, got None"
@@ -225,9 +195,7 @@ def _read_transition(
                 f"got {process_noise!r}"
             )
         if dt is not None:
-            raise ModelError(
-                f"dt must be None beside an integrator, which has its own, got dt={dt!r}"
-            )
+            raise ModelError(f"dt must be None beside an integrator, which has a dt, got dt={dt!r}")
         check_positive("dt", transition.dt)
         return transition
     if hasattr(transition, "step"):
@@ -260,24 +228,8 @@ def _read_initial_mean(value: Any) -> Any:
     return mean
 
 
-def _read_covariance(role: str, value: Any) -> Any:
-    return read_equation(role, value, "") if callable(value) else value
-
-
 def _noise_size(functions: Functions, values: Values) -> int:
     noise = functions.process_noise
     if noise is None:
         return functions.transition.noise_size(values)
-    if isinstance(noise, Equation):
-        return as_matrix("process_noise", noise(values)).type.shape[0]
-    return constant_covariance("process_noise", noise, None, definite=False).shape[0]
-
-
-def _trace_covariance(
-    role: str, covariance: Any, size: int, values: Values
-) -> TensorVariable | None:
-    if covariance is None:
-        return None  # the noise of an integrator: standard normals
-    if isinstance(covariance, Equation):
-        return as_matrix(role, covariance(values), size, size)
-    return pt.as_tensor(constant_covariance(role, covariance, size, definite=False))
+    return trace_covariance("process_noise", noise, None, values).type.shape[0]

@@ -229,12 +229,12 @@ def test_a_likelihood_has_few_exchanges():
 def test_a_filter_without_members_has_nothing_to_spread():
     for filter_ in (psf.EKF(), psf.GridFilter()):
         check_ranks(filter_, 1)
-        with pytest.raises(psf.ModelError, match=r"has no members to spread over 2 ranks"):
+        with pytest.raises(psf.ModelError, match=r"has no members to distribute over 2 ranks"):
             check_ranks(filter_, 2)
 
 
 def test_more_ranks_than_blocks_of_members():
     check_ranks(EnKF(192), 3)
     for n_members in (192, 255):  # a part of a block is no block
-        with pytest.raises(psf.ModelError, match=r"has members for 3 of 4 ranks alone"):
+        with pytest.raises(psf.ModelError, match=r"has members for 3 of 4 ranks only"):
             check_ranks(EnKF(n_members), 4)

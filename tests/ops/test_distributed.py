@@ -19,20 +19,20 @@ RECORD = (STEPS, FORCED_DATA.reshape(-1, 1), FORCE.reshape(-1, 1), 0.5, 7)
 THETA = np.array([0.6])
 
 
-def delegated(delegate, theta=THETA, record=RECORD, number=3):
+def evaluated_by(callback, theta=THETA, record=RECORD, number=3):
     return evaluator(CallbackLogLikelihood(FORCED, ENSEMBLE))(
-        theta, *record, number, delegate.address
+        theta, *record, number, callback.address
     )
 
 
-def test_the_delegate_is_given_what_the_filter_would_be():
+def test_the_callback_gets_the_arguments_of_the_filter():
     given = []
 
     def evaluate(*arguments):
         given.append(arguments)
         return np.array([1.0, -2.0, np.nan, -np.inf]), np.array([5.0, 1.0, 3.0])
 
-    terms, health = delegated(PythonCallback(evaluate))
+    terms, health = evaluated_by(PythonCallback(evaluate))
     np.testing.assert_array_equal(terms, [1.0, -2.0, np.nan, -np.inf])
     np.testing.assert_array_equal(health, [5.0, 1.0, 3.0])
     (arguments,) = given
@@ -55,26 +55,26 @@ def test_the_graph_gives_the_numbers_of_the_filter(mode):
 
     density = model.logp()
     graphs = [density, *health_outputs([density])]
-    replaced, delegable = with_likelihood_callback(graphs, {})
-    kinds += delegable.kinds
+    replaced, likelihoods = with_likelihood_callback(graphs, {})
+    kinds += likelihoods.kinds
     a = model.value_vars[0]
     plain = pytensor.function([a], graphs, mode=mode)
-    shared = pytensor.function([a, delegable.address], replaced, mode=mode)
-    delegate = PythonCallback(evaluate)
+    shared = pytensor.function([a, likelihoods.address], replaced, mode=mode)
+    callback = PythonCallback(evaluate)
     for value in (0.7, -0.4, 2.0):
-        for mine, theirs in zip(shared(value, delegate.address), plain(value), strict=True):
+        for mine, theirs in zip(shared(value, callback.address), plain(value), strict=True):
             np.testing.assert_array_equal(mine, theirs)
 
 
 def test_likelihoods_without_noise_stay():
     model = two_systems(psf.EKF(), FEW)
-    replaced, delegable = with_likelihood_callback([model.logp()], {})
-    assert delegable.kinds == ((FORCED, FEW),)
+    replaced, likelihoods = with_likelihood_callback([model.logp()], {})
+    assert likelihoods.kinds == ((FORCED, FEW),)
     assert filters_in(replaced) == sorted(map(repr, (psf.EKF(), FEW)))
 
 
-def test_twins_are_evaluated_each_with_its_own_seed():
-    """Two variables of one system are told apart by their numbers."""
+def test_equal_systems_are_evaluated_each_with_its_seed():
+    """Two variables of one system differ in the number given to the callback."""
     model = twins(FEW, FEW)
     seen = {}
 
@@ -82,37 +82,37 @@ def test_twins_are_evaluated_each_with_its_own_seed():
         seen[number] = record[-1]
         return np.zeros(STEPS.size), np.array([9.0, 0.0, -1.0])
 
-    replaced, delegable = with_likelihood_callback([model.logp()], {})
-    function = pytensor.function([model.value_vars[0], delegable.address], replaced)
-    delegate = PythonCallback(evaluate)
-    function(0.3, delegate.address)
-    assert len(delegable.kinds) == 2
+    replaced, likelihoods = with_likelihood_callback([model.logp()], {})
+    function = pytensor.function([model.value_vars[0], likelihoods.address], replaced)
+    callback = PythonCallback(evaluate)
+    function(0.3, callback.address)
+    assert len(likelihoods.kinds) == 2
     assert sorted(seen) == [0, 1]
     assert set(seen.values()) == {1, 2}
 
 
-def test_an_error_is_kept_and_the_delegate_is_asked_no_more():
+def test_an_error_is_kept_and_the_callback_is_not_called_again():
     calls = []
 
     def evaluate(*arguments):
         calls.append(arguments)
         raise ValueError("no luck")
 
-    delegate = PythonCallback(evaluate)
+    callback = PythonCallback(evaluate)
     for _ in range(2):
-        with pytest.raises(RuntimeError, match="delegate of a likelihood"):
-            delegated(delegate)
+        with pytest.raises(RuntimeError, match="callback of a likelihood"):
+            evaluated_by(callback)
     assert len(calls) == 1
-    assert str(delegate.error) == "no luck"
+    assert str(callback.error) == "no luck"
 
 
-def test_a_wrong_record_never_reaches_the_delegate():
-    delegate = PythonCallback(by_the_filter)
+def test_a_wrong_record_never_reaches_the_callback():
+    callback = PythonCallback(by_the_filter)
     steps, *rest = RECORD
     with pytest.raises(ModelError, match="increase strictly"):
-        delegated(delegate, record=(steps[::-1], *rest))
-    assert delegate.error is None
-    terms, health = delegated(delegate)
+        evaluated_by(callback, record=(steps[::-1], *rest))
+    assert callback.error is None
+    terms, health = evaluated_by(callback)
     expected = evaluator(OP)(THETA, *RECORD)
     np.testing.assert_array_equal(terms, expected[0])
     np.testing.assert_array_equal(health, expected[1])

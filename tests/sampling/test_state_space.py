@@ -7,13 +7,14 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,
 )
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import StoredNoise
-from pymc_statespace_filters.pymc_model.inspection import FAILURES, noise_seeds
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.autoregression import autoregression

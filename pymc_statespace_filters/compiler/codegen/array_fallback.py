@@ -56,28 +56,24 @@ def array_vector_function(name: str, function: VectorFunction) -> CompiledFuncti
 
 def array_member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
     """A member function that calls array code for each member."""
-    members = [v for n, v in graph.inputs.items() if n in MEMBER_INPUTS]
-    common = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
-    shared = _frontier(list(graph.inputs.values()), members, graph.outputs)
-    used_common = _used(common, shared)
-    used_members = _used(
-        {n: v for n, v in graph.inputs.items() if n in MEMBER_INPUTS}, graph.outputs
-    )
-    before = array_code(list(used_common.values()), shared)
-    inside = array_code([*used_members.values(), *shared], graph.outputs)
+    members = {n: v for n, v in graph.inputs.items() if n in MEMBER_INPUTS}
+    others = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
+    common = _frontier(list(graph.inputs.values()), list(members.values()), graph.outputs)
+    others, members = _used(others, common), _used(members, graph.outputs)
+    before = array_code(list(others.values()), common)
+    inside = array_code([*members.values(), *common], graph.outputs)
     whole, _, element = target.partition("[")
     row = "i, " if "{i}" in element else ""
-    members = [_whole(used_members)] if used_members else []
-    calls = ", ".join([*members, *(f"shared[{i}]" for i in range(len(shared)))])
+    calls = [_whole(members)] * bool(members) + [f"common[{i}]" for i in range(len(common))]
     body = [
         "try:",
-        f"    shared = before({_whole(used_common)})",
+        f"    common = before({_whole(others)})",
         "except Exception:",  # a singular matrix, say
         f"    {whole}[:] = nan",
         "    return",
         f"for member in range({whole}.shape[-1]):",
         "    try:",
-        f"        result = inside({calls})[0]",
+        f"        result = inside({', '.join(calls)})[0]",
         "    except Exception:",
         f"        {whole}[..., member] = nan",
         "    else:",

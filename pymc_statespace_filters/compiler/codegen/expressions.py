@@ -214,5 +214,5 @@ def _fold(op: ps.ScalarOp, args: tuple) -> Value:
     if isinstance(op, ps.Cast):
         return python_type(args[0])
     with np.errstate(all="ignore"):
-        # PyTensor's own implementations follow the dtypes of their arguments.
+        # PyTensor's implementations follow the dtypes of their arguments.
         return python_type(op.impl(*(np.float64(a) if kind_of(a) == FLOAT else a for a in args)))

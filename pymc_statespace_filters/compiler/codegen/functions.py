@@ -3,7 +3,7 @@
 A graph has named inputs, each a scalar or a vector of static length, and vector outputs. Two forms
 of function are made of it. A *vector function* maps vectors to vectors once; a *member function*
 does it for every column of an ensemble. Both are written out in scalars where that is possible and
-small enough, and call PyTensor's own array code otherwise; a caller cannot tell the difference.
+small enough, and call PyTensor's array code otherwise; both forms have the same interface.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -93,7 +93,9 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
     writer = Writer(_element_code(function.graph))
     lines = writer.statements(v for group in values for v in group)
     results = [
-        writer.as_float(group[0]) if is_scalar else _tuple([writer.as_float(v) for v in group])
+        writer.as_float(group[0])
+        if is_scalar
+        else "(" + "".join(f"{writer.as_float(v)}, " for v in group) + ")"
         for group, is_scalar in zip(values, function.scalar, strict=True)
     ]
     body = [*lines, f"return {', '.join(results)}"]
@@ -112,9 +114,9 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     writer = Writer(_element_code(graph), VECTOR_NAMESPACE)
     members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
     dependent = depends_on(values, members)
-    shared = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
+    common = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
     before = writer.statements(
-        [*sorted_by_number(shared), *(v for v in values if v not in dependent)]
+        [*sorted_by_number(common), *(v for v in values if v not in dependent)]
     )
     inside, results = writer.statements(values), [writer.as_float(v) for v in values]
     loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
@@ -162,10 +164,6 @@ def _indented(lines: Sequence[str]) -> list[str]:
 def sorted_by_number(values: Iterable[Value]) -> list[Value]:
     """Expressions in order of creation, so that the source is canonical."""
     return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
-
-
-def _tuple(names: Sequence[str]) -> str:
-    return "(" + "".join(f"{name}, " for name in names) + ")"
 
 
 def build(name: str, arguments: str, body: list[str], writer: Writer) -> CompiledFunction:

@@ -72,9 +72,7 @@ def _objects(array) -> np.ndarray:
     if array is None or isinstance(array, slice):  # a NoneConst or slice argument
         raise NotUnrollableError("an index that is not a number")
     if not isinstance(array, np.ndarray | np.generic | float | int | bool):
-        out = np.empty((), dtype=object)
-        out[()] = array
-        return out
+        return _as_array(array)
     numbers = np.asarray(array)
     out = np.empty(numbers.shape, dtype=object)
     for index in np.ndindex(numbers.shape):
@@ -154,11 +152,12 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     return [out]
 
 
-def _matmul(arena: Arena, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    a, b = arguments
     out = np.empty((a.shape[0], b.shape[1]), dtype=object)
     for i, j in np.ndindex(out.shape):
         out[i, j] = _inner(arena, a[i, :], b[:, j])
-    return out
+    return [out]
 
 
 def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
@@ -198,7 +197,7 @@ def _solve_triangular(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 
 
 def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    core_inputs, _ = node.op.inputs_sig, node.op.outputs_sig
+    core_inputs = node.op.inputs_sig
     batches = [a.shape[: a.ndim - len(sig)] for a, sig in zip(arguments, core_inputs, strict=True)]
     batch = np.broadcast_shapes(*batches)
     spread = [
@@ -208,9 +207,8 @@ def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     core_node = node.op._create_dummy_core_node(node.inputs)
     results: list[np.ndarray] = []
     for index in np.ndindex(batch):
-        cores = [
-            _objects(r) for r in _evaluate(arena, core_node, [_core(a, index) for a in spread])
-        ]
+        core_arguments = [_as_array(array[index]) for array in spread]
+        cores = [_objects(r) for r in _evaluate(arena, core_node, core_arguments)]
         if not results:
             results = [np.empty(batch + c.shape, dtype=object) for c in cores]
         for result, core in zip(results, cores, strict=True):
@@ -218,11 +216,8 @@ def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     return results
 
 
-def _core(array: np.ndarray, index: tuple) -> np.ndarray:
-    return _as_array(array[index])
-
-
 def _as_array(element) -> np.ndarray:
+    """An element of an object array as an array, if only of no dimension."""
     if isinstance(element, np.ndarray):
         return element
     out = np.empty((), dtype=object)
@@ -281,16 +276,9 @@ def _inner_graph(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     return unroll(arena, graph.inputs, arguments, graph.outputs, max_expressions=10**9)
 
 
-def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    return [_matmul(arena, *arguments)]
-
-
 def _shape(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    return [np.asarray(arguments[0].shape, dtype="int64")]
-
-
-def _shape_i(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    return [np.asarray(arguments[0].shape[node.op.i], dtype="int64")]
+    shape = np.asarray(arguments[0].shape, dtype="int64")
+    return [shape[node.op.i] if isinstance(node.op, Shape_i) else shape]
 
 
 def _same(arena: Arena, node, arguments: list[np.ndarray]) -> list:
@@ -308,8 +296,7 @@ _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
     ((IncSubtensor, AdvancedIncSubtensor), _inc_subtensor),
     ((ptb.MakeVector,), _make_vector),
     ((ptb.Alloc,), _alloc),
-    ((Shape,), _shape),
-    ((Shape_i,), _shape_i),
+    ((Shape, Shape_i), _shape),
     ((CheckAndRaise,), _check),
     ((OpFromGraph,), _inner_graph),
     ((SpecifyShape, ViewOp, DeepCopyOp), _same),

@@ -97,7 +97,7 @@ def _function(
     values: Sequence[Value],
     targets: Sequence[str],
 ) -> CompiledFunction:
-    """Write ``values`` to ``targets`` in every lane; what lanes share is computed before."""
+    """Write ``values`` to ``targets`` in every lane; what is equal in all is computed before."""
     writer = Writer(code, VECTOR_NAMESPACE, known)
     of_lane = depends_on(values, _named(code, "theta", "s"))
     used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]

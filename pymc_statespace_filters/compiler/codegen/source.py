@@ -143,7 +143,7 @@ class Writer:
         return self._fallback(op, args)
 
     def _fallback(self, op: ps.ScalarOp, args: tuple) -> str:
-        """A call of PyTensor's own compiled function, for the less common operations."""
+        """A call of PyTensor's compiled function, for the less common operations."""
         key = (op, len(args))
         known = {kept: name for name, kept in self.fallbacks.items()}
         # Operations of one type may differ in their properties.

@@ -6,10 +6,7 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    Graph,
-)
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, Graph
 from pymc_statespace_filters.compiler.codegen.functions import member_function
 from pymc_statespace_filters.compiler.lowering import structure
 from pymc_statespace_filters.compiler.lowering.covariances import (
@@ -23,12 +20,12 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 @lru_cache(maxsize=256)
 def compile_system(model: StateSpaceModel) -> "CompiledSystem":
-    """What filters, simulations and states need of a system; equal systems share one."""
+    """The compiled form of a system, made once for equal systems."""
     return CompiledSystem(model)
 
 
 class CompiledSystem:
-    """Sizes, properties and compiled functions of one system, each made when first asked for.
+    """Sizes, properties and compiled functions of one system, each made on its first use.
 
     Members of an ensemble are the columns of ``X`` (n, N). ``c = prepare(theta)`` are the constants
     of one evaluation: the parameters, the initial mean, then the lower square roots of the
@@ -95,13 +92,8 @@ class CompiledSystem:
     def initialise(self) -> CompiledFunction:
         """Draw the state at step 0."""
         z, mean = _normals(self.n), self._c[self.n_theta : self.n_theta + self.n]
-        return self._member_function(
-            "initialise",
-            "c, Z, X",
-            mean + self._square_roots["initial_cov"] @ z,
-            "X[{i}, member]",
-            z=z,
-        )
+        state = mean + self._square_roots["initial_cov"] @ z
+        return self._member_function("initialise", "c, Z, X", state, "X[{i}, member]", z=z)
 
     @cached_property
     def propagate(self) -> CompiledFunction:

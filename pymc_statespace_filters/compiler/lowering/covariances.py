@@ -25,9 +25,9 @@ def covariances(
     system: StateSpaceModel, merged_noise: FrozenFunctionGraph | None = None
 ) -> dict[str, FrozenFunctionGraph]:
     """Covariances whose square roots colour the noise; an integrator's noise is white."""
-    graphs = vars(system.equations) | (
-        {} if merged_noise is None else {"process_noise": merged_noise}
-    )
+    graphs = dict(vars(system.equations))
+    if merged_noise is not None:
+        graphs["process_noise"] = merged_noise
     names = ("initial_cov", "process_noise", "observation_noise")
     return {name: graphs[name] for name in names if graphs[name] is not None}
 
@@ -91,7 +91,7 @@ def semidefinite_cholesky(a):
     """Lower square root in place; a zero pivot gives a zero column, a negative one NaN.
 
     Covariances without spread in some direction are ordinary here: a known initial state, noise
-    that acts on the velocity alone. Zero is judged against the component's own variance: one may be
+    that acts on the velocity alone. Zero is relative to the variance of the component: one may be
     in pascals, the next in metres.
     """
     n = a.shape[0]

@@ -1,4 +1,4 @@
-"""The functions of a system as entry points, all of one form, so that a filter is compiled once."""
+"""The functions of a system as entry points of one signature, so that a filter is compiled once."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -13,8 +13,8 @@ MEMBER_ARGUMENTS = {
     "c": F64_PTR, "inputs": F64_PTR, "k": types.intp, "t": types.float64, "z": F64_PTR,
     "width": types.intp, "X": F64_PTR, "out": F64_PTR, "n_members": types.intp,
 }  # fmt: skip
-"""Arguments of a function of all members. ``z`` is what all members receive: normals in rows of
-``width``, or an observation."""
+"""Arguments of a function of all members. ``z`` holds normals in rows of ``width``, or one
+observation."""
 
 MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
 
@@ -50,12 +50,9 @@ def _with_addresses(
         function(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, Z, members)
 
     def observe(c, inputs, k, t, z, width, X, out, n_members):
-        members, Z, D = (
-            carray(X, (n, n_members)),
-            carray(z, (r, width)),
-            carray(out, (p, n_members)),
-        )
-        function(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, Z, members, D)
+        members, Z = carray(X, (n, n_members)), carray(z, (r, width))
+        rows, D = carray(inputs, (k + 1, n_inputs)), carray(out, (p, n_members))
+        function(carray(c, (n_constants,)), rows, k, t, Z, members, D)
 
     def log_density(c, inputs, k, t, z, width, X, out, n_members):
         members, d, log_p = carray(X, (n, n_members)), carray(z, (p,)), carray(out, (n_members,))

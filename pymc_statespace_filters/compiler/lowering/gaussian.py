@@ -8,9 +8,8 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.symbols import call, observation_moments
+from pymc_statespace_filters.compiler.numerics.small_cholesky import LOG_TWO_PI
 from pymc_statespace_filters.system.model import StateSpaceModel
-
-LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 def without_missing(
@@ -36,7 +35,7 @@ def log_normal(
     chol = cholesky(cov, lower=True)
     standardised = solve_triangular(chol, residual, lower=True, b_ndim=1)
     log_det = pt.sum(pt.log(pt.diagonal(chol)))
-    return -0.5 * pt.sum(standardised**2) - log_det - 0.5 * LOG_2PI * pt.sum(seen)
+    return -0.5 * pt.sum(standardised**2) - log_det - 0.5 * LOG_TWO_PI * pt.sum(seen)
 
 
 def observation_log_density(

@@ -27,7 +27,7 @@ def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
 
 
 def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
-    """The user's distributions, drawn by PyTensor's own code."""
+    """The user's distributions, drawn by PyTensor's code."""
     no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}
     symbols = symbols_of(system) | no_noise
     core = [symbols[name] for name in SYMBOLS]

@@ -1,4 +1,4 @@
-"""What the Jacobians of a system tell: noises that can be drawn as one, and linearity."""
+"""Structure found from the Jacobians of a system: linearity, and noises that can be merged."""
 
 from collections.abc import Mapping, Sequence
 
@@ -32,8 +32,8 @@ _KINKED = (
 def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
     """B Q B^T, if g(x, q) = g(x, 0) + B q with more noises than states and B the same everywhere.
 
-    The sum of independent noises on one state, ``[[0.6, sigma_m]]``, is one noise of the same law,
-    and drawing normals is most of the cost of an ensemble.
+    The sum of independent noises on one state, ``[[0.6, sigma_m]]``, has the distribution of a
+    single noise, and drawing normals is most of the cost of an ensemble.
     """
     if system.m <= system.n:
         return None
@@ -87,10 +87,10 @@ def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
 
 
 def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
-    """Whether the noise of one step has a covariance of full rank, at a state somewhere.
+    """Whether the noise of one step has a covariance of full rank at some point.
 
-    Found by trial at a few points, for parameters may have any range; at points of its own, such as
-    a noise of zero, the rank may be less.
+    Decided by trial at a few random points, because parameters may have any range; at exceptional
+    points, such as a noise of zero, the rank may be lower.
     """
     if system.m < system.n:
         return False
@@ -113,14 +113,11 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
 def is_free_of(
     names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
 ) -> bool:
-    """Whether no element depends on the named symbols; False where that cannot be seen."""
+    """Whether no element depends on the named symbols; False where that cannot be decided."""
     try:
         (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
     except NotUnrollableError:
         return False
-    inputs = {f"{name}.{i}" for name in names for i in range(_size(symbols[name]))}
+    sizes = {name: int(np.prod(symbols[name].type.shape, dtype=int)) for name in names}
+    inputs = {f"{name}.{i}" for name, size in sizes.items() for i in range(size)}
     return not depends_on(values, frozenset(inputs))
-
-
-def _size(symbol: TensorVariable) -> int:
-    return symbol.type.shape[0] if symbol.type.ndim else 1

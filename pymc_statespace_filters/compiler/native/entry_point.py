@@ -69,20 +69,15 @@ class EntryPoint:
     function : callable
         Returns nothing and raises nothing. It may close over compiled functions.
     arguments : mapping of str to numba type
-        The parameters of the function, by name and in order. ``F64_PTR`` and ``I64_PTR`` are
-        addresses, of which ``numba.carray`` makes arrays.
+        The parameters of the function. Their names and order are checked, because machine code
+        would read one argument as another. ``F64_PTR`` and ``I64_PTR`` are addresses, of which
+        ``numba.carray`` makes arrays.
     name : str
         Part of the symbol, readable in a profile.
     key : str or None
         Identifies the code, see `digest`; None if it cannot be cached on disk.
     needs : sequence of EntryPoint
         What the function calls by symbol.
-
-    Raises
-    ------
-    TypeError
-        If the names or the order of the arguments are not those of the function: machine code
-        would read one argument as another.
     """
 
     def __init__(

@@ -41,25 +41,12 @@ _call_rows = cached_on_disk(
 
 
 class ParallelMap:
-    """A compiled PyTensor function applied to many points.
+    """A compiled PyTensor function of float64 and int64 arguments, applied to many points.
 
-    Results depend neither on the order of the points nor on the number of threads.
-
-    Parameters
-    ----------
-    function : pytensor.compile.executor.Function
-        With float64 and int64 arguments, and numbers or arrays as results.
-    varying : sequence of ndarray
-        An example of each of its first arguments, which differ from row to row.
-    constant : sequence of ndarray
-        The other arguments.
-
-    Attributes
-    ----------
-    shapes : list of tuple of int
-        Shapes of the results.
-    on_progress : callable
-        Called in the main thread with the number of rows done since its last call.
+    ``varying`` holds an example of each of its first arguments, which differ from row to row;
+    ``constant`` holds the others, and ``shapes`` the shapes of the results. Results depend neither
+    on the order of the points nor on the number of threads. ``on_progress`` is called in the main
+    thread with the number of rows done since its last call.
     """
 
     def __init__(

@@ -1,10 +1,10 @@
 """Internal linkage for helper functions, so that all processes run the same machine code.
 
 Numba emits functions that were not inlined as weak symbols, and the first definition that a process
-loads serves all callers. In the process that compiled it, that definition was optimised on its own;
-in a process that loads it from disk, it was optimised again beside its caller, or belongs to
-another library. Both are correct, but sums and products that may be reordered differ in their last
-digits. With internal linkage every library calls its own copies.
+loads serves all callers. In the process that compiled it, that definition was optimised alone; in a
+process that loads it from disk, it was optimised again beside its caller, or belongs to another
+library. Both are correct, but sums and products that may be reordered differ in their last digits.
+With internal linkage every library calls the copies that it contains.
 """
 
 from typing import Any

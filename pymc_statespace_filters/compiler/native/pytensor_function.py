@@ -32,7 +32,7 @@ _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 
 
 class Call(NamedTuple):
-    """Arguments and results of a call from machine code; each thread needs its own.
+    """Arguments and results of a call from machine code, for one thread at a time.
 
     Attributes
     ----------
@@ -57,23 +57,8 @@ def make_call(call):
 class NativeFunction:
     """A compiled PyTensor function whose inputs and outputs are arrays of numbers.
 
-    In PyTensor's modes without numba, machine code calls Python instead.
-
-    Parameters
-    ----------
-    function : pytensor.compile.executor.Function
-    example : sequence of ndarray
-        Inputs of a first call, which determines types and shapes.
-
-    Attributes
-    ----------
-    shapes : list of tuple of int
-        Shapes of the results.
-
-    Raises
-    ------
-    Exception
-        Any exception that the function raises at the example.
+    ``example`` holds the inputs of a first call, which determines types and ``shapes`` of the
+    results. In PyTensor's modes without numba, machine code calls Python instead.
     """
 
     def __init__(self, function: Any, example: Sequence[np.ndarray]):
@@ -86,7 +71,7 @@ class NativeFunction:
         if self._is_native:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
-        self._data = [_contiguous(value) for value in shared] if self._is_native else []
+        self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
         self.shapes = [np.shape(result) for result in self(*example)]
 
     @property
@@ -102,13 +87,9 @@ class NativeFunction:
             return self._function(*inputs)
 
     def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
-        """Prepare a call that reads these contiguous arrays.
+        """A call that reads these contiguous arrays, and the object that holds its memory.
 
-        Returns
-        -------
-        Call
-        object
-            Owns the memory of the call; keep it as long as the call.
+        Keep the object as long as the call.
         """
         out = np.zeros(1 + self.size)
         if not self._is_native:
@@ -139,10 +120,6 @@ class NativeFunction:
                 out[0] = 0.0
 
         return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(evaluate)
-
-
-def _contiguous(value: np.ndarray) -> np.ndarray:
-    return np.array(value, order="C")
 
 
 @cache

@@ -142,10 +142,5 @@ _ARGUMENTS = {
     "z": F64_PTR, "n_rows": types.intp, "width": types.intp,
 }  # fmt: skip
 
-FILL_NORMALS = EntryPoint(
-    _fill,
-    _ARGUMENTS,
-    "fill_normals",
-    digest("fill_normals"),
-)
+FILL_NORMALS = EntryPoint(_fill, _ARGUMENTS, "fill_normals", digest("fill_normals"))
 """`fill_normals` of an array given by its address, compiled once for all filters."""

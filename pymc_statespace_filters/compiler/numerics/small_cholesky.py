@@ -1,8 +1,9 @@
 """Cholesky factors, triangular solves and the Gaussian log-density of small matrices, in place.
 
-Three other factorisations differ on purpose. `lowering.ensemble.semidefinite_cholesky` takes
-covariances given by the user, and marks a matrix that is none by NaN. `codegen.scalarize` and
-`codegen.array_linalg` implement PyTensor's Cholesky in generated code, with its conventions.
+Three other factorisations differ on purpose. `lowering.covariances.semidefinite_cholesky` takes
+covariances given by the user, and returns NaN for a matrix that is no covariance.
+`codegen.scalarize` and `codegen.array_linalg` implement PyTensor's Cholesky in generated code, with
+its conventions.
 """
 
 import math

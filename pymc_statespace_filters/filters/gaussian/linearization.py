@@ -1,6 +1,6 @@
 """Graphs of a system linearised around the mean of a Gaussian state.
 
-Shared by the extended Kalman filter and its smoother. The state of the filter is one vector: the
+Used by the extended Kalman filter and its smoother. The state of the filter is one vector: the
 mean, then the lower triangle of the covariance.
 """
 

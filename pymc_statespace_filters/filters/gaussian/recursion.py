@@ -67,14 +67,6 @@ class _Tape:
     result: Any
 
 
-def _no_tape() -> _Tape:
-    return _Tape(
-        jit(lambda steps: None),
-        jit(lambda tape, row, s: None),
-        jit(lambda terms, health, tape, row, s: (terms, health)),
-    )
-
-
 def _tape(size: int) -> _Tape:
     """A row for the state before each prediction and each update; no rows if the filter fails."""
 
@@ -112,7 +104,12 @@ def _tape_to_the_end(size: int) -> _Tape:
 
 def compile_value(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health)."""
-    return _compile_forward(recursion, "value", _no_tape())
+    no_tape = _Tape(
+        jit(lambda steps: None),
+        jit(lambda tape, row, s: None),
+        jit(lambda terms, health, tape, row, s: (terms, health)),
+    )
+    return _compile_forward(recursion, "value", no_tape)
 
 
 def compile_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -176,6 +173,6 @@ def compiled_of(
     parts: Mapping[str, CompiledFunction],
     recursion: GaussianFilterFunctions,
 ) -> CompiledFunction:
-    """Compile a function that calls these parts; their keys enter its own."""
+    """Compile a function that calls these parts; its key includes theirs."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
     return CompiledFunction(jit(function), key_of(what, *(part.key for part in parts.values())))

@@ -44,7 +44,7 @@ _ALONG, _AT_START = 0, 1
 
 @dataclass(frozen=True, eq=False)
 class ForwardPass:
-    """The forward pass, compiled once for a system and shared by all moments."""
+    """The forward pass, compiled once for a system and used for all moments."""
 
     smoother: BrysonFrazier
     noise: CompiledFunction
@@ -52,7 +52,7 @@ class ForwardPass:
 
 
 def forward_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
-    """The forward pass of a filter, its errors simulated alongside."""
+    """The forward pass of a filter with a simulated error of it."""
     smoother = BrysonFrazier(recursion)
     return ForwardPass(smoother, _noise(recursion.system), _forwards(smoother))
 

@@ -51,10 +51,11 @@ def density_method(n_active, n_members):
 
 
 class Kernel(NamedTuple):
-    """Mean and bandwidth of the members of a density.
+    """Moments and bandwidth of the members of a density.
 
-    ``mean`` (n,) and ``cov`` (n, n) are those of all states; ``H`` (n_free, n_free) is the lower Cholesky factor of
-    Eqs. 4.38 and 4.39 of the free states. ``active`` marks the directions with any spread.
+    ``mean`` (n,) and ``cov`` (n, n) are those of all states; ``H`` (n_free, n_free) is the lower
+    Cholesky factor of Eqs. 4.38 and 4.39 of the free states. ``active`` marks the directions with
+    any spread.
     """
 
     mean: np.ndarray
@@ -86,7 +87,7 @@ def density_workspace(local, n):
 
 @njit_contract
 def scott_bandwidth(n_effective, free, kernel):
-    """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39); moments are given.
+    """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39) from ``mean`` and ``cov``.
 
     Returns False if the moments are not finite.
     """
@@ -136,7 +137,7 @@ def _whiten(kernel, free, X, first, out):
 
 @inline_always
 def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
-    """Logs of the exact sums at a rank's own targets, which begin at column ``first``."""
+    """Logs of the exact sums at the rank's targets, which begin at column ``first``."""
     complete_points(layout, sources, n_dims)
     y, v = sources.rows[1:], targets.rows[1:]
     _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
@@ -148,8 +149,8 @@ def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
 def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 
-    w, X and V are a rank's own; the density is that of the particles of all ranks. Members of zero
-    weight are ignored and may be NaN. A target that is not finite gets -inf.
+    w, X and V are those of one rank; the density is that of the particles of all ranks. Members of
+    zero weight are ignored and may be NaN. A target that is not finite gets -inf.
     """
     sources, targets, sums = work
     first, last = local.first, local.first + local.size

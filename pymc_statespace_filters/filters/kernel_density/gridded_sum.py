@@ -7,7 +7,7 @@ units of the kernel's standard deviation, and g and h running over the grid, in 
                             exp(-(h - y)^2 / 2s),    c = D^2 / (2 pi s sqrt(1 - 2s)).
 
 So each member y adds its Gaussian to the grid, the grid is blurred (convolved with the middle
-factor), and each target v sums the grid times its own Gaussian. In two directions all three factors
+factor), and each target v sums the grid times its Gaussian. In two directions all three factors
 are products over the directions.
 
 As a function of g and h, the summand is the left side times a Gaussian density in which g and h
@@ -51,7 +51,7 @@ from pymc_statespace_filters.filters.kernel_density.simd_windows import (
 )
 
 FLOOR = 1e-6
-"""Sums below this share of the total weight are left to the caller."""
+"""Sums below this fraction of the total weight are left to the caller."""
 
 _NEGLIGIBLE = 1e-25  # smaller weights do not change sums above the floor, and make subnormals
 _FAR = 8.6  # neither do members farther than this from all targets: exp(-FAR^2 / 2) < 1e-16
@@ -201,7 +201,7 @@ def _add_all(layout, sources, n_dims, n_points, box, windows, grids):
     """The sum of the grids of all members, of n_points each.
 
     Members are divided among grids as they are among ranks. If every rank has the same number of
-    grids, their members are its own, and none need be exchanged.
+    grids, it holds all their members, and none need be exchanged.
     """
     n_grids = _number_of_grids(sources.size, n_points)
     if not sources.known and n_grids % layout.n_ranks != 0:
@@ -257,7 +257,7 @@ def _blur(n_dims, columns, rows, grid, other):
 
 @njit_contract
 def gridded_sums(layout, sources, targets, n_dims, work):
-    """sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
+    """sum_l w_l exp(-|y_l - v_i|^2) at the rank's targets, in one or two directions.
 
     Zero at targets outside the grid. Members of other ranks are exchanged as needed. Returns False
     if the grid would be too large.

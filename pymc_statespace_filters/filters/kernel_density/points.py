@@ -12,8 +12,8 @@ class Points(NamedTuple):
     """Members and their weights, or targets and the sums at them.
 
     In the first ``size`` columns of ``rows`` (1 + n, width) the first row holds the weights or
-    sums, the others the coordinates. A rank fills its own columns; ``known`` tells whether this
-    rank holds all columns from the start.
+    sums, the others the coordinates. A rank fills the columns of its members; ``known`` is True if
+    this rank holds all columns from the start.
     """
 
     rows: np.ndarray

@@ -45,7 +45,7 @@ def shifted_sum_workspace(n_ranks, n, width):
 
 @inline_always
 def _take_logs(layout, targets):
-    """Replace a rank's own sums by their logarithms; return how many are below the floor."""
+    """Replace the rank's sums by their logarithms; return how many are below the floor."""
     start, end = local_range(layout, targets.size, MEMBERS)
     sums, n_missed = targets.rows[0, start:end], 0
     for i in range(sums.size):
@@ -161,7 +161,7 @@ def _sum_tails(layout, sources, targets, n_dims, works):
 
 @inline_always
 def log_gridded_sums(layout, sources, targets, n_dims, works):
-    """log sum_l w_l exp(-|y_l - v_i|^2) at a rank's own targets, in one or two directions.
+    """log sum_l w_l exp(-|y_l - v_i|^2) at the rank's targets, in one or two directions.
 
     ``sources`` and ``targets`` are `Points`; the logs are written to the targets. Returns False if
     the grid would be too large.

@@ -25,7 +25,7 @@ from pymc_statespace_filters.filters.system_table import step_moments
 _LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
 _SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0
-_PER_STEP = 1e-5  # planned error of one step, as a share of the tolerance
+_PER_STEP = 1e-5  # planned error of one step, relative to the tolerance
 
 
 @inline_always

@@ -160,29 +160,29 @@ def gather_rows(first, end, masses, low, values, n):
 
 
 @njit_internal
-def significant(mass, share):
-    """The range [first, last) outside of which masses are below ``share`` times the largest."""
+def significant(mass, fraction):
+    """The range [first, last) outside of which masses are below ``fraction`` of the largest."""
     largest = 0.0
     for value in mass:
         largest = max(largest, value)
     first, last = np.int64(0), np.int64(mass.size)
-    while first < last and not mass[first] > share * largest:
+    while first < last and not mass[first] > fraction * largest:
         first += 1
-    while last > first and not mass[last - 1] > share * largest:
+    while last > first and not mass[last - 1] > fraction * largest:
         last -= 1
     return first, last
 
 
 @inline_always
 def aliasing(mean, sd, source_spacing, spacing):
-    """Aliasing error of the trapezoidal rule in one step, as a share of each source's mass.
+    """Aliasing error of the trapezoidal rule in one step, relative to each source's mass.
 
     As a function of the source, the mass that arrives at a point is a density at least as wide as
     the noise, sd, times a Gaussian of sd over the slope of the mean. The error is the spectrum of
     this product at 2 pi / spacing. Infinite where there is no noise.
     """
     n = mean.size
-    shares = np.zeros(n)
+    errors = np.zeros(n)
     for i in range(n):
         if not (np.isfinite(mean[i]) and np.isfinite(sd[i])):
             continue
@@ -191,18 +191,18 @@ def aliasing(mean, sd, source_spacing, spacing):
         noise = sd[i] / spacing
         if noise > 0.0 and np.isfinite(slope):
             width = noise * noise / (1.0 + slope * slope)
-            shares[i] = (1.0 + 1.0 / noise) * math.exp(-2.0 * math.pi**2 * width)
+            errors[i] = (1.0 + 1.0 / noise) * math.exp(-2.0 * math.pi**2 * width)
         else:
-            shares[i] = np.inf if noise == 0.0 else 1.0 + 1.0 / noise
-    return shares
+            errors[i] = np.inf if noise == 0.0 else 1.0 + 1.0 / noise
+    return errors
 
 
 @njit_reassoc
-def total(mass, shares):
-    """Sum of mass * share over the points with mass; shares elsewhere may be infinite."""
+def total(mass, errors):
+    """Sum of mass * error over the points with mass; errors elsewhere may be infinite."""
     result = 0.0
     for i in range(mass.size):
-        result += mass[i] * shares[i] if mass[i] > 0.0 else 0.0
+        result += mass[i] * errors[i] if mass[i] > 0.0 else 0.0
     return result
 
 

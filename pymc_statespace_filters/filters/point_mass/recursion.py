@@ -4,7 +4,7 @@ A *grid* is (low, spacing, masses), see the module `grid`. Its *source* is the m
 (means, standard deviations, masses) that was evaluated on it; the source has a density at any
 point, so a finer grid, where an observation requires one, is evaluated from it. A state known
 exactly, x_0, is the grid of the single point 1 with spacing x_0. A *table* stores the transition
-kernel of a step that is the same at every time: (first point, mean, sd, shares, rows).
+kernel of a step that is the same at every time: (first point, mean, sd, errors, rows).
 """
 
 import math
@@ -69,7 +69,7 @@ def initial_moments(system):
 
 @inline_always
 def truncation_of(reach):
-    """Masses below this share of the largest are dropped."""
+    """Masses below this fraction of the largest are dropped."""
     return math.exp(-0.5 * reach * reach)
 
 
@@ -93,8 +93,8 @@ def initialise(system, spacing, reach):
 def predict(system, k, t, spacing, reach, grid, table):
     """One step: (code, grid, source, table, mass that the step may misplace)."""
     low, _, mass = grid
-    tabled, mean, sd, shares, table = transition_at(system, k, t, spacing, reach, grid, table)
-    lost = total(mass, shares)
+    tabled, mean, sd, errors, table = transition_at(system, k, t, spacing, reach, grid, table)
+    lost = total(mass, errors)
     if lost == np.inf:
         return NO_PROCESS_NOISE, grid, (mean, sd, mass), table, lost
     target, n = extent_of(mean, sd, mass, spacing, reach)
@@ -115,22 +115,22 @@ def predict(system, k, t, spacing, reach, grid, table):
 
 @inline_always
 def transition_at(system, k, t, spacing, reach, grid, table):
-    """The transition from every point: (whether it is tabled, mean, sd, shares, table)."""
+    """The transition from every point: (whether it is tabled, mean, sd, errors, table)."""
     low, grid_spacing, mass = grid
     tabled = system.is_time_invariant and grid_spacing == spacing and mass.size > 1
-    first, mean, sd, shares, rows = table
+    first, mean, sd, errors, rows = table
     if not tabled or low < first or low + mass.size > first + mean.size:
         first, n = low, mass.size
         if tabled:  # a margin for the density to move within
             first, n = low - n // 4, n + n // 2
-        mean, sd, shares = _moments(
+        mean, sd, errors = _moments(
             system, k, t, grid_points(first, n, grid_spacing), grid_spacing, spacing
         )
         if tabled:
             rows = transition_kernel(spacing, mean, sd, reach)
-            table = first, mean, sd, shares, rows
+            table = first, mean, sd, errors, rows
     points = slice(low - first, low - first + mass.size)
-    return tabled, mean[points], sd[points], shares[points], table
+    return tabled, mean[points], sd[points], errors[points], table
 
 
 @inline_always
@@ -142,7 +142,7 @@ def rows_from(low, table):
 
 @inline_always
 def _moments(system, k, t, X, source_spacing, spacing):
-    """Mean and sd of the next state from every point, and the share that a step may misplace."""
+    """Mean and sd of the next state from every point, and the relative errors of a step."""
     M = np.empty((2, X.shape[1]))
     step_moments(system, k, t, X, M)
     mean, sd = M[0], M[1]

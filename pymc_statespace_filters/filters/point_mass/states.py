@@ -72,7 +72,7 @@ MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
 STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "tolerance": types.float64, "moment": types.intp,
     "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
-    "rows": I64_PTR, "R": types.intp, "draw_seed": types.int64,  # the steps wanted, and their draws
+    "rows": I64_PTR, "R": types.intp, "draw_seed": types.int64,  # steps of the results
     "mean": F64_PTR, "sd": F64_PTR, "drawn": F64_PTR, "terms": F64_PTR, "health": F64_PTR,
 }  # fmt: skip
 

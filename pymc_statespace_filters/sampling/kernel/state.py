@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.pytensor_function import Call
-from pymc_statespace_filters.pymc_model.inspection import FAILURES
+from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 
 HEALTH_SIZE = 3
@@ -90,7 +90,7 @@ class Evaluation(NamedTuple):
     """Result of one evaluation of a log-density."""
 
     log_density: float  # never NaN or plus infinity; minus infinity after a failure
-    failure: int  # 0, or the failure code: a key of `inspection.FAILURES`, or `NOT_A_NUMBER`
+    failure: int  # 0, or the failure code: a key of `outcomes.FAILURES`, or `NOT_A_NUMBER`
     n_effective: float  # smallest number of particles in any filter, infinity without noisy filters
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
-from pymc_statespace_filters.pymc_model.inspection import COLLAPSED
+from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
     N_EFFECTIVE,

@@ -29,7 +29,7 @@ from pymc_statespace_filters.pymc_model.graph_rewrites import (
 from pymc_statespace_filters.pymc_model.inspection import (
     health_outputs,
     log_density_terms,
-    state_space_names,
+    state_space_nodes,
 )
 from pymc_statespace_filters.sampling.kernel.state import RAISED, Evaluation, NativeLogDensity
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
@@ -226,7 +226,7 @@ def screening_density(model: Model, screen: Any, power: float) -> TensorVariable
     ModelError
         If the filter does not support a system.
     """
-    names = state_space_names(model)
+    names = state_space_nodes(model)
     total = sum(
         pt.sum(term) * (power if name in names else 1.0) for name, term in log_density_terms(model)
     )

@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_names
+from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_nodes
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import RandomBlock
 from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
@@ -107,7 +107,7 @@ class Target:
         )
         self.screen = None
         if settings.screen is not None:
-            if not state_space_names(model):
+            if not state_space_nodes(model):
                 raise ModelError(
                     f"screen needs a model with a StateSpace variable, got {settings.screen!r} for "
                     "a model without one"
