@@ -28,8 +28,6 @@ def update(system, j, k, t, d, noise, members, local, work):
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
     mark_finite(X, X, alive)
-    if count(alive, local) == 0.0:
-        return -np.inf, 0.0, NO_FINITE_MEMBER
     log_density(system, k, t, d, X, members.log_p)
     for i in range(alive.size):
         log_w[i] = log_w[i] + members.log_p[i] if alive[i] else -np.inf
@@ -37,7 +35,8 @@ def update(system, j, k, t, d, noise, members, local, work):
     # Increment of the log-likelihood and effective number (Eq. 4.43)
     increment, n_effective = normalise_weights(log_w, w, local)
     if increment == -np.inf:
-        return -np.inf, 0.0, ZERO_WEIGHTS
+        failure = NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS
+        return -np.inf, 0.0, failure
     return increment, n_effective, NONE
 
 

@@ -15,15 +15,14 @@ from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     Moments,
     check_simulated_observations,
-    forecast_moments,
+    forecast_covariances,
+    forecast_means,
     kalman_update,
     mark_finite,
     moments_workspace,
 )
 from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
-from pymc_statespace_filters.filters.ensemble.reductions import count
-from pymc_statespace_filters.filters.ensemble.weights import log_sum
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -64,21 +63,21 @@ def update(system, j, k, t, d, noise, members, local, work):
     # Simulated observations (Eq. 4.15)
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)
     mark_finite(X, D, alive)
-    n_alive = count(alive, local)
-    if n_alive == 0.0:
-        return -np.inf, 0.0, NO_FINITE_MEMBER
-
-    # Moments of the forecast (Eqs. 4.16-4.19)
     for i in range(w.size):
         w[i] = 1.0 if alive[i] else 0.0
-    if not forecast_moments(w, X, D, d, n_alive, n_alive - 1.0, local, moments):
+
+    # Moments of the forecast (Eqs. 4.16-4.19), and the mean of p(d | x^f_i)
+    log_terms = _log_terms(system, k, t, d, members, local, work)
+    forecast = forecast_means(members, log_terms, work.terms, local, moments, False)
+    n_alive = forecast.n_alive
+    if n_alive == 0.0:
+        return -np.inf, 0.0, NO_FINITE_MEMBER
+    if not forecast_covariances(members, d, n_alive - 1.0, local, moments):
         return -np.inf, n_alive, COVARIANCE_NOT_POSITIVE
 
-    # Increment of the log-likelihood
-    if work.is_ensemble:
-        log_density(system, k, t, d, X, members.log_p)
-        increment, n_effective = _ensemble_likelihood(members, local, work)
-    else:
+    # Increment of the log-likelihood, and how many members carry it (Eq. 4.43)
+    increment, n_effective = forecast.log_sum, forecast.n_effective  # Eq. 4.26
+    if not work.is_ensemble:
         increment, n_effective = _gaussian_likelihood(d, work), n_alive
     if not np.isfinite(increment):
         return -np.inf, 0.0, ZERO_WEIGHTS
@@ -89,15 +88,15 @@ def update(system, j, k, t, d, noise, members, local, work):
 
 
 @inline_always
-def _ensemble_likelihood(members, local, work):
-    """Log of the mean over the members of p(d | x^f_i) (Eq. 4.26), and how many members carry it.
-
-    The latter is the same question as in a particle filter (Eq. 4.43).
-    """
+def _log_terms(system, k, t, d, members, local, work):
+    """log p(d | x^f_i) / N of every member, none for the Gaussian likelihood."""
+    if not work.is_ensemble:
+        return work.log_terms[:0]
+    log_density(system, k, t, d, members.X, members.log_p)
     log_N = math.log(local.n_members)
     for i in range(members.alive.size):
         work.log_terms[i] = members.log_p[i] - log_N if members.alive[i] else -np.inf
-    return log_sum(work.log_terms, work.terms, local)
+    return work.log_terms
 
 
 @inline_always

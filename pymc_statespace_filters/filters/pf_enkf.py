@@ -10,17 +10,17 @@ from pymc_statespace_filters.compiler.native.jit import inline_always
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
-    forecast_moments,
+    forecast_covariances,
+    forecast_means,
     kalman_update,
     mark_finite,
 )
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
-from pymc_statespace_filters.filters.ensemble.reductions import count, weight_spread
+from pymc_statespace_filters.filters.ensemble.reductions import count
 from pymc_statespace_filters.filters.ensemble.weights import log_sum, normalise_weights
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.importance_weights import (
-    Forecast,
     importance_workspace,
     reweight,
 )
@@ -50,37 +50,37 @@ def update(system, j, k, t, d, noise, members, local, work):
     # Simulated observations (Eq. 4.29), and previous weights of the particles that are alive
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, members.D)
     mark_finite(X, members.D, members.alive)
-    n_alive = count(members.alive, local)
-    if n_alive == 0.0:
-        return -np.inf, 0.0, NO_FINITE_MEMBER
     for i in range(log_w.size):
         log_w[i] = log_w[i] if members.alive[i] else -np.inf
     log_alive, n_effective = normalise_weights(log_w, members.w, local)
     if log_alive == -np.inf:
-        return -np.inf, 0.0, ZERO_WEIGHTS
+        failure = NO_FINITE_MEMBER if count(members.alive, local) == 0.0 else ZERO_WEIGHTS
+        return -np.inf, 0.0, failure
 
     # Predicted density of the observation: previous weights on the forecast particles
     log_density(system, k, t, d, X, members.log_p)
-    log_predicted = _log_weighted_density(members, local, scratch)
+    log_terms = _log_weighted_density(members, scratch)
+    forecast = forecast_means(members, log_terms, scratch.w_equal, local, scratch.moments, True)
 
     # Proposal (Eqs. 4.30-4.35) and weights (Eq. 4.36); without a proposal those of Eq. 4.28
     copy_members(X, members.X_f)
-    forecast = Forecast(n_alive, n_effective, weight_spread(members.w, local))
     as_printed = likelihood == _AS_PRINTED
     if not (
-        _propose(d, members, forecast, system.free, local, scratch)
-        and reweight(system, k, t, d, members, forecast, local, scratch, as_printed)
+        _propose(d, members, forecast.spread, system.free, local, scratch.moments)
+        and reweight(system, k, t, d, members, forecast, n_effective, local, scratch, as_printed)
     ):
         copy_members(members.X_f, X)
         log_density(system, k, t, d, X, members.log_p)
         for i in range(log_w.size):
             log_w[i] += members.log_p[i]
-    log_printed = _log_weighted_density(members, local, scratch) if as_printed else 0.0
+    log_printed = 0.0
+    if as_printed:
+        log_printed, _ = log_sum(_log_weighted_density(members, scratch), scratch.w_equal, local)
     log_total, n_effective = normalise_weights(log_w, members.w, local)  # Eqs. 4.37, 4.43
 
     # Increment of the log-likelihood
     if likelihood == _PREDICTIVE:
-        increment = log_alive + log_predicted  # Eq. 4.42 without its double count
+        increment = log_alive + forecast.log_sum  # Eq. 4.42 without its double count
     elif likelihood == _WEIGHTS:
         increment = log_alive + log_total  # of the mean unnormalised weight: importance sampling
     else:
@@ -91,24 +91,19 @@ def update(system, j, k, t, d, noise, members, local, work):
 
 
 @inline_always
-def _log_weighted_density(members, local, scratch):
-    """Log of the sum of w_i p(d | x_i)."""
+def _log_weighted_density(members, scratch):
+    """log w_i p(d | x_i) of every particle."""
     for i in range(members.log_w.size):
         scratch.log_prior[i] = members.log_w[i] + members.log_p[i]
-    return log_sum(scratch.log_prior, scratch.w_equal, local)[0]
+    return scratch.log_prior
 
 
 @inline_always
-def _propose(d, members, forecast, free, local, scratch):
+def _propose(d, members, spread, free, local, moments):
     """Move X by the Kalman gain; False if the covariance is singular or not finite."""
-    if not (
-        forecast.spread > _ONE_PARTICLE
-        and forecast_moments(
-            members.w, members.X, members.D, d, 1.0, forecast.spread, local, scratch.moments
-        )
-    ):
+    if not (spread > _ONE_PARTICLE and forecast_covariances(members, d, spread, local, moments)):
         return False
-    kalman_update(d, members.D, members.alive, free, scratch.moments, members.X)
+    kalman_update(d, members.D, members.alive, free, moments, members.X)
     return True
 
 

@@ -17,9 +17,11 @@ from pymc_statespace_filters.filters.ensemble.partition import (
     local_range,
 )
 from pymc_statespace_filters.filters.ensemble.reductions import (
+    allgather_sums,
     count,
     local_partition,
-    weight_spread,
+    sum_spread,
+    total,
     weighted_cov,
     weighted_mean,
 )
@@ -110,7 +112,10 @@ def all_sums(rank, n_ranks, address, w, X, log_w):
     mine = slice(local.first, local.first + local.size)
     v, Y, out, log_v = w[mine].copy(), X[:, mine].copy(), np.empty(9), log_w[mine].copy()
     relative, zeros, products = np.empty(v.size), np.zeros(2), np.empty((2, 1))
-    out[0], out[1] = count(v, local), weight_spread(v, local)
+    out[0] = count(v, local)
+    sum_spread(v, local, 0)
+    allgather_sums(local, 1)
+    out[1] = total(local, 0)
     weighted_mean(v, Y, 1.0, local, out[2:4])
     weighted_cov(v, Y, zeros, Y[:1], zeros, 1.0, local, products)
     out[4], out[5] = products[0, 0], products[1, 0]

@@ -15,7 +15,15 @@ from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     solve_lower_transposed,
 )
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.reductions import weighted_cov, weighted_mean
+from pymc_statespace_filters.filters.ensemble.reductions import (
+    allgather_sums,
+    sum_members,
+    sum_products,
+    sum_spread,
+    sum_values,
+    total,
+)
+from pymc_statespace_filters.filters.ensemble.weights import total_weight, weigh
 from pymc_statespace_filters.filters.protocol import System
 
 
@@ -48,7 +56,8 @@ def equal_weights(alive, count, w):
 class Moments(NamedTuple):
     """Moments of a forecast: of states, simulated observations, and both (Eqs. 4.16-4.19).
 
-    `forecast_moments` leaves the Cholesky factor in ``P_dd``, `kalman_update` the gain in ``P_xd``.
+    `forecast_covariances` leaves the Cholesky factor in ``P_dd``, `kalman_update` the gain in
+    ``P_xd``.
     """
 
     x_mean: np.ndarray
@@ -63,24 +72,65 @@ def moments_workspace(n, p):
     return Moments(np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
 
 
-@njit_contract
-def forecast_moments(w, X, D, d, total_weight, divisor, local, moments):
-    """Means and covariances of states and simulated observations (Eqs. 4.16-4.19, 4.30-4.33).
+class Forecast(NamedTuple):
+    """Sums over all members of a forecast: how many are alive, 1 - sum w^2, and a log of a sum.
 
-    Means are sums with weights w over ``total_weight``, covariances over ``divisor``. A missing
-    component of d gets a row and column of the identity in P_dd and of zero in P_xd, so that it
-    moves nothing. Returns False if P_dd is not positive definite.
+    ``log_sum`` is the log of the sum of the weights that the caller gave as ``log_terms``,
+    ``n_effective`` their effective number.
     """
-    x_mean, d_mean, P_xd, P_dd = moments.x_mean, moments.d_mean, moments.P_xd, moments.P_dd
-    weighted_mean(w, X, total_weight, local, x_mean)
-    weighted_mean(w, D, total_weight, local, d_mean)
-    weighted_cov(w, X, x_mean, D, d_mean, divisor, local, P_xd)
-    weighted_cov(w, D, d_mean, D, d_mean, divisor, local, P_dd)
-    for b in range(d.size):
+
+    n_alive: float
+    spread: float
+    log_sum: float
+    n_effective: float
+
+
+@inline_always
+def forecast_means(members, log_terms, terms, local, moments, is_normalised):
+    """Means of states and simulated observations (Eqs. 4.16, 4.30-4.31), in one allgather.
+
+    Unless the weights w are normalised, they are 1 for members that are alive and 0 for others.
+    """
+    n, p = moments.P_xd.shape
+    sum_values(members.alive, local, 0)
+    sum_spread(members.w, local, 1)
+    sum_members(members.w, members.X, local, 2)
+    sum_members(members.w, members.D, local, 2 + n)
+    weigh(log_terms, terms, local, 2 + n + p)
+    allgather_sums(local, 2 + n + p + 3)
+    n_alive, spread = total(local, 0), total(local, 1)
+    weight = 1.0 if is_normalised else n_alive
+    for a in range(n):
+        moments.x_mean[a] = total(local, 2 + a) / weight
+    for b in range(p):
+        moments.d_mean[b] = total(local, 2 + n + b) / weight
+    log_sum, n_effective = total_weight(local, 2 + n + p)
+    return Forecast(n_alive, spread, log_sum, n_effective)
+
+
+@njit_contract
+def forecast_covariances(members, d, divisor, local, moments):
+    """Covariances of states and simulated observations over ``divisor``, in one allgather.
+
+    (Eqs. 4.17-4.19, 4.32-4.33.) A missing component of d gets a row and column of the identity in
+    P_dd and of zero in P_xd, so that it moves nothing. Returns False if P_dd is not positive
+    definite.
+    """
+    w, X, D, P_xd, P_dd = members.w, members.X, members.D, moments.P_xd, moments.P_dd
+    n, p = P_xd.shape
+    sum_products(w, X, moments.x_mean, D, moments.d_mean, local, 0)
+    sum_products(w, D, moments.d_mean, D, moments.d_mean, local, n * p)
+    allgather_sums(local, (n + p) * p)
+    for b in range(p):
+        for a in range(n):
+            P_xd[a, b] = total(local, a * p + b) / divisor
+        for a in range(p):
+            P_dd[a, b] = total(local, (n + a) * p + b) / divisor
+    for b in range(p):
         if np.isnan(d[b]):
-            for a in range(x_mean.size):
+            for a in range(n):
                 P_xd[a, b] = 0.0
-            for a in range(d.size):
+            for a in range(p):
                 P_dd[a, b] = P_dd[b, a] = 0.0
             P_dd[b, b] = 1.0
     return cholesky(P_dd)

@@ -156,19 +156,20 @@ def sum_squares(values, local, row):
 
 
 @njit_contract
-def _sum_spread(w, local, row):
+def sum_spread(w, local, row):
+    """Row of the sums of w (1 - w), all positive: in all 1 - sum w^2, if w is normalised."""
     _spread(w, w.size, _local_blocks(local, row))
 
 
 @njit_contract
-def _sum_members(w, X, local, row):
+def sum_members(w, X, local, row):
     """Rows of sum_i w_i X_ai for each row of X; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
         _weighted((w, X[a]), w.size, _local_blocks(local, row + a))
 
 
 @njit_contract
-def _sum_products(w, X, x_mean, Y, y_mean, local, row):
+def sum_products(w, X, x_mean, Y, y_mean, local, row):
     """Rows of sum_i w_i (X_ai - mean) (Y_bi - mean), b fastest; zero weight as above."""
     for a in range(X.shape[0]):
         for b in range(Y.shape[0]):
@@ -185,17 +186,9 @@ def count(flags, local):
 
 
 @inline_always
-def weight_spread(w, local):
-    """1 - sum w^2 of normalised weights, as a sum of positive terms w (1 - w)."""
-    _sum_spread(w, local, 0)
-    allgather_sums(local, 1)
-    return total(local, 0)
-
-
-@inline_always
 def weighted_mean(w, X, total_weight, local, out):
     """Mean of each row of X; ``total_weight`` is the sum of w. Zero weights may have NaN."""
-    _sum_members(w, X, local, 0)
+    sum_members(w, X, local, 0)
     allgather_sums(local, X.shape[0])
     for a in range(out.size):
         out[a] = total(local, a) / total_weight
@@ -205,7 +198,7 @@ def weighted_mean(w, X, total_weight, local, out):
 def weighted_cov(w, X, x_mean, Y, y_mean, divisor, local, out):
     """Covariances sum_i w_i (X_ai - mean) (Y_bi - mean) / divisor; zero weights as above."""
     n, p = out.shape
-    _sum_products(w, X, x_mean, Y, y_mean, local, 0)
+    sum_products(w, X, x_mean, Y, y_mean, local, 0)
     allgather_sums(local, n * p)
     for a in range(n):
         for b in range(p):

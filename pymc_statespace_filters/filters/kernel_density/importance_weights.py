@@ -25,14 +25,6 @@ from pymc_statespace_filters.filters.kernel_density.density import (
 from pymc_statespace_filters.filters.system_table import log_density
 
 
-class Forecast(NamedTuple):
-    """Of the forecast of all ranks: how many members are alive, N_eff, and 1 - sum w^2."""
-
-    n_alive: float
-    n_effective: float
-    spread: float
-
-
 class Scratch(NamedTuple):
     """Moments of the forecast, and scratch of the densities of Eq. 4.36."""
 
@@ -52,7 +44,7 @@ def importance_workspace(system, local):
 
 
 @inline_always
-def reweight(system, k, t, d, members, forecast, local, scratch, keeps_previous):
+def reweight(system, k, t, d, members, forecast, n_effective, local, scratch, keeps_previous):
     """Write the unnormalised log-weights of X to log_w and log p(d | x^a) to log_p.
 
     ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. Returns False, with log_w
@@ -62,7 +54,9 @@ def reweight(system, k, t, d, members, forecast, local, scratch, keeps_previous)
     free, n, n_alive, w_equal = system.free, system.n, forecast.n_alive, scratch.w_equal
     kernel_f, kernel_a = kernel_workspace(n, free.size), kernel_workspace(n, free.size)
     equal_weights(members.alive, n_alive, w_equal)
-    if not _set_bandwidths(members, forecast, free, local, scratch, kernel_f, kernel_a):
+    if not _set_bandwidths(
+        members, forecast, n_effective, free, local, scratch, kernel_f, kernel_a
+    ):
         return False
     log_density(system, k, t, d, X, log_p)
     log_prior, log_proposal, density = scratch.log_prior, scratch.log_proposal, scratch.density
@@ -76,7 +70,7 @@ def reweight(system, k, t, d, members, forecast, local, scratch, keeps_previous)
 
 
 @inline_always
-def _set_bandwidths(members, forecast, free, local, scratch, kernel_f, kernel_a):
+def _set_bandwidths(members, forecast, n_effective, free, local, scratch, kernel_f, kernel_a):
     X, X_f, w_equal = members.X, members.X_f, scratch.w_equal
     n_alive = forecast.n_alive
     weighted_mean(w_equal, X, 1.0, local, kernel_a.mean)
@@ -89,7 +83,7 @@ def _set_bandwidths(members, forecast, free, local, scratch, kernel_f, kernel_a)
     )
     return (
         scott_bandwidth(n_alive, free, kernel_a)  # Eq. 4.38
-        and scott_bandwidth(forecast.n_effective, free, kernel_f)
+        and scott_bandwidth(n_effective, free, kernel_f)
         and _agree(kernel_a.active, kernel_f.active)
     )
 
