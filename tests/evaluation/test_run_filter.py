@@ -162,7 +162,7 @@ def test_where_no_particle_is_finite_the_state_is_unknown():
         ({"params": {}}, "a"),
         ({"filter": "ekf"}, "filter must be a filter"),
         ({"filter": psf.GridFilter()}, "GridFilter treats systems of one state"),
-        ({"inputs": [1.0]}, "names none"),
+        ({"inputs": [1.0]}, "inputs must be None for a system without inputs"),
     ],
 )
 def test_refusals(changes, message):

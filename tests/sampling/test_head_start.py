@@ -178,7 +178,7 @@ def test_draws_of_nuts_do(model):
             DataMismatchError,
             r"pilot: idata must have draws of \['place'\]",
         ),
-        (tree(place=PLACE[..., :1]), {}, DataMismatchError, "pilot: 'place' has shape"),
+        (tree(place=PLACE[..., :1]), {}, DataMismatchError, "pilot: 'place' in idata must have"),
         (
             tree(sd=-SD),
             {},

@@ -96,7 +96,11 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
         patch.setattr(ChainPool, "finished", interrupted)
         with pytest.raises(ModelError, match="nothing to return"):  # of the model not begun
             psf.run_models(models, **settings)
-    assert [len(list(folder.glob("*.log"))) for folder in sorted(tmp_path.iterdir())] == [2, 2]
+    stored = [
+        {segment.name.partition(".")[0] for segment in folder.rglob("*.segment")}
+        for folder in sorted(tmp_path.iterdir())
+    ]
+    assert stored == [{"chain-0", "chain-1"}] * 2
     trees = psf.run_models(models, **settings)
     for name in models:
         assert_identical(trees[name], expected[name])

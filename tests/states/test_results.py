@@ -210,7 +210,7 @@ REFUSED = {
         xr.DataTree.from_dict({"prior": GOOD["posterior"].to_dataset()}),
         pair_model,
         {},
-        r"group 'posterior', it has \['prior'\]",
+        r"must have a group 'posterior', got \['prior'\]",
     ),
     "one chain": (
         xr.DataTree.from_dict({"posterior": GOOD["posterior"].to_dataset().isel(chain=0)}),
