@@ -101,11 +101,11 @@ class EKF:
         return compile_batch(_functions(system.model))
 
     def compile_taped(self, system: System) -> CompiledFunction:
-        """Compile the pass forwards, with a third result: the tape."""
+        """Compile the forward pass, with a third result: the tape."""
         return compile_taped(_functions(system.model))
 
     def compile_pullback(self, system: System) -> CompiledFunction:
-        """Compile the pass back along the tape."""
+        """Compile the backward pass along the tape."""
         return compile_pullback(_functions(system.model))
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:

@@ -29,7 +29,12 @@ type Integers = NDArray[np.int64]
 class System(Protocol):
     """One system as a filter sees it: `compiler.lowering.compiled_system.CompiledSystem`.
 
-    Functions are read there too; each is a `CompiledFunction`, compiled when first asked for.
+    Each function is a `CompiledFunction`, compiled when first asked for. Members of an ensemble, or
+    other points, are the N columns of ``X`` (n, N). ``c`` are the constants of an evaluation, ``k``
+    the step and ``t`` its time, ``Z`` standard normals with a column for each member (more are
+    allowed), ``D`` (p, N) observations, ``M`` (2, N) a mean and a variance for each column.
+    ``m`` counts the normals of one step, which may be fewer than ``model.m``: noises with constant
+    gains are merged. ``free`` are the states that an update may move.
     """
 
     model: Any
@@ -220,18 +225,18 @@ class BatchFilter(Filter, Protocol):
 class DifferentiableFilter(Filter, Protocol):
     """A filter whose likelihood has a gradient.
 
-    A gradient is one pass forwards, which leaves a tape, and one pass back over it. A graph that
-    holds the likelihood too shares the pass forwards.
+    A gradient is a forward pass, which leaves a tape, and a backward pass over it. A graph that
+    holds the likelihood too shares the forward pass.
     """
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
         """Compile both passes as one function."""
 
     def compile_taped(self, system: System) -> CompiledFunction:
-        """Compile the pass forwards: terms, health and the tape."""
+        """Compile the forward pass: terms, health and the tape."""
 
     def compile_pullback(self, system: System) -> CompiledFunction:
-        """Compile the pass back: (theta .. seed, tape, terms_bar) -> theta_bar."""
+        """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar."""
 
 
 @runtime_checkable
