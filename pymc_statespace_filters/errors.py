@@ -114,7 +114,7 @@ class ParallelError(StateSpaceFiltersError, RuntimeError):
 
 
 class ParallelWarning(UserWarning):
-    """The ranks of a run differ, so that its results are not reproducible to the bit.
+    """The ranks of a run differ, so that its results are not reproducible bit for bit.
 
     Examples
     --------

@@ -52,10 +52,10 @@ def log_likelihood(
     t0 : float
         Time of step 0.
     seed : int or array_like of int
-        The noise inside the filter, if it has any; broadcasts with the parameters.
+        Seed of the noise inside the filter, if it has any; broadcasts with the parameters.
     comm : mpi4py.MPI.Intracomm or "world", optional
-        Ranks among which the filter's members are divided, in blocks of 64. All of them call this
-        with the same arguments and get the same result, to the bit that of one rank.
+        Ranks among which the filter's members are divided, in blocks of 64. All of them make
+        this call with the same arguments and get the same result, bit for bit that of one rank.
 
     Returns
     -------

@@ -40,19 +40,19 @@ def run_filter(
     observed, steps, times, inputs, t0
         The record, as in `log_likelihood`.
     seed : int
-        The noise inside the filter, if it has any. The run is that of `log_likelihood` with this
-        seed.
+        Seed of the noise inside the filter, if it has any. The run is that of `log_likelihood` with
+        this seed.
     at : {"observations", "steps"}
         When the states are kept: at the observations, or at every step from 0 to the last of them.
 
     Returns
     -------
     xarray.Dataset
-        Of the state given the observations up to its time: ``mean`` and ``sd`` (time, state),
-        ``cov`` (time, state, state_bis), the covariance. Of EnKF, BootstrapPF and PFEnKF also
-        ``particles`` (time, particle, state) and ``weights`` (time, particle), which sum to one,
-        before resampling; a particle that is not finite has weight zero, and where none is finite
-        mean and covariance are NaN. ``log_likelihood`` (obs_time) holds the terms
+        For the state given the observations up to its time: ``mean`` and ``sd`` (time, state), and
+        the covariance ``cov`` (time, state, state_bis). With EnKF, BootstrapPF and PFEnKF also
+        ``particles`` (time, particle, state) and ``weights`` (time, particle) before resampling;
+        the weights sum to one; a particle that is not finite has weight zero, and where none is
+        finite mean and covariance are NaN. ``log_likelihood`` (obs_time) holds the terms
         log p(d_j | d_1 .. d_{j-1}). From an observation at which the filter fails on, terms are
         -inf and states NaN.
 
@@ -73,7 +73,7 @@ def run_filter(
 
     Notes
     -----
-    Particles of every time are kept, (states + 1) x particles x times x 8 bytes.
+    The particles of every time are stored: (states + 1) x particles x times x 8 bytes.
 
     Examples
     --------

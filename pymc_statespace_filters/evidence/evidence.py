@@ -50,7 +50,7 @@ class Evidence:
     uniform : str
         Names of the variables with such priors, separated by commas.
     improper : str
-        Names of the free variables whose prior is improper, as ``pm.Flat``, or is not normalised,
+        Names of the free variables whose prior is improper, like ``pm.Flat``, or is not normalised,
         as under an ordering transform.
 
     Raises

@@ -1,4 +1,4 @@
-"""The filters, and what a filter of your own needs: the contract in `protocol`, the base classes.
+"""The filters, and what your own filter needs: the contract in `protocol`, and base classes.
 
 `EnsembleFilterBase` and `ParticleFilter` with `ensemble_filter` and `particle_filter` give a filter
 with members everything but its update; a filter of another kind satisfies `Filter` by itself.

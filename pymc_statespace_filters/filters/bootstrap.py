@@ -55,9 +55,9 @@ class BootstrapPF(ParticleFilter):
         Resample after an observation if the effective number of particles (Eq. 4.43) is below this
         fraction of N: 1 resamples at every observation, 0 never.
     resampling : {"systematic", "multinomial", "sorted"}
-        Scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is systematic
-        along particles in order, one state by its size, up to eight along a Hilbert curve: the
-        estimate then moves little when its normals do.
+        Resampling scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is
+        systematic resampling of sorted particles: by size with one state, along a Hilbert curve
+        with two to eight. The estimate then changes little when its normals do.
 
     Raises
     ------

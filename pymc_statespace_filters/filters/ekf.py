@@ -1,7 +1,7 @@
 """The extended Kalman filter, thesis Eqs. 4.3-4.14, and its exact reverse-mode derivative.
 
-The two verbs are written once, as graphs; their derivatives come from the same graphs. The state
-of the filter is one vector: the mean, then the lower triangle of the covariance.
+Prediction and update are written once, as graphs; their derivatives come from the same graphs. The
+state of the filter is one vector: the mean, then the lower triangle of the covariance.
 """
 
 from dataclasses import dataclass
@@ -54,15 +54,16 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 class EKF:
     """Extended Kalman filter: exact for linear systems with Gaussian noise, else an approximation.
 
-    The state between observations is taken for Gaussian, and the equations for linear around
-    its mean. Deterministic, with a gradient: gradient samplers such as NUTS work with it. Where
-    the state has several modes between sparse observations its likelihood is wrong by tens of
-    nats; compare with a particle filter before trusting it.
+    The state is approximated as Gaussian between observations, and the equations as linear around
+    its mean. The filter is deterministic and has a gradient, so gradient samplers such as NUTS
+    work with it. Where the state has several modes between sparse observations, the likelihood is
+    wrong by tens of nats; compare with a particle filter before trusting it.
 
     Notes
     -----
     Thesis, Eqs. 4.3-4.14. Differences: the forecast starts from the analysis of the step before
-    (printed: from its forecast); the noise of the observation enters the innovation covariance;
+    (the thesis prints: from its forecast); the noise of the observation enters the innovation
+    covariance;
     the analysis covariance has Joseph's form, which stays symmetric and non-negative.
 
     Examples

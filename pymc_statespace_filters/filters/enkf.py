@@ -119,9 +119,9 @@ class EnKF(EnsembleFilterBase):
     n_members : int
         Size N of the ensemble, at least 2.
     likelihood : {"ensemble", "gaussian"}
-        How p(d_j | d_1 .. d_{j-1}) is read off the forecast ensemble. "ensemble" is the mean of
-        p(d_j | x_i) over the members (Eq. 4.26); "gaussian" is the normal density with mean and
-        covariance of the simulated observations.
+        How p(d_j | d_1 .. d_{j-1}) is estimated from the forecast ensemble. "ensemble" is the mean
+        of p(d_j | x_i) over the members (Eq. 4.26); "gaussian" is the normal density with the
+        mean and covariance of the simulated observations.
 
     Raises
     ------

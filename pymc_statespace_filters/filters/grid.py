@@ -1,6 +1,6 @@
 """Point-mass filter: the density of one state itself, on a grid (Bucy and Senne, 1971).
 
-The two verbs are integrals, thesis Eqs. 3.13-3.16 read as the recursion
+Prediction and update are integrals, thesis Eqs. 3.13-3.16 written as the recursion
 
     p(x_{k+1} | d_1 .. d_j) = integral of N(x_{k+1}; g(x_k, 0), s(x_k)^2) p(x_k | d_1 .. d_j) dx_k,
     p(d_j | d_1 .. d_{j-1}) = integral of p(d_j | x) p(x | d_1 .. d_{j-1}) dx,
@@ -65,14 +65,15 @@ PointMassArguments = arguments_class("PointMassArguments", POINT_MASS_ARGUMENTS,
 class GridFilter:
     """Point-mass filter: the exact likelihood of a system with one state, deterministic.
 
-    The state's density is kept on a grid that moves, and is refined, with it: there is no range and
-    no spacing to choose. For smooth equations the result is that of the discretised system to the
-    tolerance, whatever the shape of the density: what a `BootstrapPF` estimates, without noise.
+    The density of the state is represented on a grid that moves with it and is refined as needed:
+    there is no range and no spacing to choose. For smooth equations the result is the likelihood of
+    the discretised system, to the tolerance, whatever the shape of the density. `BootstrapPF`
+    estimates the same number with noise.
 
     Parameters
     ----------
     tolerance : float
-        Largest error that a term log p(d_j | d_1 .. d_{j-1}) is to have, by the grid's own
+        Largest error allowed in a term log p(d_j | d_1 .. d_{j-1}), by the filter's own error
         estimate; between 1e-12 and 1e-2.
 
     Raises
@@ -83,11 +84,12 @@ class GridFilter:
     Notes
     -----
     The process noise must be additive given the state, ``g(x, q) = g(x, 0) + G(x) q``, and nowhere
-    zero. A transition with kinks (`freeplay`, an absolute value) is integrated with an error of the
-    order of the squared spacing, which no estimate sees: `is_exact_for` is False then. Parameters
-    that would need more than 8192 points have no likelihood here, with that reason. Masses below
-    the rounding error of the largest are dropped, until an observation falls so far out that they
-    matter. A point that explodes is left out, as are infinite particles.
+    zero. A transition with kinks (`freeplay`, an absolute value) is integrated with an error of
+    second order in the spacing, which the error estimate does not include: `is_exact_for` is then
+    False. Parameters that would need more than 8192 points get the log-likelihood minus infinity,
+    with that reason. Masses below the rounding error of the largest are dropped, until an
+    observation falls so far out that they matter. A grid point that diverges is left out, as a
+    particle that is not finite would be.
 
     R. S. Bucy and K. D. Senne, "Digital synthesis of non-linear filters", Automatica 7 (1971).
 

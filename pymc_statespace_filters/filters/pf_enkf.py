@@ -119,9 +119,9 @@ class PFEnKF(ParticleFilter):
         Resample after an observation if the effective number of particles (Eq. 4.43) is below this
         fraction of N: 1 resamples at every observation, 0 never.
     resampling : {"systematic", "multinomial", "sorted"}
-        Scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is systematic
-        along particles in order, one state by its size, up to eight along a Hilbert curve: the
-        estimate then moves little when its normals do.
+        Resampling scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is
+        systematic resampling of sorted particles: by size with one state, along a Hilbert curve
+        with two to eight. The estimate then changes little when its normals do.
     likelihood : {"predictive", "weights", "as_printed"}
         How p(d_j | d_1 .. d_{j-1}) is estimated. "predictive": previous weights on the forecast
         particles. "weights": log of the mean unnormalised weight. "as_printed": Eqs. 4.36 and 4.42
@@ -174,8 +174,8 @@ class PFEnKF(ParticleFilter):
         Returns
         -------
         str
-            "lattice" (O(N)), "exact" (O(N^2)), or "none" where no particle is moved and the filter
-            is the bootstrap filter.
+            "lattice" (sums over a grid, O(N)), "exact" (exact sums, O(N^2)), or "none" where no
+            particle is moved and the filter is the bootstrap filter.
 
         Examples
         --------

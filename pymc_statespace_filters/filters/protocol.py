@@ -1,9 +1,9 @@
 """What a filter is: the contract between filters and everything that uses them.
 
-A filter is a frozen, hashable object of settings. It says what it can treat and compiles functions
-for one system, which it is given as a `System`. No base class is needed: `log_likelihood`,
-`StateSpace`, `sample_dram` and the evidence take any `Filter`; what else a filter can do it says by
-the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter` and
+A filter is an immutable, hashable object that holds settings. It states which systems it supports
+and compiles functions for one system, which it is given as a `System`. No base class is needed:
+`log_likelihood`, `StateSpace`, `sample_dram` and the evidence take any `Filter`. Its other
+abilities are the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter` and
 `EnsembleFilter`.
 
 Arrays of the compiled functions: ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each

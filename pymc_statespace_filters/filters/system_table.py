@@ -1,7 +1,7 @@
 """A compiled system inside machine code: sizes, and functions that are called by their address.
 
 `system_table` packs a `CompiledSystem` into one vector, `read_system` unpacks it. Both use the
-names of `TABLE`, so that no slot is known by its number alone.
+names of `TABLE`, so that no code refers to a slot by its number.
 """
 
 from collections.abc import Sequence

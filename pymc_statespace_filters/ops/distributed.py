@@ -3,8 +3,8 @@
 `DistributedLogLikelihood` is called by all ranks at once. Where several ranks evaluate one chain,
 one of them runs the sampler: there the log-likelihood is a `CallbackLogLikelihood`, which calls a
 Python function, a `PythonCallback`, that makes all ranks evaluate. The address of the callback is
-an argument, so that the surrounding machine code, and its numbers to the bit, are the same with and
-without it.
+an argument, so that the surrounding machine code, and every bit of its numbers, are the same
+with and without it.
 """
 
 import ctypes
@@ -51,7 +51,7 @@ def distributed_evaluator(system: StateSpaceModel, filter: Filter, comm: Communi
     """The function (theta, steps, observed, inputs, t0, seed) -> (terms, health) of all ranks.
 
     All ranks call it with the same arguments. Each moves its local members, and all get the same
-    result, to the bit that of one rank.
+    result, bit for bit that of one rank.
     """
     check_ranks(filter, comm.size)
     if comm.size == 1:

@@ -1,4 +1,4 @@
-"""Access to MPI: the communicator for the argument ``comm``, with advice when it cannot be had.
+"""Access to MPI: the communicator for the argument ``comm``, with advice when there is none.
 
 The only module that imports mpi4py, and only if a communicator is requested.
 """

@@ -47,7 +47,7 @@ def plot_average(
     Raises
     ------
     ModelError
-        If `average` is no result of `average_models`, or has several numeric dimensions.
+        If `average` is not a result of `average_models`, or has several numeric dimensions.
 
     Examples
     --------

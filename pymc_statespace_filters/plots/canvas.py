@@ -1,4 +1,4 @@
-"""Shared by the plots: figures, labelled rows, curves, bands, annotations and ticks."""
+"""Elements shared by the plots: figures, labelled rows, curves, bands, annotations and ticks."""
 
 import math
 from collections.abc import Mapping

@@ -31,7 +31,7 @@ def plot_evidence(
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        Passed to ``arviz_plots.PlotCollection.wrap``, as ``figure_kwargs={"figsize": (6, 3)}``.
+        Passed to ``arviz_plots.PlotCollection.wrap``: ``figure_kwargs={"figsize": (6, 3)}``.
 
     Returns
     -------

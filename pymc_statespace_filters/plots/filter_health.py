@@ -52,8 +52,9 @@ def plot_filter_health(
       band, or long runs of one sign, show when the model is wrong;
     * their autocorrelation: white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
     * the empirical distribution function of the probability integral transform (PIT) minus that of
-      a uniform distribution, with a simultaneous band [1]_. Too wide predictions go below and then
-      above the band, too narrow ones the other way round; a bias lies on one side.
+      a uniform distribution, with a simultaneous band [1]_. Predictions that are too wide go below
+      and then above the band, those that are too narrow the other way round; a bias lies on one
+      side.
 
     For particle and ensemble filters, one more panel with the effective number of particles over
     the draws. Below 3 (the dashed line) the filter has collapsed. Its title is the number of

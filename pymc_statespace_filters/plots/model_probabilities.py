@@ -41,7 +41,7 @@ def plot_model_probabilities(
     Raises
     ------
     ModelError
-        If `table` is no such table.
+        If `table` is not such a table.
 
     Examples
     --------

@@ -51,7 +51,7 @@ def plot_phase(
     idata : xarray.DataTree
         Result of `filtered_states` or `smoothed_states`.
     x, y : str or xarray.DataArray
-        Name of a state; or a quantity computed from the states, as a restoring force, with
+        Name of a state; or a quantity computed from the states, like a restoring force, with
         dimensions (chain, draw, time), whose name labels the axis.
     group : {"smoothed_states", "filtered_states"}, optional
         By default the smoothed states if there are any.

@@ -74,7 +74,7 @@ def plot_states(
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
-        Passed to ``arviz_plots.PlotCollection.wrap``, as ``col_wrap=2`` for two columns of panels.
+        Passed to ``arviz_plots.PlotCollection.wrap``: ``col_wrap=2`` gives two columns of panels.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """The random variable operation behind `StateSpace`.
 
 The module `dispatch` registers how the operation is drawn and what its log-density is; this one
-imports no simulator, so that a query for the operation's type costs no more than its name.
+imports no simulator, so that a module can test for the operation's type at little cost.
 """
 
 from collections.abc import Sequence

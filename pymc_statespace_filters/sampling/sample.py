@@ -1,4 +1,4 @@
-"""``sample_dram`` and ``run_models``: whole chains in machine code, results as of ``pm.sample``."""
+"""`sample_dram` and `run_models`: whole chains in machine code, results as from ``pm.sample``."""
 
 import os
 from collections.abc import Mapping, Sequence

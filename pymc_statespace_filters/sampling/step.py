@@ -54,7 +54,7 @@ class DRAM(BlockedStep):
     vars : list of variables, optional
         Continuous variables to sample. Default: all free variables of the model.
     stages : int or (int, int), default (2, 1)
-        Maximal number of proposals in an iteration, or a pair: while tuning, afterwards. 1 is
+        Maximum number of proposals in an iteration, or a pair: during tuning and afterwards. 1 is
         random-walk Metropolis-Hastings. Further stages help a chain to leave a bad start; once the
         covariance is good they rarely pay for their evaluations.
     stage_scale : float, default 0.2

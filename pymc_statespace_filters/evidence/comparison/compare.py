@@ -90,7 +90,7 @@ def compare_evidence(
     ci_prob : float
         Probability of the intervals.
     estimator : str, optional
-        Estimator whose evidences are compared, as ``"bridge"``, if the models have several.
+        Estimator whose evidences are compared, such as ``"bridge"``, if the models have several.
 
     Returns
     -------
@@ -128,12 +128,12 @@ def compare_evidence(
             this row, and only prior or correction place it below the first. Empty for the first
             row.
         ``warning``
-            Whether the evidence has doubts, no standard error, an improper prior, or chains that
-            held a noise seed, whose error ``se`` excludes.
+            Whether the evidence has ``doubts``, no standard error, an improper prior, or chains
+            that held a noise seed, whose error ``se`` excludes.
 
-        If an evidence has no standard error (``se`` is NaN, as Laplace's), the probabilities are
-        those of the estimates, and all intervals are NaN, because each depends on every evidence.
-        Comparisons with that model are undecided, and its ``strength`` ignores errors.
+        If an evidence has no standard error (``se`` is NaN, as for Laplace's), the probabilities
+        are those of the estimates, and all intervals are NaN, because each depends on every
+        evidence. Comparisons with that model are undecided, and its ``strength`` ignores errors.
 
     Raises
     ------

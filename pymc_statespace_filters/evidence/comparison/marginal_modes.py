@@ -48,8 +48,8 @@ def marginal_modes(
     The density is ArviZ's kernel estimate, mirrored at the smallest and the largest draw, with
     ArviZ's bandwidth for the effective number of draws: the repeated values of rejecting chains
     would otherwise give too small a bandwidth. With 1000 effective draws the standard error of a
-    mode is about 15 per cent of a standard deviation; a mode at the end of a support, as of a scale
-    that may be zero, is only found to be near it.
+    mode is about 15 per cent of a standard deviation; a mode at the end of a support, such as that
+    of a scale that may be zero, is only found to be near it.
 
     Examples
     --------

@@ -32,7 +32,7 @@ class ModelPrior:
         Raises
         ------
         ModelError
-            If a prior cannot be sampled, as ``pm.Flat``; if a transform excludes a part of the
+            If a prior cannot be sampled, like ``pm.Flat``; if a transform excludes a part of the
             support, as an ordering does, so that the density is not that of the draws; or if draws
             are rounded to the edge of the support, where the transform is infinite.
         """

@@ -6,10 +6,10 @@ Where members are updated, past states are updated by the same innovations with 
 
 which is the ensemble Kalman smoother (Evensen and van Leeuwen 2000). Where members are resampled,
 past states are resampled with them: a particle's ancestry. Ancestries coalesce: the further back,
-the fewer distinct ones. So a state is settled a fixed lag of observations later (Kitagawa 1996),
+the fewer distinct ones. So a state is fixed a given lag of observations later (Kitagawa 1996),
 with the weights of that moment; members that are never resampled have no such lag.
 
-A particle filter with Kalman updates weights present states alone. Its past states, updated like
+A particle filter with Kalman updates weights only the present states. Its past states, updated like
 those of an ensemble and weighted like the present ones, are exact for linear systems as the number
 of particles grows, and otherwise an approximation.
 """

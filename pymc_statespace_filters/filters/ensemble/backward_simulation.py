@@ -8,9 +8,9 @@ where x_{k+1} is the state already drawn (Godsill, Doucet and West 2004). Resamp
 updates do not matter: only the weighted particles of each step do. The process noise must be
 additive, g(x, q) = g(x, 0) + B(x) q, and reach every state.
 
-Particles are proposed with their weights alone and accepted by their density over the largest
-there can be (Douc, Garivier, Moulines and Olsson 2011), which costs a few tries; after some all
-weights are computed.
+Particles are proposed in proportion to their weights w_i and accepted with the ratio of the normal
+density to its upper bound (Douc, Garivier, Moulines and Olsson 2011), which takes a few tries. If
+these fail, all weights are computed.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The common half of all filters that move members by noise: what they compile, and of what."""
+"""The base class of filters that move members by noise: the functions that they compile."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -149,7 +149,7 @@ class EnsembleFilterBase:
         """Compile the log-likelihood for members that are divided among ranks.
 
         Each rank moves its own members (see `partition`); terms and health are equal on all ranks,
-        to the bit those of `compile`.
+        bit for bit those of `compile`.
         """
         evaluation = self.algorithm(system).evaluation(system)
         evaluate = evaluation.function

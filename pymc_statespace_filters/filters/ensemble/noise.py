@@ -1,8 +1,9 @@
 """The normals of one evaluation: made from a seed where they are used, or stored beforehand.
 
-Stored normals are those that the seed would have given: first the start, then every step, then for
-every observation its simulated noise and what a resampling takes. Each has its place whatever the
-data and the parameters are, so that noise can be held, or moved a little, while these change.
+Stored normals are those that the seed would give: first those of the initial state, then those of
+every step, then for every observation those of its simulated noise and of a resampling. Their
+places do not depend on the data or the parameters, so that noise can be held, or changed a little,
+while these change.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
-"""Which members of an ensemble are this process's own, and how it learns of the others.
+"""Which members of an ensemble this process holds, and how it exchanges data with the others.
 
-Members belong to ranks in whole blocks of 64. What is summed over members is summed block by block,
-and then over the blocks in their order, so that a sum is the same to the bit however many ranks
-there are. Where all members are one process's own, nothing is exchanged.
+Members belong to ranks in whole blocks of 64. Sums over members are taken block by block, and then
+over the blocks in their order, so that a sum is bit for bit the same on any number of ranks. Where
+one process holds all members, nothing is exchanged.
 """
 
 from typing import NamedTuple

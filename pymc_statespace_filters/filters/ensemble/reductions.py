@@ -3,7 +3,7 @@
 A sum is a row of an array with a column for each block of 64 members. Every rank writes the columns
 of its local blocks, one allgather fills in the others, and every rank adds up all of them in their
 order. The sum over one block is made by the same instructions on every rank, so that the result is
-the same to the bit on any number of ranks. With one rank nothing is exchanged.
+bit for bit the same on any number of ranks. With one rank nothing is exchanged.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The manifest of a checkpoint: the settings of its run, in a file that is written once, whole."""
+"""The manifest of a checkpoint: the settings of its run, in a file that is written once."""
 
 import json
 import os

@@ -1,6 +1,6 @@
 """A whole run, from the request to the DataTrees: the steps that all ranks take together.
 
-Types on the way of a draw, from the request to the DataTree:
+The types involved in a run, from the request to the DataTree:
 
 `SamplingRequest`
     the user's arguments on which the draws depend; `ExecutionOptions` has the others
