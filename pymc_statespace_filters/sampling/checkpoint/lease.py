@@ -4,8 +4,8 @@ Each job puts a new lease file into the folder, and then looks at those of other
 at least the later one sees the other, and gives up. `filelock.SoftFileLease` writes the file,
 which names the process and its host, and touches it every few seconds in a thread. The lease of a
 process of this computer that has ended is removed at once. Any other is watched, and removed if it
-is not touched for 20 s; only changes count, the clocks of two computers are never compared. A job that was
-suspended for longer finds its file gone and stores nothing more.
+is not touched for 20 s; only changes count, the clocks of two computers are never compared. A job
+that was suspended for longer finds its file gone and stores nothing more.
 
 SoftFileLease can also take over one common file. That is not used, because it exchanges two file
 names in one step, which NFS, SMB and most parallel file systems refuse: there the lease of a dead
