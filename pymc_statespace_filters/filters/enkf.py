@@ -67,8 +67,11 @@ def update(system, j, k, t, d, noise, members, local, work):
         w[i] = 1.0 if alive[i] else 0.0
 
     # Moments of the forecast (Eqs. 4.16-4.19), and the mean of p(d | x^f_i)
-    log_terms = _log_terms(system, k, t, d, members, local, work)
-    forecast = forecast_means(members, log_terms, work.terms, local, moments, False)
+    if work.is_ensemble:
+        log_density(system, k, t, d, X, members.log_p)
+        _fill_log_terms(members, local, work)
+    log_terms, terms = work.log_terms, work.terms
+    forecast = forecast_means(members, log_terms, terms, work.is_ensemble, local, moments, False)
     n_alive = forecast.n_alive
     if n_alive == 0.0:
         return -np.inf, 0.0, NO_FINITE_MEMBER
@@ -88,15 +91,11 @@ def update(system, j, k, t, d, noise, members, local, work):
 
 
 @inline_always
-def _log_terms(system, k, t, d, members, local, work):
-    """log p(d | x^f_i) / N of every member, none for the Gaussian likelihood."""
-    if not work.is_ensemble:
-        return work.log_terms[:0]
-    log_density(system, k, t, d, members.X, members.log_p)
+def _fill_log_terms(members, local, work):
+    """Write log p(d | x^f_i) / N of every member; zero for those that are not alive."""
     log_N = math.log(local.n_members)
     for i in range(members.alive.size):
         work.log_terms[i] = members.log_p[i] - log_N if members.alive[i] else -np.inf
-    return work.log_terms
 
 
 @inline_always

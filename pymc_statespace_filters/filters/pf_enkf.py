@@ -60,7 +60,9 @@ def update(system, j, k, t, d, noise, members, local, work):
     # Predicted density of the observation: previous weights on the forecast particles
     log_density(system, k, t, d, X, members.log_p)
     log_terms = _log_weighted_density(members, scratch)
-    forecast = forecast_means(members, log_terms, scratch.w_equal, local, scratch.moments, True)
+    forecast = forecast_means(
+        members, log_terms, scratch.w_equal, True, local, scratch.moments, True
+    )
 
     # Proposal (Eqs. 4.30-4.35) and weights (Eq. 4.36); without a proposal those of Eq. 4.28
     copy_members(X, members.X_f)

@@ -46,4 +46,4 @@ def test_it_is_the_same_to_the_bit_on_any_number_of_ranks():
         for size, found in results.items():
             assert np.array_equal(found, alone), size
         assert "members for 1 of 2 ranks" in few
-        assert "no members to spread over 2 ranks" in none
+        assert "no members to distribute over 2 ranks" in none

@@ -32,7 +32,7 @@ def digest_of_sources(package: Path) -> str:
     machine code is loaded through the module that it was compiled in.
     """
     files = [*package.glob("*.py")]
-    for folder in ("system", "compiler", "filters", "ops"):
+    for folder in ("system", "compiler", "filters", "ops", "evaluation", "pymc_model"):
         files += package.joinpath(folder).rglob("*.py")
     sources = [
         part

@@ -273,6 +273,7 @@ def backward_simulation(
             )  # fmt: skip
             simulate_backward(*arguments)
             keep_alive(table)
+            keep_alive(stored)
             if succeeded[0] == 0.0:
                 health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
                 for row in range(R):

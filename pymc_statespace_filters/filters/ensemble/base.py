@@ -220,4 +220,6 @@ class EnsembleFilterBase:
             keep_alive(normals)
             return terms, health
 
-        return CompiledFunction(run, key_of(f"{self!r} {sizes}", table.key, self.entry.key))
+        return CompiledFunction(
+            run, key_of(f"{self!r} {settings.tolist()}", table.key, self.entry.key)
+        )

@@ -86,25 +86,27 @@ class Forecast(NamedTuple):
 
 
 @inline_always
-def forecast_means(members, log_terms, terms, local, moments, is_normalised):
+def forecast_means(members, log_terms, terms, has_terms, local, moments, is_normalised):
     """Means of states and simulated observations (Eqs. 4.16, 4.30-4.31), in one allgather.
 
     Unless the weights w are normalised, they are 1 for members that are alive and 0 for others.
+    ``has_terms`` tells whether to sum ``log_terms`` too.
     """
     n, p = moments.P_xd.shape
     sum_values(members.alive, local, 0)
     sum_spread(members.w, local, 1)
     sum_members(members.w, members.X, local, 2)
     sum_members(members.w, members.D, local, 2 + n)
-    weigh(log_terms, terms, local, 2 + n + p)
-    allgather_sums(local, 2 + n + p + 3)
+    if has_terms:
+        weigh(log_terms, terms, local, 2 + n + p)
+    allgather_sums(local, 2 + n + p + 3 * has_terms)
     n_alive, spread = total(local, 0), total(local, 1)
     weight = 1.0 if is_normalised else n_alive
     for a in range(n):
         moments.x_mean[a] = total(local, 2 + a) / weight
     for b in range(p):
         moments.d_mean[b] = total(local, 2 + n + b) / weight
-    log_sum, n_effective = total_weight(local, 2 + n + p)
+    log_sum, n_effective = total_weight(local, 2 + n + p) if has_terms else (0.0, 0.0)
     return Forecast(n_alive, spread, log_sum, n_effective)
 
 

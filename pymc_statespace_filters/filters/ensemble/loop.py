@@ -191,9 +191,14 @@ def ensemble_filter(
         if state[1] == NONE:
             emit(to, ENDED, n_observations, k, members, nothing, ancestors)
 
-    return EntryPoint(run, FILTER_ARGUMENTS, name, _key(name, update), needs=(FILL_NORMALS,))
+    key = _key(name, n_settings, workspace, update, resampler, resample)
+    return EntryPoint(run, FILTER_ARGUMENTS, name, key, needs=(FILL_NORMALS,))
 
 
-def _key(name: str, update: Callable) -> str | None:
-    in_package = update.__module__.partition(".")[0] == __name__.partition(".")[0]
-    return digest(name) if in_package else None
+def _key(name: str, n_settings: int, *functions: Callable) -> str | None:
+    """The key on disk; None for code outside the package, which the key would not cover."""
+    package = __name__.partition(".")[0]
+    if any(function.__module__.partition(".")[0] != package for function in functions):
+        return None
+    parts = (f"{function.__module__}.{function.__qualname__}" for function in functions)
+    return digest(name, str(n_settings), *parts)

@@ -4,22 +4,28 @@ import pytest
 
 from pymc_statespace_filters.compiler.native.cache_key import digest_of_sources
 
+SOURCES = (
+    "errors.py",
+    "system/model.py",
+    "compiler/native/jit.py",
+    "filters/enkf.py",
+    "filters/ensemble/deep/loop.py",
+    "ops/base.py",
+    "evaluation/simulate.py",
+    "pymc_model/dispatch.py",
+)
+
 
 @pytest.fixture
 def package(tmp_path):
-    for path in (
-        "errors.py",
-        "filters/enkf.py",
-        "filters/ensemble/deep/loop.py",
-        "plots/states.py",
-    ):
+    for path in (*SOURCES, "plots/states.py"):
         file = tmp_path / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"# {path}\n")
     return tmp_path
 
 
-@pytest.mark.parametrize("path", ["errors.py", "filters/enkf.py", "filters/ensemble/deep/loop.py"])
+@pytest.mark.parametrize("path", SOURCES)
 def test_a_changed_source_changes_the_key_in_nested_folders_too(package, path):
     before = digest_of_sources(package)
     (package / path).write_text("# changed\n")
