@@ -87,7 +87,9 @@ def test_one_of_two_noisy_variables_is_tuned_on_its_own_noise():
     ]
     np.testing.assert_allclose(spreads[0].variance, spreads[1].variance, rtol=1e-9)
     assert spreads[0].mean != spreads[1].mean
-    with pytest.raises(ModelError, match=r"several variables are noisy, .* one of 'a', 'b'"):
+    with pytest.raises(
+        ModelError, match=r"var_name must be one of 'a', 'b', as several variables are noisy"
+    ):
         psf.suggest_particles(two_records(few, few))
 
 

@@ -100,7 +100,7 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
         {segment.name.partition(".")[0] for segment in folder.rglob("*.segment")}
         for folder in sorted(tmp_path.iterdir())
     ]
-    assert stored == [{"chain-0", "chain-1"}] * 2
+    assert sorted(stored, key=len) == [set(), {"chain-0", "chain-1"}]  # one had not begun
     trees = psf.run_models(models, **settings)
     for name in models:
         assert_identical(trees[name], expected[name])
