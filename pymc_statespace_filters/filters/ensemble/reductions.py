@@ -194,7 +194,8 @@ def weighted_mean(w, X, total_weight, local, out):
         out[a] = total(local, a) / total_weight
 
 
-@inline_always
+# Not inlined: an entry point may multiply by a reciprocal, which changes the last bit.
+@njit_contract
 def weighted_cov(w, X, x_mean, Y, y_mean, divisor, local, out):
     """Covariances sum_i w_i (X_ai - mean) (Y_bi - mean) / divisor; zero weights as above."""
     n, p = out.shape
