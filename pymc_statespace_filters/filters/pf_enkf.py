@@ -44,18 +44,17 @@ def workspace(system, local, settings):
 @inline_always
 def update(system, j, k, t, d, noise, members, local, work):
     """Move the particles by a Kalman gain, and weight them for the densities that this changes."""
-    X, log_w = members.X, members.log_w
+    X, log_w, alive = members.X, members.log_w, members.alive
     likelihood, scratch = work
 
     # Simulated observations (Eq. 4.29), and previous weights of the particles that are alive
     observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, members.D)
-    mark_finite(X, members.D, members.alive)
+    mark_finite(X, members.D, alive)
     for i in range(log_w.size):
-        log_w[i] = log_w[i] if members.alive[i] else -np.inf
+        log_w[i] = log_w[i] if alive[i] else -np.inf
     log_alive, n_effective = normalise_weights(log_w, members.w, local)
     if log_alive == -np.inf:
-        failure = NO_FINITE_MEMBER if count(members.alive, local) == 0.0 else ZERO_WEIGHTS
-        return -np.inf, 0.0, failure
+        return -np.inf, 0.0, NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS
 
     # Predicted density of the observation: previous weights on the forecast particles
     log_density(system, k, t, d, X, members.log_p)
