@@ -5,8 +5,9 @@ import functools
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.compiler.numerics.philox import INITIAL, OBSERVATION, PROCESS, padded
-from pymc_statespace_filters.compiler.numerics.philox import fill_normals as fill
+from pymc_statespace_filters.compiler.numerics.normals import fill_normals as fill
+from pymc_statespace_filters.compiler.numerics.normals import padded
+from pymc_statespace_filters.compiler.numerics.philox import INITIAL, OBSERVATION, PROCESS
 from pymc_statespace_filters.errors import ModelError
 from tests.filters.machines import DOUBLE_WELL, double_well_machine, evaluate, oscillator_record
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING, uniform
+from pymc_statespace_filters.compiler.numerics.normals import uniform
+from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, normals, run

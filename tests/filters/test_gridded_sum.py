@@ -8,7 +8,7 @@ import pytest
 from numba import njit
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.compiler.numerics.philox import padded
+from pymc_statespace_filters.compiler.numerics.normals import padded
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.kernel_density.density import density_method
 from pymc_statespace_filters.filters.kernel_density.gridded_sum import (

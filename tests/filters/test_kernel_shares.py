@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.compiler.numerics.philox import padded
+from pymc_statespace_filters.compiler.numerics.normals import padded
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.kernel_density.density import (

@@ -5,7 +5,8 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING, uniform
+from pymc_statespace_filters.compiler.numerics.normals import uniform
+from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.filters.laws import (

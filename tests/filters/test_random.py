@@ -1,26 +1,36 @@
 """The generator: known answers, laws, and that a number depends on nothing but its place."""
 
+import hashlib
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numba import njit
 from scipy import stats
 
 from pymc_statespace_filters.compiler.numerics import (
-    philox as _random,
+    normals as _normals,
+)
+from pymc_statespace_filters.compiler.numerics import (
+    philox as _philox,
 )
 from pymc_statespace_filters.compiler.numerics import (
     restricted_domain as _elementary,
 )
-from pymc_statespace_filters.compiler.numerics.philox import (
+from pymc_statespace_filters.compiler.numerics.normals import (
     BLOCK,
-    INITIAL,
-    OBSERVATION,
-    PROCESS,
-    RESAMPLING,
     exponential,
     fill_normals,
     padded,
     uniform,
+)
+from pymc_statespace_filters.compiler.numerics.philox import (
+    INITIAL,
+    OBSERVATION,
+    PROCESS,
+    RESAMPLING,
 )
 
 
@@ -43,19 +53,30 @@ def elementwise_log(x, out):
 
 
 @njit
-def elementwise_sin_cos(x, sine, cosine):
-    for i in range(x.size):
-        sine[i], cosine[i] = _elementary.sin_cos_quarter(x[i])
-
-
-@njit
 def scalar_philox(counter, key):
-    return _random.philox(counter[0], counter[1], counter[2], counter[3], key[0], key[1])
+    words = _philox.philox(counter[0], counter[1], counter[2], counter[3], key[0], key[1])
+    return [word & _philox.LOW_WORD for word in words]
+
+
+def box_muller(word, of_direction):
+    """The normals of two words, as the module's docstring says, in double precision."""
+    radius = np.sqrt(-2 * np.log((word + 0.5) / 2**32))
+    angle = np.pi * (of_direction + 0.5 - 2**31) / 2**32
+    sign = -1 if of_direction % 2 else 1
+    return np.array([sign * radius * np.sin(angle), sign * radius * np.cos(angle)])
 
 
 @njit
-def box_muller(words):
-    return _random.box_muller(words[0], words[1], words[2], words[3])
+def _made_of(of_radius, of_direction, made):
+    for i in range(of_radius.size):
+        radius = _normals.radius_of(_normals.number_of(of_radius[i]))
+        made[i] = _normals.point_at(radius, _normals.number_of(of_direction[i]))
+
+
+def made_of(of_radius, of_direction):
+    made = np.empty((of_radius.size, 2))
+    _made_of(of_radius, of_direction, made)
+    return made
 
 
 def relative_error(value, exact):
@@ -89,15 +110,6 @@ def test_log_is_accurate_to_rounding_also_near_one():
     assert relative_error(out, np.log(x.astype(np.longdouble))) < 1e-15
 
 
-def test_sin_and_cos_are_accurate_to_rounding():
-    x = np.concatenate([np.linspace(-0.5, 0.5, 20_000), np.logspace(-16, -1, 100)])
-    sine, cosine = np.empty_like(x), np.empty_like(x)
-    elementwise_sin_cos(x, sine, cosine)
-    angle = x.astype(np.longdouble) * np.arctan(np.longdouble(1)) * 2
-    assert relative_error(sine, np.sin(angle)) < 1e-15
-    assert relative_error(cosine, np.cos(angle)) < 1e-15
-
-
 # ---- the generator
 
 
@@ -105,11 +117,11 @@ def test_sin_and_cos_are_accurate_to_rounding():
     ("counter", "key", "answer"),
     [
         ("00000000 00000000 00000000 00000000", "00000000 00000000",
-         "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+         "5f6fb709 0d893f64 4f121f81 4f730a48"),
         ("ffffffff ffffffff ffffffff ffffffff", "ffffffff ffffffff",
-         "408f276d 41c83b0e a20bc7c6 6d5451fd"),
+         "5207ddc2 45165e59 4d8ee751 8c52f662"),
         ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0",
-         "d16cfe09 94fdcceb 5001e420 24126ea1"),
+         "4dfccaba 190a87f0 c47362ba b6b5242a"),
     ],
 )  # fmt: skip
 def test_philox_gives_the_published_known_answers(counter, key, answer):
@@ -120,12 +132,48 @@ def test_philox_gives_the_published_known_answers(counter, key, answer):
 
 
 def test_normals_are_box_muller_of_the_documented_philox_counter():
-    seed, step, component, pair = -7, 12, 1, 40  # pair 40 is lane 8 of block 1
+    seed, step, component, call = -7, 12, 1, 24  # call 24 is lane 8 of block 1
     key = np.array([seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF], dtype=np.uint64)
-    counter = np.array([pair, component, step, PROCESS], dtype=np.uint64)
-    expected = box_muller(np.array(scalar_philox(counter, key), dtype=np.uint64))
     Z = normals(seed, PROCESS, step, components=2, members=128)
-    assert (Z[1, 64 + 8], Z[1, 64 + 8 + 32]) == expected
+    for call in range(16, 32):
+        counter = np.array([call, component, step, PROCESS], dtype=np.uint64)
+        words = [int(word) for word in scalar_philox(counter, key)]
+        lane = 64 + call - 16
+        for first, two_words in ((lane, words[:2]), (lane + 16, words[2:])):
+            expected = box_muller(*two_words)
+            assert np.abs(Z[1, [first, first + 32]] - expected).max() < 4e-8
+
+
+def test_all_words_make_normals_as_accurate_as_stated():
+    corners = [0, 1, 2, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1]
+    words = np.concatenate([corners, np.random.default_rng(1).integers(0, 2**32, 20_000)])
+    for of_radius, of_direction in ((words, words[::-1]), (words, np.roll(words, 5))):
+        made = made_of(of_radius.astype(np.uint64), of_direction.astype(np.uint64))
+        exact = np.array(
+            [box_muller(int(a), int(b)) for a, b in zip(of_radius, of_direction, strict=True)]
+        )
+        radius = np.hypot(*exact.T)
+        assert np.abs(np.hypot(*made.T) / radius - 1).max() < 2e-8
+        assert np.abs((made - exact).T / radius).max() < 2e-8
+
+
+def digest_of_normals():
+    return hashlib.sha256(normals(-7, PROCESS, 11, components=3, members=1250)).hexdigest()
+
+
+def test_normals_are_the_same_to_the_bit_on_every_machine():
+    # Computed with vectors of 2, 4 and 8 numbers.
+    assert digest_of_normals() == "a0272b7f8bc9ebce1b5475f90321e02f1466dd49eb3d55699fad7cde78594a90"
+
+
+def test_normals_do_not_depend_on_the_width_of_vectors():
+    # A processor without a fused multiply-add, and with vectors of two numbers.
+    plain = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    program = "from tests.filters.test_random import digest_of_normals as d; print(d())"
+    run = subprocess.run(
+        [sys.executable, "-c", program], env=plain, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == digest_of_normals()
 
 
 def test_a_number_does_not_depend_on_how_many_members_or_components_there_are():
@@ -208,7 +256,7 @@ def test_exponentials_are_exponential():
 )
 def test_the_unit_interval_is_open_and_symmetric(words, expected):
     word = np.uint64(words)
-    assert njit(lambda w: _random.open_unit(w, w))(word) == expected
+    assert njit(lambda w: _philox.open_unit(w, w))(word) == expected
 
 
 @pytest.mark.parametrize(("n", "expected"), [(2, 64), (64, 64), (65, 128), (1250, 1280)])

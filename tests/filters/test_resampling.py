@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK, RESAMPLING, fill_normals, padded
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK, fill_normals, padded
+from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING
 from pymc_statespace_filters.filters.ensemble.resampling import (
     POINTS,
     choose_ancestors,

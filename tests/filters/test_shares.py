@@ -8,7 +8,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.jit import njit_contract
-from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS, fill_normals
+from pymc_statespace_filters.compiler.numerics.normals import fill_normals
+from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS
 from pymc_statespace_filters.filters import BootstrapPF, EnKF
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,

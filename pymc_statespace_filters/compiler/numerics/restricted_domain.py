@@ -1,4 +1,4 @@
-"""exp, log, sin and cos restricted to the domains that the filters need, for speed.
+"""exp and log restricted to the domains that the filters need, for speed.
 
 Like the functions of `exponential`, which hold for all numbers, these have no branches and no
 calls, so that loops vectorise. They are separate on purpose: without special cases and compensated
@@ -27,9 +27,6 @@ from pymc_statespace_filters.compiler.numerics.intrinsics import (
     float_of,
     polynomial,
 )
-from pymc_statespace_filters.compiler.numerics.trigonometric import COS, SIN
-
-_HALF_PI = 1.5707963267948966
 
 _EXP = tuple(1.0 / math.factorial(i) for i in range(12, -1, -1))  # Taylor: truncation 2e-16
 
@@ -57,11 +54,3 @@ def log(x):
     half_square = 0.5 * f * f
     tail = s * (half_square + polynomial(z, LOG) * z) + k * LN2_LOW
     return k * LN2_HIGH - ((half_square - tail) - f)
-
-
-@inline_always
-def sin_cos_quarter(v):
-    """(sin(pi v / 2), cos(pi v / 2)) for |v| <= 1/2."""
-    a = v * _HALF_PI
-    z = a * a
-    return a + a * z * polynomial(z, SIN), 1.0 - (0.5 * z - z * z * polynomial(z, COS))

@@ -9,7 +9,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunc
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK, padded
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK, padded
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.callbacks import NO_CALLBACK
 from pymc_statespace_filters.filters.ensemble.loop import FilterArguments

@@ -15,7 +15,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     arguments_class,
 )
 from pymc_statespace_filters.compiler.native.jit import inline_always
-from pymc_statespace_filters.compiler.numerics.philox import FILL_NORMALS
+from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
     FORECAST,

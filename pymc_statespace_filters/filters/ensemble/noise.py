@@ -14,8 +14,8 @@ from numba import carray, types
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint, arguments_class
 from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.compiler.numerics.philox import (
-    FILL_NORMALS,
     INITIAL,
     OBSERVATION,
     PROCESS,

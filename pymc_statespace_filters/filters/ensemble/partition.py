@@ -11,7 +11,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import inline_always
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 
 MEMBERS, BLOCKS = BLOCK, 1
 """Columns of a block: an array has a column for each member, or one for each block.

@@ -16,7 +16,7 @@ from pymc_statespace_filters.compiler.native.jit import (
     njit_reassoc,
     njit_strict,
 )
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
     MEMBERS,

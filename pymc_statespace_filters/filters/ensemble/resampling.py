@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK, exponential, padded, uniform
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK, exponential, padded, uniform
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     MOST_STATES,

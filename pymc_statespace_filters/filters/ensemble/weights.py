@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
 from pymc_statespace_filters.filters.ensemble.reductions import (
     HALVES,

@@ -23,7 +23,8 @@ from pymc_statespace_filters.compiler.lowering.covariances import (
 )
 from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK, FILL_NORMALS, STATES
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK, FILL_NORMALS
+from pymc_statespace_filters.compiler.numerics.philox import STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
 from pymc_statespace_filters.filters.gaussian.recursion import (
     GaussianFilterFunctions,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     LOG_TWO_PI,
     semidefinite_cholesky,

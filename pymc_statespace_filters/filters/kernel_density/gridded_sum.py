@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
-from pymc_statespace_filters.compiler.numerics.philox import BLOCK
+from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
