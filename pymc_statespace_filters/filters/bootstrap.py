@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.ensemble.reductions import count
@@ -15,13 +15,13 @@ from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZER
 from pymc_statespace_filters.filters.system_table import log_density
 
 
-@inline_always
+@njit_internal
 def workspace(system, local, settings):
     """Nothing: the update needs no scratch."""
     return ()
 
 
-@inline_always
+@njit_internal
 def update(system, j, k, t, d, noise, members, local, work):
     """Weight the particles by the density of the observation."""
     X, w, log_w, alive = members.X, members.w, members.log_w, members.alive

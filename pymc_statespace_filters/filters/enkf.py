@@ -8,7 +8,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import NO_LAG, ancestral_smoother
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
@@ -47,7 +47,7 @@ class _Work(NamedTuple):
     residual: np.ndarray
 
 
-@inline_always
+@njit_internal
 def workspace(system, local, settings):
     """Scratch of an update."""
     moments = moments_workspace(system.n, system.p)
@@ -55,7 +55,7 @@ def workspace(system, local, settings):
     return _Work(settings[0] == _ENSEMBLE, moments, np.empty(N), np.empty(N), np.empty(system.p))
 
 
-@inline_always
+@njit_internal
 def update(system, j, k, t, d, noise, members, local, work):
     """Move the members by the Kalman gain of their own covariances."""
     X, D, w, alive, moments = members.X, members.D, members.w, members.alive, work.moments
@@ -90,7 +90,7 @@ def update(system, j, k, t, d, noise, members, local, work):
     return increment, n_effective, NONE
 
 
-@inline_always
+@njit_internal
 def _fill_log_terms(members, local, work):
     """Write log p(d | x^f_i) / N of every member; zero for those that are not alive."""
     log_N = math.log(local.n_members)
@@ -98,7 +98,7 @@ def _fill_log_terms(members, local, work):
         work.log_terms[i] = members.log_p[i] - log_N if members.alive[i] else -np.inf
 
 
-@inline_always
+@njit_internal
 def _gaussian_likelihood(d, work):
     """log N(d; d_bar, P_dd), observed components only."""
     moments, residual, n_present = work.moments, work.residual, 0

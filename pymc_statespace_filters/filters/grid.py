@@ -24,7 +24,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     arguments_class,
 )
-from pymc_statespace_filters.compiler.native.jit import inline_always, keep_alive, njit_contract
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
@@ -148,7 +148,7 @@ class GridFilter:
         evaluate, make_table, dt = POINT_MASS.external, table.make, system.dt
         tolerance = self.tolerance
 
-        @njit_contract
+        @njit_callable
         def run(theta, steps, observed, inputs, t0, noise):
             terms, health = np.full(steps.size, -np.inf), np.empty(3)
             health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
@@ -196,7 +196,7 @@ def _point_mass(
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
-@inline_always
+@njit_internal
 def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
     if not has_valid_covariances(system):

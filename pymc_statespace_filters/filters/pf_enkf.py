@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
@@ -35,13 +35,13 @@ _LIKELIHOODS = ("predictive", "weights", "as_printed")
 _PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
 
 
-@inline_always
+@njit_internal
 def workspace(system, local, settings):
     """The choice of the likelihood, and scratch of an update."""
     return int(settings[2]), importance_workspace(system, local)
 
 
-@inline_always
+@njit_internal
 def update(system, j, k, t, d, noise, members, local, work):
     """Move the particles by a Kalman gain, and weight them for the densities that this changes."""
     X, log_w, alive = members.X, members.log_w, members.alive
@@ -91,7 +91,7 @@ def update(system, j, k, t, d, noise, members, local, work):
     return increment, n_effective, NONE
 
 
-@inline_always
+@njit_internal
 def _log_weighted_density(members, scratch):
     """log w_i p(d | x_i) of every particle."""
     for i in range(members.log_w.size):
@@ -99,7 +99,7 @@ def _log_weighted_density(members, scratch):
     return scratch.log_prior
 
 
-@inline_always
+@njit_internal
 def _propose(d, members, spread, free, local, moments):
     """Move X by the Kalman gain; False if the covariance is singular or not finite."""
     if not (spread > _ONE_PARTICLE and forecast_covariances(members, d, spread, local, moments)):

@@ -18,7 +18,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     address_of,
     call_address,
 )
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.protocol import System
 
 
@@ -98,7 +98,7 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     constants[TABLE.is_time_invariant] = "step_moments" in used and system.is_time_invariant
     constants[N_SLOTS:] = system.free
 
-    @njit_contract
+    @njit_internal
     def make():
         table = constants.copy()
         table[TABLE.prepare] = address_of(prepare)
@@ -113,7 +113,7 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     return SystemTable(make, key_of(repr((system.dt, constants.tolist())), *keys))
 
 
-@inline_always
+@njit_internal
 def read_system(table, dt, theta, n_theta, inputs, n_rows):
     """Unpack a table, and prepare the constants of one evaluation."""
     slots = carray(table, (N_SLOTS,))
@@ -130,7 +130,7 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
     )  # fmt: skip
 
 
-@inline_always
+@njit_internal
 def _call(address, system, k, t, z, width, X, out):
     arguments = MemberArguments(
         c=system.c, inputs=system.inputs, k=k, t=t, z=z, width=width, X=X, out=out,
@@ -139,31 +139,31 @@ def _call(address, system, k, t, z, width, X, out):
     call_address(address, arguments)
 
 
-@inline_always
+@njit_internal
 def initialise(system, z, width, X):
     """Draw every member's state at step 0 from normals at the address z."""
     _call(system.initialise, system, NULL, 0.0, z, width, X, NULL)
 
 
-@inline_always
+@njit_internal
 def propagate(system, k, t, z, width, X):
     """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
     _call(system.propagate, system, k, t, z, width, X, NULL)
 
 
-@inline_always
+@njit_internal
 def observe(system, k, t, z, width, X, D):
     """Simulate an observation of every member (Eq. 4.15)."""
     _call(system.observe, system, k, t, z, width, X, D)
 
 
-@inline_always
+@njit_internal
 def log_density(system, k, t, d, X, log_p):
     """Write log p(d | x) of every member; components of d that are NaN are left out."""
     _call(system.log_density, system, k, t, d, NULL, X, log_p)
 
 
-@inline_always
+@njit_internal
 def step_moments(system, k, t, X, M):
     """Write mean and variance of the next state, given each point X (1, N), to M (2, N)."""
     _call(system.step_moments, system, k, t, NULL, NULL, X, M)

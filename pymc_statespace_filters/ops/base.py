@@ -24,7 +24,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import (
     compile_system,
 )
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
+from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.system.model import StateSpaceModel

@@ -23,12 +23,17 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.system.parameters import flat_parameters
+from tests.compiled import from_python
 from tests.filters.test_ekf_states import assert_drawn_from
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
 from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
+
+_choose_particles, _fill_intervals, _settlement = map(
+    from_python, (_choose_particles, _fill_intervals, _settlement)
+)
 
 ROWS = np.arange(7)
 NO_INPUTS = np.zeros((0, 0))

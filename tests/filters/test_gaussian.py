@@ -11,6 +11,12 @@ from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     solve_lower,
     solve_lower_transposed,
 )
+from tests.compiled import from_python
+
+cholesky, log_gaussian, semidefinite_cholesky, solve_lower, solve_lower_transposed = map(
+    from_python,
+    (cholesky, log_gaussian, semidefinite_cholesky, solve_lower, solve_lower_transposed),
+)
 
 
 def random_covariance(n, seed, rank=None):

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -273,7 +273,7 @@ def test_other_draws_are_independent():
         assert abs(correlations).max() < 5.0 / np.sqrt(N_DRAWS)
 
 
-@njit_contract
+@njit(error_model="numpy", nogil=True)
 def quantiles(low, spacing, mass, u, out):
     for i in range(u.size):
         out[i] = draw(low, spacing, mass, u[i])

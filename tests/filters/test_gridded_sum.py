@@ -18,10 +18,13 @@ from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
 )
 from pymc_statespace_filters.filters.kernel_density.points import Points
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
+from tests.compiled import from_python
 from tests.filters.laws import OSCILLATOR, run
 from tests.filters.machines import scalar_record
 from tests.filters.test_kernel_density import bandwidth, log_density
 from tests.filters.test_pf_enkf_page import numpy_pf_enkf
+
+gridded_sum_workspace = from_python(gridded_sum_workspace)
 
 GOAL = 1e-8
 REACHED = 2e-9  # what the module promises of a pair, and a little for what windows leave out

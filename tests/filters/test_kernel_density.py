@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.ensemble.reductions import local_partition, weighted_cov
 from pymc_statespace_filters.filters.kernel_density.density import (
@@ -14,11 +14,16 @@ from pymc_statespace_filters.filters.kernel_density.density import (
     log_kernel_density,
     scott_bandwidth,
 )
+from tests.compiled import from_python
+
+density_workspace, log_kernel_density, scott_bandwidth = map(
+    from_python, (density_workspace, log_kernel_density, scott_bandwidth)
+)
 
 ALONE = RankLayout(0, 1, 0)
 
 
-@njit_contract
+@njit(error_model="numpy", nogil=True)
 def covariance(w, X, kernel, divisor, local):
     weighted_cov(w, X, kernel.mean, X, kernel.mean, divisor, local, kernel.cov)
 

@@ -10,8 +10,11 @@ from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     log_kernel_density,
 )
+from tests.compiled import from_python
 from tests.filters.test_kernel_density import bandwidth, weighted_particles
 from tests.ranks import on_ranks
+
+density_workspace, log_kernel_density = map(from_python, (density_workspace, log_kernel_density))
 
 LINE, PLANE, SPACE = 1, 2, 3
 

@@ -10,6 +10,11 @@ from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     read_keys,
     undo_rotations,
 )
+from tests.compiled import from_python
+
+order_particles, order_workspace, read_keys, undo_rotations = map(
+    from_python, (order_particles, order_workspace, read_keys, undo_rotations)
+)
 
 workspace = numba.njit(lambda n, n_particles: order_workspace(n, n_particles))
 

@@ -15,6 +15,11 @@ from pymc_statespace_filters.filters.ensemble.resampling import (
     n_normals,
     systematic,
 )
+from tests.compiled import from_python
+
+choose_ancestors, choose_in_order, copy_ancestors, multinomial, systematic = map(
+    from_python, (choose_ancestors, choose_in_order, copy_ancestors, multinomial, systematic)
+)
 
 
 def ancestors_at(weights, points):

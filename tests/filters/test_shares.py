@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numba import njit
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.compiler.numerics.normals import fill_normals
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS
 from pymc_statespace_filters.filters import BootstrapPF, EnKF
@@ -106,7 +106,7 @@ def test_normals_of_a_part_are_those_of_the_whole():
 # ---- sums
 
 
-@njit_contract
+@njit(error_model="numpy", nogil=True)
 def all_sums(rank, n_ranks, address, w, X, log_w):
     """Sums of the local part of w, X and log_w, by way of the ranks' exchange."""
     local = local_partition(RankLayout(rank, n_ranks, address), w.size, 12)

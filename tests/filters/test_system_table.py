@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from numba import carray, types
+from numba import carray, njit, types
 
 from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.compiler.native.entry_point import (
@@ -11,7 +11,6 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     arguments_class,
 )
-from pymc_statespace_filters.compiler.native.jit import njit_contract
 from pymc_statespace_filters.filters.system_table import (
     N_SLOTS,
     SYSTEM_ARGUMENTS,
@@ -19,6 +18,7 @@ from pymc_statespace_filters.filters.system_table import (
     read_system,
     system_table,
 )
+from tests.compiled import from_python
 from tests.filters.machines import oscillator_machine
 
 FUNCTIONS = ("initialise", "propagate", "observe", "log_density")
@@ -50,11 +50,11 @@ def test_what_is_packed_is_read_under_its_own_name():
     machine = oscillator_machine()
     machine.n, machine.p, machine.n_inputs, machine.n_theta = 2, 3, 5, 4
     machine.free = np.array([1])
-    table = system_table(machine, FUNCTIONS).make()
+    table = from_python(system_table(machine, FUNCTIONS).make)()
     READ.compile()
     read = READ.external
 
-    @njit_contract
+    @njit(error_model="numpy", nogil=True)
     def unpack(table, theta, inputs):
         out, reals = np.empty(12, np.int64), np.empty(2)
         arguments = ReadArguments(

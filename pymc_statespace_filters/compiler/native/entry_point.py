@@ -25,7 +25,7 @@ from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, digest
-from pymc_statespace_filters.compiler.native.private_linkage import (
+from pymc_statespace_filters.compiler.native.code_library import (
     InternalLinkageCompiler,
     with_internal_linkage,
 )

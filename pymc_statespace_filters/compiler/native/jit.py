@@ -3,35 +3,48 @@
 Division by zero gives inf or nan as in NumPy, the GIL is released, and multiplications may be fused
 with additions. No flag lets the compiler assume finite numbers, because it would remove the checks
 for NaN and infinity.
+
+Most functions are called by compiled functions only, see `code_library`. Each of these is optimised
+alone, so a loop vectorises only if what it calls is inlined.
 """
+
+from functools import partial
 
 from numba import njit
 
-njit_contract = njit(error_model="numpy", nogil=True, fastmath={"contract"})
+from pymc_statespace_filters.compiler.native.code_library import LinkedCompiler
 
-njit_internal = njit(
+_linked = partial(
+    njit,
     error_model="numpy",
     nogil=True,
-    fastmath={"contract"},
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
+    pipeline_class=LinkedCompiler,
 )
-"""For a function that only compiled functions call: compiled without the wrappers for Python."""
 
-inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
-"""For a function with one caller, or of a few instructions inside a loop that must vectorise.
+njit_internal = _linked(fastmath={"contract"})
+"""For all functions without a reason for another decorator."""
 
-Numba inlines it before compilation. LLVM would otherwise optimise it again at every level of
-callers, so this also halves the compilation time of a new model.
-"""
+njit_callable = njit(error_model="numpy", nogil=True, fastmath={"contract"})
+"""For a function that Python calls, too."""
 
-njit_reassoc = njit(error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+njit_reassoc = _linked(fastmath={"contract", "reassoc"})
 """For sums over members, which may be reordered in order to vectorise."""
 
+inlined = _linked(forceinline=True)
+"""For functions inside vector loops, without fused operations: LLVM inlines them."""
+
+inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
+"""For a few instructions inside a loop that must vectorise, fused with those of the loop.
+
+Numba inlines them before compilation, which takes time in proportion to the caller's size.
+"""
+
 njit_strict = njit(error_model="numpy", nogil=True, inline="always")
-"""Inlined, without fused operations: for sums whose bits must not depend on the calling code."""
+"""As `inline_always` without fused operations: for bits that must not depend on the caller."""
 
 
-@njit_contract
+@njit_internal
 def keep_alive(array):
     """Do nothing; called after the last use of an array's address, to keep the array until then."""

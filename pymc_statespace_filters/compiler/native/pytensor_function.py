@@ -20,13 +20,13 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
     EntryPoint,
     call_address,
 )
-from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 

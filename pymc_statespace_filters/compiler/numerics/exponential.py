@@ -11,12 +11,12 @@ that of `_log_parts` and its evaluation are fdlibm's (Sun Microsystems, 1993).
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.jit import inlined
 from pymc_statespace_filters.compiler.numerics.intrinsics import (
     ROUND,
     bits_of,
     float_of,
     fma,
-    inlined,
     polynomial,
     power_of_two,
     sign_bit,

@@ -1,9 +1,9 @@
 """Hyperbolic functions for vector code, by the rules of `exponential`."""
 
+from pymc_statespace_filters.compiler.native.jit import inlined
 from pymc_statespace_filters.compiler.numerics.exponential import exp, exp_times
 from pymc_statespace_filters.compiler.numerics.intrinsics import (
     fma,
-    inlined,
     polynomial,
     sign_bit,
     with_sign,

@@ -8,18 +8,11 @@ whether the loop around it was vectorised.
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-inlined = njit(
-    error_model="numpy",
-    nogil=True,
-    forceinline=True,
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,
-)
-"""For functions inside vector loops: LLVM inlines them into every caller."""
+from pymc_statespace_filters.compiler.native.jit import inlined
 
 ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it rounds to an integer, held in the lowest bits
 _ROUND_BIASED = ROUND + 1023.0

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 
@@ -41,7 +41,7 @@ def _scale_column(A, j, root):
         A[j, i] = 0.0
 
 
-@njit_contract
+@njit_internal
 def cholesky(A):
     """Replace A by its lower Cholesky factor; False, with A in parts, if not positive definite."""
     for j in range(A.shape[0]):
@@ -52,7 +52,7 @@ def cholesky(A):
     return True
 
 
-@njit_contract
+@njit_internal
 def semidefinite_cholesky(A, floor, active):
     """Replace A by a lower factor in which directions without variance have a zero column.
 
@@ -72,7 +72,7 @@ def semidefinite_cholesky(A, floor, active):
     return True
 
 
-@njit_contract
+@njit_internal
 def solve_lower(L, b):
     """Replace b by L^-1 b."""
     for i in range(b.size):
@@ -81,7 +81,7 @@ def solve_lower(L, b):
         b[i] /= L[i, i]
 
 
-@njit_contract
+@njit_internal
 def solve_lower_transposed(L, b):
     """Replace b by L^-T b."""
     for i in range(b.size - 1, -1, -1):
@@ -90,7 +90,7 @@ def solve_lower_transposed(L, b):
         b[i] /= L[i, i]
 
 
-@njit_contract
+@njit_internal
 def log_gaussian(r, L, n_dims):
     """log N(r; 0, L L^T) of ``n_dims`` components; r is overwritten.
 

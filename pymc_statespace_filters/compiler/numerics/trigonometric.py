@@ -10,12 +10,12 @@ Angles are reduced by pi / 2 in three parts, which with fused multiplications is
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.jit import inlined
 from pymc_statespace_filters.compiler.numerics.intrinsics import (
     ROUND,
     bits_of,
     float_of,
     fma,
-    inlined,
     polynomial,
     sign_bit,
     with_sign,

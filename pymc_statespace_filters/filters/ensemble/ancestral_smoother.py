@@ -26,7 +26,8 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, addr
 from pymc_statespace_filters.compiler.native.jit import (
     inline_always,
     keep_alive,
-    njit_contract,
+    njit_callable,
+    njit_internal,
     njit_reassoc,
 )
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
@@ -89,7 +90,7 @@ def _n_reals(header):
     return (3 * n + 1) * header[_ROWS] + N + header[_SLOTS] * n * N
 
 
-@inline_always
+@njit_internal
 def _past_of(integers, reals):
     """Name the parts of the two vectors."""
     header, whole = integers[:_N_HEADER], integers[_N_HEADER:]
@@ -134,7 +135,7 @@ def _carry_past(integers, reals, event, j, k, X, log_w, d, D, ancestors):
             _settle(past, log_weights)
 
 
-@njit_contract
+@njit_internal
 def _settle(past, log_w):
     """Write the summary of the oldest row that is kept."""
     header = past.header
@@ -148,7 +149,7 @@ def _settle(past, log_w):
     header[_SETTLED] += 1
 
 
-@njit_contract
+@njit_internal
 def _count_distinct(w, origins):
     """Number of distinct ancestors of the members that have weight."""
     seen, count = np.zeros(w.size, np.bool_), 0
@@ -159,7 +160,7 @@ def _count_distinct(w, origins):
     return count
 
 
-@njit_contract
+@njit_internal
 def _resample_past(parents, past, origins):
     """Give every member the past of its parent."""
     old_past, old_origins = past.copy(), origins.copy()
@@ -169,7 +170,7 @@ def _resample_past(parents, past, origins):
             past[a, i] = old_past[a, parents[i]]
 
 
-@njit_contract
+@njit_internal
 def _update_past(past, d, D):
     """Move the free states of all rows kept as `kalman_update` moves the present ones."""
     first, end = past.header[_SETTLED], past.header[_STORED]
@@ -198,7 +199,7 @@ def _product(a, x):
     return total
 
 
-@njit_contract
+@njit_internal
 def _innovations(log_w, d, D, A, V):
     """A, whose product with past states is P_xd, and V = P_dd^-1 (d - d_i); False if none move.
 
@@ -240,7 +241,7 @@ def _innovations(log_w, d, D, A, V):
     return True
 
 
-@inline_always
+@njit_internal
 def _solve_innovations(P_dd_chol, w, spread, A, V):
     """Weight A for a covariance, and make V the solutions P_dd^-1 V, in place."""
     p, N = V.shape
@@ -278,7 +279,7 @@ def ancestral_smoother(
     callback, likelihood = CARRY_PAST.symbol, evaluate.function
     free, n, p, N = system.free, system.n, system.p, n_members
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R = rows.size
         settled_at, S = _settlement(rows, steps, observed, lag)
@@ -302,7 +303,7 @@ def ancestral_smoother(
     return CompiledFunction(run, key_of(f"ancestral {updates} {lag}", evaluate.key, CARRY_PAST.key))
 
 
-@njit_contract
+@njit_internal
 def _settlement(rows, steps, observed, lag):
     """At which observation each row is settled, and how many rows wait for that at most."""
     seen = np.array([j for j in range(steps.size) if not is_missing(observed, j)], np.int64)

@@ -27,7 +27,12 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     address_of,
     arguments_class,
 )
-from pymc_statespace_filters.compiler.native.jit import inline_always, keep_alive, njit_contract
+from pymc_statespace_filters.compiler.native.jit import (
+    inline_always,
+    keep_alive,
+    njit_callable,
+    njit_internal,
+)
 from pymc_statespace_filters.compiler.numerics.philox import STATES, key_words, open_unit, philox
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.compiler.numerics.small_cholesky import cholesky, solve_lower
@@ -113,7 +118,7 @@ def _simulate_backward(
     carray(succeeded, (1,))[0] = 1.0
 
 
-@njit_contract
+@njit_internal
 def _kernels(system, k, t, X, w, noise, scratch, kernel):
     """Means, lower roots of covariances and log-constants of the next state from each particle."""
     means, roots, log_constants = kernel
@@ -143,7 +148,7 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
     return True
 
 
-@njit_contract
+@njit_internal
 def _choose_particles(seed, k, w, intervals, kernel, paths, chosen):
     """Draw for every path the particle from which it came."""
     log_constants, N = kernel[2], w.size
@@ -170,7 +175,7 @@ def _choose_particles(seed, k, w, intervals, kernel, paths, chosen):
                 chosen[path] = _find(intervals, u)
 
 
-@inline_always
+@njit_internal
 def _log_density(kernel, i, x, residual):
     """log N(x; mean_i, root_i root_i^T) without what is the same for all."""
     means, roots, log_constants = kernel
@@ -191,7 +196,7 @@ def _uniforms(seed, attempt, path, k):
     return open_unit(words[0], words[1]), open_unit(words[2], words[3])
 
 
-@njit_contract
+@njit_internal
 def _fill_intervals(w, intervals):
     """Cumulative weights, and for each of N equal parts of them the particle where it begins."""
     cumulative, begins = intervals
@@ -206,7 +211,7 @@ def _fill_intervals(w, intervals):
         begins[part] = i
 
 
-@inline_always
+@njit_internal
 def _find(intervals, u):
     """The particle in whose interval a number of (0, 1) falls, in O(1) on average."""
     cumulative, begins = intervals
@@ -217,7 +222,7 @@ def _find(intervals, u):
     return i
 
 
-@njit_contract
+@njit_internal
 def _summarise_paths(out, n_rows, row, paths, chosen, N):
     """Mean, deviation and the first of the paths; the number of distinct particles in them."""
     M, n = paths.shape
@@ -255,7 +260,7 @@ def backward_simulation(
     n, m, dt, N = system.n, system.m, system.dt, n_particles
     M = max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R, n_steps = rows.size, steps[-1] if steps.size else np.int64(0)
         integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)

@@ -8,7 +8,7 @@ import numpy as np
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_contract
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, padded
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.callbacks import NO_CALLBACK
@@ -116,7 +116,7 @@ class EnsembleFilterBase:
         STORE_NORMALS.compile()
         store = STORE_NORMALS.external
 
-        @njit_contract
+        @njit_callable
         def stored(steps, seed):
             n_steps = steps[-1] if steps.size else np.int64(0)
             out = np.empty(n_stored(sizes, n_steps, steps.size))
@@ -137,7 +137,7 @@ class EnsembleFilterBase:
         evaluation = self.algorithm(system).evaluation(system)
         evaluate = evaluation.function
 
-        @njit_contract
+        @njit_callable
         def run(theta, steps, observed, inputs, t0, noise):
             return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK)
 
@@ -154,7 +154,7 @@ class EnsembleFilterBase:
         evaluation = self.algorithm(system).evaluation(system)
         evaluate = evaluation.function
 
-        @njit_contract
+        @njit_callable
         def run(theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange):
             noise, layout = (seed, np.empty(0)), (rank, n_ranks, exchange)
             return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, layout)
@@ -178,7 +178,7 @@ class EnsembleFilterBase:
         evaluation = self.evaluation(system)
         evaluate = evaluation.function
 
-        @njit_contract
+        @njit_callable
         def run(theta, steps, observed, inputs, t0, noise, callback):
             return evaluate(theta, steps, observed, inputs, t0, noise, callback, SINGLE_RANK)
 
@@ -197,7 +197,7 @@ class EnsembleFilterBase:
         sizes = self.noise_sizes(system)
         settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
 
-        @njit_contract
+        @njit_internal
         def run(theta, steps, observed, inputs, t0, noise, callback, layout):
             seed, normals = noise
             n_steps = steps[-1] if steps.size else np.int64(0)

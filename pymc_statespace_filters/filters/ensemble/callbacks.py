@@ -14,7 +14,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     arguments_class,
     call_address,
 )
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 
 FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
 """Events at step k: members were initialised or moved there from step k - 1; an observation has
@@ -35,7 +35,7 @@ CALLBACK_ARGUMENTS = {
 CallbackArguments = arguments_class("CallbackArguments", CALLBACK_ARGUMENTS, __name__)
 
 
-@inline_always
+@njit_internal
 def emit(callback, event, j, k, members, d, ancestors):
     """Call the callback, if there is one."""
     address, integers, reals = callback
@@ -47,7 +47,7 @@ def emit(callback, event, j, k, members, d, ancestors):
         call_address(address, arguments)
 
 
-@njit_contract
+@njit_internal
 def searchsorted(rows, k, first):
     """Index of the first of increasing rows, from ``first`` on, that is not before step k."""
     place = first

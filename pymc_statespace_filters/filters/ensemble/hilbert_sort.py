@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
 
 MOST_STATES = 8  # of 8 bits each: a key is one 64-bit integer
 
@@ -37,7 +37,7 @@ class OrderWork(NamedTuple):
     counts: np.ndarray
 
 
-@inline_always
+@njit_internal
 def order_workspace(n, n_particles):
     """Scratch for particles of n states."""
     N = n_particles
@@ -49,7 +49,7 @@ def order_workspace(n, n_particles):
     )  # fmt: skip
 
 
-@njit_contract
+@njit_internal
 def order_particles(w, X, work):
     """Indices that sort the particles X (n, N) with weights w; an array of ``work``.
 
@@ -88,7 +88,7 @@ def _moments(w, X, mean, sd):
         sd[a] = np.sqrt(total)
 
 
-@njit_contract
+@njit_internal
 def _fill_cells(X, x_mean, spread, n_bits, cells):
     """Cell number, from 0 to 2^n_bits - 1, in each direction with spread."""
     half, last = 0.5 * (1 << n_bits), (1 << n_bits) - 1
@@ -105,7 +105,7 @@ def _fill_cells(X, x_mean, spread, n_bits, cells):
         row += 1
 
 
-@njit_contract
+@njit_internal
 def undo_rotations(cells, n_bits):
     """Undo, level by level, the rotation of the curve within each particle's cell.
 
@@ -126,7 +126,7 @@ def undo_rotations(cells, n_bits):
                 first[i] = x ^ turn  # must come second: for a = 0 both are the same row
 
 
-@njit_contract
+@njit_internal
 def read_keys(cells, n_bits, keys):
     """Keys: the bits of the rotated points, level by level, are the key's Gray code."""
     for i in range(keys.size):
@@ -139,7 +139,7 @@ def read_keys(cells, n_bits, keys):
                 keys[i] = (key << 1) | ((key ^ (cell[i] >> level)) & 1)
 
 
-@njit_contract
+@njit_internal
 def _sort(n_bits, work):
     """Indices of the particles by increasing key: stable radix sort from the lowest digit."""
     keys, moved_keys, counts = work.keys, work.moved_keys, work.counts

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
@@ -27,7 +27,7 @@ from pymc_statespace_filters.filters.ensemble.weights import total_weight, weigh
 from pymc_statespace_filters.filters.protocol import System
 
 
-@njit_contract
+@njit_internal
 def mark_finite(X, D, alive):
     """Set ``alive`` where states and simulated observations are all finite."""
     for i in range(alive.size):
@@ -38,7 +38,7 @@ def mark_finite(X, D, alive):
                 alive[i] &= np.isfinite(A[a, i])
 
 
-@njit_contract
+@njit_internal
 def copy_members(X, out):
     """Copy X into out, by loops: a slice assignment brings its error message into every filter."""
     for a in range(X.shape[0]):
@@ -46,7 +46,7 @@ def copy_members(X, out):
             out[a, i] = X[a, i]
 
 
-@njit_contract
+@njit_internal
 def equal_weights(alive, count, w):
     """Weight 1/count for the members alive, zero for the others."""
     for i in range(w.size):
@@ -66,7 +66,7 @@ class Moments(NamedTuple):
     P_dd: np.ndarray
 
 
-@inline_always
+@njit_internal
 def moments_workspace(n, p):
     """Room for the moments of n states and p observables."""
     return Moments(np.empty(n), np.empty(p), np.empty((n, p)), np.empty((p, p)))
@@ -85,7 +85,7 @@ class Forecast(NamedTuple):
     n_effective: float
 
 
-@inline_always
+@njit_internal
 def forecast_means(members, log_terms, terms, has_terms, local, moments, is_normalised):
     """Means of states and simulated observations (Eqs. 4.16, 4.30-4.31), in one allgather.
 
@@ -110,7 +110,7 @@ def forecast_means(members, log_terms, terms, has_terms, local, moments, is_norm
     return Forecast(n_alive, spread, log_sum, n_effective)
 
 
-@njit_contract
+@njit_internal
 def forecast_covariances(members, d, divisor, local, moments):
     """Covariances of states and simulated observations over ``divisor``, in one allgather.
 
@@ -138,7 +138,7 @@ def forecast_covariances(members, d, divisor, local, moments):
     return cholesky(P_dd)
 
 
-@njit_contract
+@njit_internal
 def kalman_update(d, D, alive, free, moments, X):
     """x^a_i = x^f_i + K (d - d_i) with K = P_xd P_dd^-1 (Eqs. 4.20-4.21, 4.34-4.35), in place.
 

@@ -14,7 +14,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     arguments_class,
 )
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
@@ -70,7 +70,7 @@ class Members(NamedTuple):
     alive: np.ndarray
 
 
-@inline_always
+@njit_internal
 def _members(n, p, local):
     N = local.size
     log_w = np.empty(N)
@@ -88,7 +88,7 @@ def _n_sums(system):
     return 8 + 2 * (system.n + system.p) ** 2
 
 
-@inline_always
+@njit_internal
 def _noise(seed, normals, given, steps, local):
     """The normals of this rank: padded to its own width, else of the sizes that the filter gave."""
     sizes = NoiseSizes(local.width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
@@ -100,13 +100,13 @@ class _NoResampling(NamedTuple):
     ancestors: np.ndarray
 
 
-@inline_always
+@njit_internal
 def no_resampler(settings, n, local):
     """Workspace of a filter that does not resample."""
     return _NoResampling(np.empty(0, np.int64))
 
 
-@inline_always
+@njit_internal
 def no_resampling(resampler, noise, j, k, n_effective, members, local):
     """Keep all members."""
     return False

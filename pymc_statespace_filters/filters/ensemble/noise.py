@@ -13,7 +13,7 @@ from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint, arguments_class
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.compiler.numerics.philox import (
     INITIAL,
@@ -54,7 +54,7 @@ class Noise(NamedTuple):
     first_block: int
 
 
-@inline_always
+@njit_internal
 def noise_of(seed, stored, sizes, n_steps, first_block):
     """The source of normals for a record whose last observation is at step ``n_steps``."""
     rows = max(sizes.initial, sizes.process, sizes.observation)
@@ -69,7 +69,7 @@ def n_stored(sizes, n_steps, n_observations):
     return of_states + n_observations * (sizes.observation * sizes.width + sizes.resampling)
 
 
-@inline_always
+@njit_internal
 def _normals(noise, purpose, step, place, n_rows, width):
     # Signed: an unsigned address plus a signed number would be a float64.
     if noise.stored.size > 0:
@@ -79,14 +79,14 @@ def _normals(noise, purpose, step, place, n_rows, width):
     return address
 
 
-@inline_always
+@njit_internal
 def initial_normals(noise):
     """Address of the normals of the start."""
     sizes = noise.sizes
     return _normals(noise, np.int64(INITIAL), np.int64(0), np.int64(0), sizes.initial, sizes.width)
 
 
-@inline_always
+@njit_internal
 def process_normals(noise, k):
     """Address of the normals of step k."""
     sizes = noise.sizes
@@ -94,7 +94,7 @@ def process_normals(noise, k):
     return _normals(noise, np.int64(PROCESS), k, place, sizes.process, sizes.width)
 
 
-@inline_always
+@njit_internal
 def observation_normals(noise, j, k):
     """Address of the normals of the simulated observation j, at step k."""
     sizes = noise.sizes
@@ -102,7 +102,7 @@ def observation_normals(noise, j, k):
     return _normals(noise, np.int64(OBSERVATION), k, place, sizes.observation, sizes.width)
 
 
-@inline_always
+@njit_internal
 def resampling_normals(noise, j, k):
     """Normals of a resampling after observation j, at step k, a vector; on every rank the same."""
     sizes = noise.sizes

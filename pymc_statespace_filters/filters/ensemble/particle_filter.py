@@ -5,7 +5,7 @@ from dataclasses import KW_ONLY, dataclass
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, ancestral_smoother
 from pymc_statespace_filters.filters.ensemble.backward_simulation import backward_simulation
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
@@ -25,12 +25,12 @@ from pymc_statespace_filters.filters.settings import check_choice, check_count, 
 _N_SETTINGS = 2  # threshold of resampling, number of its scheme
 
 
-@inline_always
+@njit_internal
 def _resampler(settings, n, local):
     return resampler(settings[0], int(settings[1]), n, local)
 
 
-@inline_always
+@njit_internal
 def _resample(resampling, noise, j, k, n_effective, members, local):
     z = resampling_normals(noise, j, k)
     return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, local)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 
 MEMBERS, BLOCKS = BLOCK, 1
@@ -44,7 +44,7 @@ def local_range(layout, n_columns, per_block):
     return np.int64(min(first, n_columns)), np.int64(min(last, n_columns))
 
 
-@inline_always
+@njit_internal
 def allgather(layout, array, per_block):
     """Fill the columns of a contiguous array (rows, columns) that are not our own."""
     if layout.exchange != 0:

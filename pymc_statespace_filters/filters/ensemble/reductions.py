@@ -12,7 +12,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import (
     inline_always,
-    njit_contract,
+    njit_internal,
     njit_reassoc,
     njit_strict,
 )
@@ -47,7 +47,7 @@ class LocalPartition(NamedTuple):
     lanes: np.ndarray
 
 
-@inline_always
+@njit_internal
 def local_partition(layout, n_members, n_rows):
     """The members of this rank, with room for ``n_rows`` rows of sums."""
     first, last = local_range(layout, n_members, MEMBERS)
@@ -59,7 +59,7 @@ def local_partition(layout, n_members, n_rows):
     )
 
 
-@inline_always
+@njit_internal
 def allgather_sums(local, n_rows):
     """Fill in the blocks of other ranks in the first rows of sums."""
     allgather(local.layout, local.sums[:n_rows], BLOCKS)
@@ -132,43 +132,43 @@ def _products(given, i):
     return term if w[i] > 0.0 else 0.0
 
 
-@inline_always
+@njit_internal
 def _local_blocks(local, row):
     return local.sums[row, local.first_block :]
 
 
-@njit_contract
+@njit_internal
 def sum_blocks(values, out):
     """Sum of every block of a vector."""
     _values(values, values.size, out)
 
 
-@njit_contract
+@njit_internal
 def sum_values(values, local, row):
     """Row of the sums of a vector, of numbers or flags."""
     _values(values, values.size, _local_blocks(local, row))
 
 
-@njit_contract
+@njit_internal
 def sum_squares(values, local, row):
     """Row of the sums of the squares of a vector."""
     _squares(values, values.size, _local_blocks(local, row))
 
 
-@njit_contract
+@njit_internal
 def sum_spread(w, local, row):
     """Row of the sums of w (1 - w), all positive: in all 1 - sum w^2, if w is normalised."""
     _spread(w, w.size, _local_blocks(local, row))
 
 
-@njit_contract
+@njit_internal
 def sum_members(w, X, local, row):
     """Rows of sum_i w_i X_ai for each row of X; members of zero weight may be NaN."""
     for a in range(X.shape[0]):
         _weighted((w, X[a]), w.size, _local_blocks(local, row + a))
 
 
-@njit_contract
+@njit_internal
 def sum_products(w, X, x_mean, Y, y_mean, local, row):
     """Rows of sum_i w_i (X_ai - mean) (Y_bi - mean), b fastest; zero weight as above."""
     for a in range(X.shape[0]):
@@ -185,7 +185,7 @@ def count(flags, local):
     return total(local, 0)
 
 
-@inline_always
+@njit_internal
 def weighted_mean(w, X, total_weight, local, out):
     """Mean of each row of X; ``total_weight`` is the sum of w. Zero weights may have NaN."""
     sum_members(w, X, local, 0)
@@ -195,7 +195,7 @@ def weighted_mean(w, X, total_weight, local, out):
 
 
 # Not inlined: an entry point may multiply by a reciprocal, which changes the last bit.
-@njit_contract
+@njit_internal
 def weighted_cov(w, X, x_mean, Y, y_mean, divisor, local, out):
     """Covariances sum_i w_i (X_ai - mean) (Y_bi - mean) / divisor; zero weights as above."""
     n, p = out.shape

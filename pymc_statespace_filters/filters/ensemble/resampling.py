@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, exponential, padded, uniform
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
@@ -29,7 +29,7 @@ from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgathe
 from pymc_statespace_filters.filters.ensemble.reductions import sum_blocks
 
 
-@njit_contract
+@njit_internal
 def systematic(z, points):
     """Points (i + u) / N with one uniform u from two normals; the last of N + 1 is unused."""
     n = points.size - 1
@@ -38,7 +38,7 @@ def systematic(z, points):
         points[i] = (i + u) / n
 
 
-@njit_contract
+@njit_internal
 def multinomial(z, points):
     """N sorted uniforms: partial sums of N + 1 exponentials over their total."""
     n = points.size - 1
@@ -75,7 +75,7 @@ class Resampling(NamedTuple):
     w_ordered: np.ndarray
 
 
-@inline_always
+@njit_internal
 def resampler(fraction, scheme, n_states, local):
     """Settings and scratch: resample below ``fraction`` of the particles, by scheme number."""
     N, in_order = local.n_members, scheme == _SORTED
@@ -88,7 +88,7 @@ def resampler(fraction, scheme, n_states, local):
     )  # fmt: skip
 
 
-@inline_always
+@njit_internal
 def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
     """Draw new particles of equal weight if the effective number is below the threshold.
 
@@ -142,7 +142,7 @@ def check_sortable(scheme: str, n_states: int) -> None:
         )
 
 
-@njit_contract
+@njit_internal
 def gather_particles(w, X, local, all_particles):
     """Weights and states of the particles of all ranks, (1 + n, N)."""
     local_columns = all_particles[:, local.first : local.first + local.size]
@@ -154,7 +154,7 @@ def gather_particles(w, X, local, all_particles):
     allgather(local.layout, all_particles, MEMBERS)
 
 
-@njit_contract
+@njit_internal
 def choose_ancestors(w, points, cumulative, ancestors):
     """Ancestor of each point: the n with v_{n-1} <= u < v_n, v the cumulative weights (Eq. 4.44).
 
@@ -187,7 +187,7 @@ def choose_ancestors(w, points, cumulative, ancestors):
         ancestors[i] = n
 
 
-@inline_always
+@njit_internal
 def _last_of_weight(w, first):
     """The last particle of positive weight in the block from ``first`` on; ``first`` if none."""
     last = min(first + BLOCK, w.size) - 1
@@ -196,7 +196,7 @@ def _last_of_weight(w, first):
     return last
 
 
-@njit_contract
+@njit_internal
 def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
     """As `choose_ancestors`, with the particles taken in this order."""
     for i in range(order.size):
@@ -206,7 +206,7 @@ def choose_in_order(w, order, points, w_ordered, cumulative, ancestors):
         ancestors[i] = order[ancestors[i]]
 
 
-@njit_contract
+@njit_internal
 def copy_ancestors(X_all, ancestors, X):
     """Set the columns of X (states, particles) to those of their ancestors in X_all."""
     for a in range(X.shape[0]):

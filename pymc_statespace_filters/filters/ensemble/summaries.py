@@ -8,7 +8,12 @@ from numba import carray
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
-from pymc_statespace_filters.compiler.native.jit import inline_always, keep_alive, njit_contract
+from pymc_statespace_filters.compiler.native.jit import (
+    inline_always,
+    keep_alive,
+    njit_callable,
+    njit_internal,
+)
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     CALLBACK_ARGUMENTS,
@@ -41,7 +46,7 @@ def _current_row(integers, event, k):
     return row if row < rows.size and rows[row] == k else np.int64(-1)
 
 
-@njit_contract
+@njit_internal
 def _header(n, n_members, rows, last_event, draw_seed):
     integers = np.empty(_N_HEADER + rows.size, np.int64)
     integers[_N], integers[_MEMBERS], integers[_ROWS] = n, n_members, rows.size
@@ -78,12 +83,12 @@ def _store_members(integers, reals, event, j, k, X, log_w, d, D, ancestors):
             mean_and_cov(w, members, mean[row], cov[row])
 
 
-@njit_contract
+@njit_internal
 def _run_size(n, N, R):
     return R * (n + n * n + N * n + N)
 
 
-@njit_contract
+@njit_internal
 def _parts(reals, n, N, R):
     """Mean, covariance, members and weights, which lie one after the other."""
     cov = R * n
@@ -97,7 +102,7 @@ def _parts(reals, n, N, R):
     )
 
 
-@njit_contract
+@njit_internal
 def finite_weights(X, log_w):
     """Normalised weights of the members that are finite; all zero if none is."""
     log_w, w = log_w.copy(), np.zeros(log_w.size)
@@ -109,7 +114,7 @@ def finite_weights(X, log_w):
     return w
 
 
-@njit_contract
+@njit_internal
 def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
     """Write mean, deviation, a draw and the effective number of weighted members to their row.
 
@@ -126,7 +131,7 @@ def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
     numbers[3 * n * n_rows + row] = effective_number(w)
 
 
-@njit_contract
+@njit_internal
 def _moments(w, X, mean, sd):
     """Weighted mean and deviation of each row, the variance over 1 - sum w^2."""
     spread = 1.0 - 1.0 / effective_number(w)
@@ -142,7 +147,7 @@ def _moments(w, X, mean, sd):
         sd[a] = math.sqrt(variance / spread) if spread > 0.0 else 0.0
 
 
-@njit_contract
+@njit_internal
 def mean_and_cov(w, X, mean, cov):
     """Weighted mean and covariance of the members, the latter over 1 - sum w^2 (Eq. 4.33)."""
     spread = 1.0 - 1.0 / effective_number(w)
@@ -159,7 +164,7 @@ def mean_and_cov(w, X, mean, cov):
             cov[a, b] = cov[b, a] = total / spread if spread > 0.0 else 0.0
 
 
-@njit_contract
+@njit_internal
 def choose(w, u):
     """The member in whose share of the whole weight a number of (0, 1) falls."""
     chosen, cumulative = 0, 0.0
@@ -185,7 +190,7 @@ def states_function(
     SUMMARISE.compile()
     callback, last_event, likelihood = SUMMARISE.symbol, _LAST_EVENTS[moment], evaluate.function
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         R, reals = rows.size, np.full((3 * n + 1) * rows.size, np.nan)
         integers = _header(n, n_members, rows, last_event, draw_seed)
@@ -209,7 +214,7 @@ def run_function(
     callback, last_event, N = STORE_MEMBERS.symbol, int(UPDATED), n_members
     likelihood = evaluate.function
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows):
         R, reals = rows.size, np.full(_run_size(n, N, rows.size), np.nan)
         integers = _header(n, N, rows, last_event, 0)
@@ -227,7 +232,7 @@ def run_function(
     return CompiledFunction(run, key_of("run", evaluate.key, STORE_MEMBERS.key))
 
 
-@njit_contract
+@njit_internal
 def forget_row(numbers, n, n_rows, row):
     """Leave a row unknown."""
     for place in range(3):
@@ -236,7 +241,7 @@ def forget_row(numbers, n, n_rows, row):
     numbers[3 * n * n_rows + row] = np.nan
 
 
-@njit_contract
+@njit_internal
 def results(numbers, n, n_rows, health):
     """What rows were summarised to, as the function of the states gives it."""
     moments = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
 from pymc_statespace_filters.filters.ensemble.reductions import (
@@ -19,7 +19,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
 )
 
 
-@njit_contract
+@njit_internal
 def normalise(log_w, w):
     """Normalise log_w and write the weights to w; return the log of their former sum.
 
@@ -54,7 +54,7 @@ def effective_number(w):
     return 1.0 / total
 
 
-@njit_contract
+@njit_internal
 def weigh(log_w, w, local, row):
     """Write to w the weights relative to the largest of their block, and three rows of sums.
 
@@ -71,7 +71,7 @@ def weigh(log_w, w, local, row):
     sum_squares(w, local, row + 2)
 
 
-@inline_always
+@njit_internal
 def _weigh_block(log_w, w, first, n, lanes):
     """Write n weights relative to the largest of them; return its logarithm."""
     log_block, w_block = log_w[first : first + n], w[first : first + n]
@@ -89,13 +89,13 @@ def _weigh_block(log_w, w, first, n, lanes):
     return largest
 
 
-@inline_always
+@njit_internal
 def _relative(log_w, largest):
     difference = log_w - largest
     return exp(difference) if difference > EXP_LOWEST else 0.0
 
 
-@njit_contract
+@njit_internal
 def total_weight(local, row):
     """Log of the sum of all weights, and their effective number (thesis, Eq. 4.43).
 
@@ -120,7 +120,7 @@ def total_weight(local, row):
     return largest + math.log(all_weight), all_weight * all_weight / all_squares
 
 
-@njit_contract
+@njit_internal
 def normalise_local(log_total, log_w, w, local, row):
     """Normalise a rank's own w and log_w after `total_weight`, which returned ``log_total``."""
     for first in range(0, w.size, BLOCK):
@@ -131,7 +131,7 @@ def normalise_local(log_total, log_w, w, local, row):
         log_w[i] -= log_total
 
 
-@inline_always
+@njit_internal
 def normalise_weights(log_w, w, local):
     """Make w and log_w the normalised weights of all members.
 
@@ -144,7 +144,7 @@ def normalise_weights(log_w, w, local):
     return log_total, n_effective
 
 
-@inline_always
+@njit_internal
 def log_sum(log_w, scratch, local):
     """Log of the sum of the weights of all members, and their effective number."""
     weigh(log_w, scratch, local, 0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     LOG_TWO_PI,
@@ -64,7 +64,7 @@ class Kernel(NamedTuple):
     active: np.ndarray
 
 
-@inline_always
+@njit_internal
 def kernel_workspace(n, n_free):
     """A kernel to be filled by ``scott_bandwidth``."""
     return Kernel(
@@ -72,7 +72,7 @@ def kernel_workspace(n, n_free):
     )
 
 
-@njit_contract
+@njit_internal
 def density_workspace(local, n):
     """Scratch of ``log_kernel_density`` for n directions.
 
@@ -85,7 +85,7 @@ def density_workspace(local, n):
     return sources, targets, (exact, grid, shifted_sum_workspace(n_ranks, n, width))
 
 
-@njit_contract
+@njit_internal
 def scott_bandwidth(n_effective, free, kernel):
     """Fill ``H`` and ``active`` for the free states (Eqs. 4.38 and 4.39) from ``mean`` and ``cov``.
 
@@ -108,7 +108,7 @@ def scott_bandwidth(n_effective, free, kernel):
     return True
 
 
-@njit_contract
+@njit_internal
 def _whiten(kernel, free, X, first, out):
     """Write H^-1 (X - mean) / sqrt(2) of the active directions to rows of ``out``, from 1 on.
 
@@ -135,7 +135,7 @@ def _whiten(kernel, free, X, first, out):
     return n_rows
 
 
-@inline_always
+@njit_internal
 def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
     """Logs of the exact sums at the rank's targets, which begin at column ``first``."""
     complete_points(layout, sources, n_dims)
@@ -145,7 +145,7 @@ def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
         logs[i] = log_kernel_sum(y, n_dims, n_blocks, v, first + i, work)
 
 
-@njit_contract
+@njit_internal
 def log_kernel_density(local, w, X, V, free, kernel, work, out):
     """Log-density at the columns of V of the particles X with normalised weights w.
 

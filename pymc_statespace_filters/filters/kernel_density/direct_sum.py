@@ -9,19 +9,19 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.filters.ensemble.reductions import HALVES
 
 
-@njit_contract
+@njit_internal
 def kernel_sum_workspace(width):
     """Scratch of ``compact`` and ``log_kernel_sum``."""
     return np.empty(width), np.empty(width), np.empty(BLOCK)
 
 
-@njit_contract
+@njit_internal
 def compact(w, sources, n_dims, work):
     """Move the members of positive weight to the front; return their number and their blocks."""
     log_w, _, _ = work
@@ -40,7 +40,7 @@ def compact(w, sources, n_dims, work):
     return n_sources, n_blocks
 
 
-@inline_always
+@njit_internal
 def _exponents(sources, log_w, n_dims, first, targets, target, e):
     """e_l = log w_l - |y_l - v|^2 for a block of members, coordinates scaled by 1 / sqrt(2)."""
     for i in range(BLOCK):
@@ -51,7 +51,7 @@ def _exponents(sources, log_w, n_dims, first, targets, target, e):
             e[i] -= (y[i] - v) * (y[i] - v)
 
 
-@njit_contract
+@njit_internal
 def log_kernel_sum(sources, n_dims, n_blocks, targets, target, work):
     """log sum_l w_l exp(-|y_l - v|^2); -inf for a target that is not finite."""
     log_w, exponents, lane = work

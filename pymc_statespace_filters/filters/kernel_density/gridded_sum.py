@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.filters.ensemble.partition import (
@@ -68,7 +68,7 @@ _POINTS_PER_UNIT = math.sqrt(2.0) / SPACING  # coordinates are scaled by 1 / sqr
 _WITHIN = _FAR * math.sqrt(0.5)
 
 
-@njit_contract
+@njit_internal
 def gridded_sum_workspace(n_ranks, width):
     """Scratch of ``gridded_sums`` for a padded number of members.
 
@@ -82,7 +82,7 @@ def gridded_sum_workspace(n_ranks, width):
     return windows, lanes, ranges, (np.empty(2), np.empty(2)), (np.empty((1, room)), np.empty(room))
 
 
-@njit_contract
+@njit_internal
 def _range(y, w, least, lanes):
     """The smallest and the largest finite y of weights above ``least``."""
     low, high = lanes
@@ -101,7 +101,7 @@ def _range(y, w, least, lanes):
     return low[0], high[0]
 
 
-@inline_always
+@njit_internal
 def _find_ranges(layout, sources, targets, n_dims, lanes, ranges):
     """Ranges of members and of targets in each direction, of each rank.
 
@@ -118,7 +118,7 @@ def _find_ranges(layout, sources, targets, n_dims, lanes, ranges):
     allgather(layout, ranges[: 4 * n_dims], BLOCKS)
 
 
-@inline_always
+@njit_internal
 def _extent(ranges):
     """The first coordinate of the grid and its number of points.
 
@@ -137,7 +137,7 @@ def _extent(ranges):
     return first, LANES * np.floor(steps / LANES + (1 + POINTS / LANES))
 
 
-@njit_contract
+@njit_internal
 def _place(y, first, n_points, cell, lead, ratio):
     """The windows at these coordinates: first cell, lead (zero outside the grid) and ratio."""
     last = n_points - POINTS
@@ -154,13 +154,13 @@ def _place(y, first, n_points, cell, lead, ratio):
         ratio[i] = exp(STEEPNESS * (r - 1.0))
 
 
-@inline_always
+@njit_internal
 def _weigh(w, lead):
     for i in range(w.size):
         lead[i] *= w[i] if w[i] > _NEGLIGIBLE else 0.0
 
 
-@inline_always
+@njit_internal
 def _add_members(windows, n, n_dims, stride, grid):
     cell, lead, ratio = windows
     for i in range(n):
@@ -173,7 +173,7 @@ def _add_members(windows, n, n_dims, stride, grid):
                 add_to_plane(grid, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
 
 
-@inline_always
+@njit_internal
 def _number_of_grids(n_members, n_points):
     """Number of grids that the members are divided among: a power of two, as ranks often are."""
     n_grids = 1
@@ -184,7 +184,7 @@ def _number_of_grids(n_members, n_points):
     return n_grids
 
 
-@inline_always
+@njit_internal
 def _add_stretch(sources, i, j, n_dims, box, windows, grid):
     """Clear a grid and add the members i to j - 1 to it."""
     (first, extent), (cell, lead, ratio) = box, windows
@@ -196,7 +196,7 @@ def _add_stretch(sources, i, j, n_dims, box, windows, grid):
     _add_members(windows, j - i, n_dims, np.int64(extent[0]) + 2 * _BLUR, grid)
 
 
-@inline_always
+@njit_internal
 def _add_all(layout, sources, n_dims, n_points, box, windows, grids):
     """The sum of the grids of all members, of n_points each.
 
@@ -223,7 +223,7 @@ def _add_all(layout, sources, n_dims, n_points, box, windows, grids):
     return total
 
 
-@inline_always
+@njit_internal
 def _sum_targets(windows, n_dims, start, stride, grid, out):
     cell, lead, ratio = windows
     for i in range(out.size):
@@ -235,7 +235,7 @@ def _sum_targets(windows, n_dims, start, stride, grid, out):
             out[i] = sum_plane(grid, at, stride, lead[0, i], ratio[0, i], lead[1, i], ratio[1, i])
 
 
-@inline_always
+@njit_internal
 def _blur(n_dims, columns, rows, grid, other):
     """Blur ``grid``, whose rows have a margin of `_BLUR` points on either side.
 
@@ -255,7 +255,7 @@ def _blur(n_dims, columns, rows, grid, other):
     return grid, 0
 
 
-@njit_contract
+@njit_internal
 def gridded_sums(layout, sources, targets, n_dims, work):
     """sum_l w_l exp(-|y_l - v_i|^2) at the rank's targets, in one or two directions.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     Moments,
     equal_weights,
@@ -35,7 +35,7 @@ class Scratch(NamedTuple):
     density: tuple
 
 
-@inline_always
+@njit_internal
 def importance_workspace(system, local):
     """Scratch of one update."""
     N, density = local.size, density_workspace(local, system.free.size)
@@ -43,7 +43,7 @@ def importance_workspace(system, local):
     return Scratch(moments, np.empty(N), np.empty(N), np.empty(N), density)
 
 
-@inline_always
+@njit_internal
 def reweight(system, k, t, d, members, forecast, n_effective, local, scratch, keeps_previous):
     """Write the unnormalised log-weights of X to log_w and log p(d | x^a) to log_p.
 
@@ -69,7 +69,7 @@ def reweight(system, k, t, d, members, forecast, n_effective, local, scratch, ke
     return True
 
 
-@inline_always
+@njit_internal
 def _set_bandwidths(members, forecast, n_effective, free, local, scratch, kernel_f, kernel_a):
     X, X_f, w_equal = members.X, members.X_f, scratch.w_equal
     n_alive = forecast.n_alive
@@ -88,7 +88,7 @@ def _set_bandwidths(members, forecast, n_effective, free, local, scratch, kernel
     )
 
 
-@njit_contract
+@njit_internal
 def _agree(spreads_a, spreads_f):
     """Whether two ensembles spread in the same directions."""
     for a in range(spreads_a.size):

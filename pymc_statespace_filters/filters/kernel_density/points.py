@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
 
 
@@ -21,7 +21,7 @@ class Points(NamedTuple):
     known: bool
 
 
-@inline_always
+@njit_internal
 def complete_points(layout, points, n_dims):
     """Complete the weights or sums and the coordinates on every rank."""
     allgather(layout, points.rows[: 1 + n_dims], MEMBERS)

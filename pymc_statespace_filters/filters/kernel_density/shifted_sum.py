@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_contract
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp, log
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
@@ -32,7 +32,7 @@ _LOG_FLOOR = math.log(FLOOR)
 _FEW = 64  # so many exact sums cost less than another grid; both costs are O(N)
 
 
-@njit_contract
+@njit_internal
 def shifted_sum_workspace(n_ranks, n, width):
     """Scratch of ``log_gridded_sums``.
 
@@ -43,7 +43,7 @@ def shifted_sum_workspace(n_ranks, n, width):
     return missed, counts, np.empty((1 + n, width)), np.empty(n), np.empty((1, width))
 
 
-@inline_always
+@njit_internal
 def _take_logs(layout, targets):
     """Replace the rank's sums by their logarithms; return how many are below the floor."""
     start, end = local_range(layout, targets.size, MEMBERS)
@@ -54,7 +54,7 @@ def _take_logs(layout, targets):
     return n_missed
 
 
-@inline_always
+@njit_internal
 def _total(layout, counts, count):
     counts[0, layout.rank] = count
     allgather(layout, counts, BLOCKS)
@@ -64,7 +64,7 @@ def _total(layout, counts, count):
     return np.int64(total)
 
 
-@njit_contract
+@njit_internal
 def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, shift):
     """Find the shift for the targets ``missed``; False if none of them is finite."""
     n_sources, n_blocks = members
@@ -87,7 +87,7 @@ def _choose_shift(sources, n_dims, members, targets, missed, sum_work, shifted, 
     return np.isfinite(log_total)
 
 
-@inline_always
+@njit_internal
 def _shift_weights(sources, n_dims, n_sources, log_w, shift, weights):
     """Write w_l exp(2 t.y_l), normalised, to ``weights``; return the log of their sum."""
     largest = -np.inf
@@ -105,7 +105,7 @@ def _shift_weights(sources, n_dims, n_sources, log_w, shift, weights):
     return largest + math.log(total)
 
 
-@inline_always
+@njit_internal
 def _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works):
     """Sums at shifted targets; return how many targets are still below the floor."""
     sum_work, grid_work, (missed, _, shifted, shift, _) = works
@@ -134,7 +134,7 @@ def _sum_shifted(layout, members, sources, targets, n_missed, n_dims, works):
     return n_left
 
 
-@inline_always
+@njit_internal
 def _sum_tails(layout, sources, targets, n_dims, works):
     """Sums at the targets below the floor; afterwards every rank holds all sums."""
     sum_work, _, (missed, _, _, _, exact) = works
@@ -159,7 +159,7 @@ def _sum_tails(layout, sources, targets, n_dims, works):
         logs[missed[k]] = exact[0, k]
 
 
-@inline_always
+@njit_internal
 def log_gridded_sums(layout, sources, targets, n_dims, works):
     """log sum_l w_l exp(-|y_l - v_i|^2) at the rank's targets, in one or two directions.
 

@@ -57,7 +57,7 @@ def first_grid(system, steps, t0, tolerance):
     return spacing, _SHORTEST_REACH
 
 
-@inline_always
+@njit_internal
 def next_grid(code, spacing, reach):
     """After an attempt that ended with this code: (whether to repeat it, spacing, reach)."""
     if code == TOO_COARSE:
@@ -67,7 +67,7 @@ def next_grid(code, spacing, reach):
     return False, spacing, reach
 
 
-@inline_always
+@njit_internal
 def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep, tape):
     """Write the terms of one pass; return (NONE, J), or (reason, observation) of a stop."""
     k = np.int64(0)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
+from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 
 MAX_POINTS = 8192
@@ -22,7 +22,7 @@ _LARGEST_INDEX = 2.0**50
 _BLOCK = 8  # the targets of a source are a multiple of this, so that vector loops have no remainder
 
 
-@inline_always
+@njit_internal
 def grid_points(low, n, spacing):
     """Coordinates of the points in the layout of an ensemble, (1, n)."""
     X = np.empty((1, n))
@@ -54,7 +54,7 @@ def extent_of(mean, sd, mass, spacing, reach):
     return low, np.int64(math.ceil(highest)) - low + 1 + _BLOCK
 
 
-@inline_always
+@njit_internal
 def _add_gaussian(first, spacing, mean, sd, mass, out):
     """Add the masses of mass * N(mean, sd^2) to ``out``, whose first point is number ``first``."""
     scale = spacing / sd
@@ -88,7 +88,7 @@ def scatter(low, n, spacing, mean, sd, mass, reach):
     return out
 
 
-@inline_always
+@njit_internal
 def transition_kernel(spacing, mean, sd, reach):
     """The transition kernel by rows, one per source: (first targets, ends of rows, masses)."""
     n = mean.size
@@ -105,7 +105,7 @@ def transition_kernel(spacing, mean, sd, reach):
     return first, end, masses
 
 
-@inline_always
+@njit_internal
 def scatter_rows(first, end, masses, mass, low, n):
     """As `scatter`, with the rows of a `transition_kernel`."""
     out = np.zeros(n)
@@ -173,7 +173,7 @@ def significant(mass, fraction):
     return first, last
 
 
-@inline_always
+@njit_internal
 def aliasing(mean, sd, source_spacing, spacing):
     """Aliasing error of the trapezoidal rule in one step, relative to each source's mass.
 
@@ -206,7 +206,7 @@ def total(mass, errors):
     return result
 
 
-@inline_always
+@njit_internal
 def weigh(mass, log_density):
     """Log of sum_i mass_i exp(log_density_i), and its terms over the largest; NaN, inf give 0."""
     terms = np.empty(mass.size)
@@ -224,7 +224,7 @@ def weigh(mass, log_density):
     return largest + math.log(whole), terms
 
 
-@inline_always
+@njit_internal
 def highest(log_density):
     """The largest value that is not infinite or NaN."""
     largest = -np.inf
@@ -234,7 +234,7 @@ def highest(log_density):
     return largest
 
 
-@inline_always
+@njit_internal
 def normalise(mass):
     """Scale the masses to sum to one, in place."""
     whole = 0.0
@@ -244,7 +244,7 @@ def normalise(mass):
         mass[i] /= whole
 
 
-@inline_always
+@njit_internal
 def coarseness(mass):
     """Relative disagreement of the sums over every third point: the spectrum at 2 pi / (3 spacing).
 

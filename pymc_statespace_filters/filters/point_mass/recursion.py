@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.outcomes import (
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
@@ -52,7 +52,7 @@ def empty_table():
     return np.int64(0), values, values, values, (indices, indices, values)
 
 
-@inline_always
+@njit_internal
 def has_valid_covariances(system):
     """Whether every covariance of the system is positive semidefinite."""
     for root in system.c[system.n_theta + system.n :]:
@@ -61,13 +61,13 @@ def has_valid_covariances(system):
     return True
 
 
-@inline_always
+@njit_internal
 def initial_moments(system):
     """Mean and standard deviation of the state at step 0."""
     return system.c[system.n_theta], system.c[system.n_theta + 1]
 
 
-@inline_always
+@njit_internal
 def truncation_of(reach):
     """Masses below this fraction of the largest are dropped."""
     return math.exp(-0.5 * reach * reach)
@@ -113,7 +113,7 @@ def predict(system, k, t, spacing, reach, grid, table):
     return NONE, (target + i, spacing, out[i:j]), source, table, lost
 
 
-@inline_always
+@njit_internal
 def transition_at(system, k, t, spacing, reach, grid, table):
     """The transition from every point: (whether it is tabled, mean, sd, errors, table)."""
     low, grid_spacing, mass = grid
@@ -133,14 +133,14 @@ def transition_at(system, k, t, spacing, reach, grid, table):
     return tabled, mean[points], sd[points], errors[points], table
 
 
-@inline_always
+@njit_internal
 def rows_from(low, table):
     """The rows of a table's kernel from point ``low`` on."""
     first, _, _, _, (starts, ends, masses) = table
     return starts[low - first :], ends[low - first :], masses
 
 
-@inline_always
+@njit_internal
 def _moments(system, k, t, X, source_spacing, spacing):
     """Mean and sd of the next state from every point, and the relative errors of a step."""
     M = np.empty((2, X.shape[1]))

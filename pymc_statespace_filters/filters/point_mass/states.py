@@ -31,7 +31,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 from pymc_statespace_filters.compiler.native.jit import (
     inline_always,
     keep_alive,
-    njit_contract,
+    njit_callable,
     njit_internal,
 )
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
@@ -111,7 +111,7 @@ def _grid_states(
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
-@inline_always
+@njit_internal
 def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
     if not has_valid_covariances(system):
@@ -251,7 +251,7 @@ def states_function(
     bound = _bind(system, tolerance, MOMENTS[moment])
     evaluate = bound.function
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
         mean, sd, drawn, _, health = evaluate(theta, steps, observed, inputs, t0, rows, draw_seed)
         n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
@@ -265,7 +265,7 @@ def run_function(system: System, tolerance: float) -> CompiledFunction[RunFuncti
     bound = _bind(system, tolerance, FILTERED)
     evaluate = bound.function
 
-    @njit_contract
+    @njit_callable
     def run(theta, steps, observed, inputs, t0, seed, rows):
         mean, sd, _, terms, health = evaluate(theta, steps, observed, inputs, t0, rows, 0)
         cov = (sd * sd).reshape(rows.size, 1, 1)
@@ -280,7 +280,7 @@ def _bind(system: System, tolerance: float, moment: int) -> CompiledFunction:
     table = system_table(system, ("step_moments", "log_density"))
     evaluate, make_table, dt = GRID_STATES.external, table.make, system.dt
 
-    @njit_contract
+    @njit_callable
     def states(theta, steps, observed, inputs, t0, rows, draw_seed):
         # One state: what is (R, 1) for the caller is a vector here.
         mean, sd = np.full((rows.size, 1), np.nan), np.full((rows.size, 1), np.nan)

@@ -6,8 +6,8 @@ import numpy as np
 from llvmlite.binding import Linkage
 from numba import njit
 
+from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, _compiled
-from pymc_statespace_filters.compiler.native.private_linkage import with_internal_linkage
 
 _LINES = "\n".join(f"    total += math.sin({i} * x)" for i in range(300))
 _NAMESPACE = {"math": math, "__name__": __name__}
