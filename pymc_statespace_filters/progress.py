@@ -1,12 +1,14 @@
-"""Progress bars, drawn by PyMC: of sampled chains, and of rows that are evaluated in threads."""
+"""Progress bars of chains and of rows, drawn by PyMC, and a line while machine code is compiled."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from threading import Timer
 from time import perf_counter
 from typing import Any, Protocol
 
 from pymc.progress_bar import ProgressBarManager, create_simple_progress
 from pymc.progress_bar.rich_progress import RichProgressBackend
+from rich.console import Console
 from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
 from rich.theme import Theme
@@ -180,3 +182,25 @@ def row_progress(work: ReportsRows, *, enabled: bool) -> Iterator[Callable[[str,
         if enabled:
             work.on_progress = bar.advance
         yield bar.begin
+
+
+@contextmanager
+def slow_compilation(name: str) -> Iterator[None]:
+    """Say in a terminal what is being compiled, if it takes longer than `PATIENCE`.
+
+    The line disappears when the compilation ends.
+    """
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    status = console.status(f"Compiling {name}, once per installation ...")
+    timer = Timer(PATIENCE, status.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
+        status.stop()

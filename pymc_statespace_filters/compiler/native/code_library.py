@@ -24,7 +24,7 @@ from numba.core.compiler import Compiler
 
 # Called from Python, a function without machine code is a TypeError. Its slot is called with an
 # object that is not callable, the arguments and the keywords.
-_NO_CODE = ctypes.cast(ctypes.pythonapi.PyObject_Call, ctypes.c_void_p).value
+_NO_CODE = ctypes.cast(ctypes.pythonapi.PyObject_Call, ctypes.c_void_p).value or 0
 
 
 class _InternalLinkageLibrary(JITCodeLibrary):

@@ -29,6 +29,7 @@ from pymc_statespace_filters.compiler.native.code_library import (
     InternalLinkageCompiler,
     with_internal_linkage,
 )
+from pymc_statespace_filters.progress import slow_compilation
 
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)
@@ -94,6 +95,7 @@ class EntryPoint:
                 f"its function, got {list(arguments)}"
             )
         self._function = function
+        self._name = name
         self._arguments = tuple(arguments.values())
         self._needs = needs
         self.key = key
@@ -115,7 +117,8 @@ class EntryPoint:
         )
         if self.key is not None and config.numba__cache:
             compiled._cache = _cache(self._function, self.key)
-        compiled.compile()
+        with slow_compilation(self._name):
+            compiled.compile()
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled
 

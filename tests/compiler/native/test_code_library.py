@@ -3,11 +3,14 @@
 import math
 
 import numpy as np
+import pytest
 from llvmlite.binding import Linkage
 from numba import njit
 
+from pymc_statespace_filters.compiler.native import code_library
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, _compiled
+from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 
 _LINES = "\n".join(f"    total += math.sin({i} * x)" for i in range(300))
 _NAMESPACE = {"math": math, "__name__": __name__}
@@ -51,3 +54,60 @@ def test_entries_are_closed():
         result.ctypes.data_as(_compiled[entry.symbol].ctypes.argtypes[0])
     )
     assert result[0] == twice_jitted(0.5)
+
+
+def test_what_only_compiled_functions_call_has_no_machine_code():
+    """It is optimised, linked into its callers with all that it calls, and refuses Python."""
+
+    @njit_internal
+    def innermost(x):
+        total = 0.0
+        for i in range(100):
+            total += math.sin(i * x)
+        return total
+
+    @inlined
+    def inner(x):
+        return innermost(x) + 1.0
+
+    @njit_internal
+    def outer(x):
+        return inner(x) + innermost(2.0 * x)
+
+    called = njit(lambda x: outer(x))
+    expected = sum(math.sin(i * 0.3) + math.sin(i * 0.6) for i in range(100)) + 1.0
+    assert abs(called(0.3) - expected) < 1e-12
+    for function in (innermost, inner, outer):
+        (compiled,) = function.overloads.values()
+        assert not compiled.library._compiled
+        with pytest.raises(TypeError, match="not callable"):
+            function(0.3)
+
+
+def test_a_function_is_optimised_once_however_many_call_it(monkeypatch):
+    optimised = []
+    optimise = code_library.JITCodeLibrary._optimize_final_module
+    monkeypatch.setattr(
+        code_library.JITCodeLibrary,
+        "_optimize_final_module",
+        lambda self: (optimised.append(type(self).__name__), optimise(self))[1],
+    )
+
+    @njit_internal
+    def shared(x):
+        return math.sin(x) * x
+
+    @njit_internal
+    def first(x):
+        return shared(x) + 1.0
+
+    @njit_internal
+    def second(x):
+        return shared(x) + first(x)
+
+    def evaluate(out):
+        out[0] = first(out[0]) + second(out[0])
+
+    EntryPoint(evaluate, {"out": F64_PTR}, "evaluate_once", None).compile()
+    assert optimised.count("_LinkedLibrary") == 3
+    assert optimised.count("_InternalLinkageLibrary") == 1

@@ -77,11 +77,11 @@ def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
     evaluate = partial(
         psf.log_likelihood, params={"a": 0.6}, observed=FORCED_DATA, steps=STEPS, inputs=FORCE
     )
-    evaluate(forced(), psf.BootstrapPF(10))
+    evaluate(forced(), psf.BootstrapPF(100))
     before = set(entries._compiled)
-    evaluate(forced(), psf.BootstrapPF(20, resampling="multinomial"))
+    evaluate(forced(), psf.BootstrapPF(200, resampling="multinomial"))
     assert set(entries._compiled) == before
-    evaluate(forced(initial_mean=[0.25]), psf.BootstrapPF(10))
+    evaluate(forced(initial_mean=[0.25]), psf.BootstrapPF(100))
     new = set(entries._compiled) - before
     assert new
     assert not any("bootstrap" in symbol or "fill_normals" in symbol for symbol in new)

@@ -1,0 +1,103 @@
+from .diagnostics import (
+    compute_log_likelihood,
+    filter_diagnostics,
+    leave_future_out,
+)
+from .errors import (
+    CheckpointWarning,
+    DataMismatchError,
+    EvidenceWarning,
+    FilterWarning,
+    GradientUnavailableError,
+    LoweringError,
+    ModelError,
+    ParallelError,
+    ParallelWarning,
+    StateSpaceFiltersError,
+)
+from .evaluation.log_likelihood import log_likelihood
+from .evaluation.run_filter import run_filter
+from .evaluation.simulate import simulate
+from .evidence import (
+    DimensionCorrection,
+    Evidence,
+    average_models,
+    chib_jeliazkov,
+    compare_evidence,
+    estimate_evidence,
+    marginal_modes,
+    prior_sensitivity,
+)
+from .filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
+from .plots import (
+    plot_average,
+    plot_evidence,
+    plot_filter_health,
+    plot_forecast,
+    plot_model_probabilities,
+    plot_phase,
+    plot_prior_sensitivity,
+    plot_states,
+)
+from .pymc_model.distribution import StateSpace
+from .sampling import DRAM, run_models, sample_dram, suggest_particles
+from .states import filtered_states, forecast, smoothed_states
+from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
+from .system.integrators import EulerMaruyama
+from .system.model import StateSpaceModel
+from .system.record import nearest_steps
+
+__all__ = [
+    "DRAM",
+    "EKF",
+    "BootstrapPF",
+    "CheckpointWarning",
+    "DataMismatchError",
+    "DimensionCorrection",
+    "EnKF",
+    "EulerMaruyama",
+    "Evidence",
+    "EvidenceWarning",
+    "FilterWarning",
+    "GradientUnavailableError",
+    "GridFilter",
+    "LoweringError",
+    "ModelError",
+    "PFEnKF",
+    "ParallelError",
+    "ParallelWarning",
+    "StateSpace",
+    "StateSpaceFiltersError",
+    "StateSpaceModel",
+    "average_models",
+    "chib_jeliazkov",
+    "compare_evidence",
+    "compute_log_likelihood",
+    "cubic",
+    "estimate_evidence",
+    "filter_diagnostics",
+    "filtered_states",
+    "forecast",
+    "freeplay",
+    "hysteresis",
+    "hysteresis_branch",
+    "leave_future_out",
+    "log_likelihood",
+    "marginal_modes",
+    "nearest_steps",
+    "plot_average",
+    "plot_evidence",
+    "plot_filter_health",
+    "plot_forecast",
+    "plot_model_probabilities",
+    "plot_phase",
+    "plot_prior_sensitivity",
+    "plot_states",
+    "prior_sensitivity",
+    "run_filter",
+    "run_models",
+    "sample_dram",
+    "simulate",
+    "smoothed_states",
+    "suggest_particles",
+]
