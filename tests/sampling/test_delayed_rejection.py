@@ -15,6 +15,11 @@ from pymc_statespace_filters.sampling.kernel.delayed_rejection import (
     gaussian_log_proposals,
     log_acceptance,
 )
+from tests.compiled import from_python
+
+gaussian_log_acceptance, gaussian_log_proposals, log_acceptance = map(
+    from_python, (gaussian_log_acceptance, gaussian_log_proposals, log_acceptance)
+)
 
 N_STATES = 5
 FULL = np.array([0.3, 0.1, 0.25, 0.05, 0.3])

@@ -11,6 +11,7 @@ import pytest
 
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_acceptance
 from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acceptance
+from tests.compiled import from_python
 from tests.sampling.test_delayed_rejection import (
     FULL,
     N_STATES,
@@ -19,6 +20,10 @@ from tests.sampling.test_delayed_rejection import (
     path_table,
     random_proposals,
     transition_matrix,
+)
+
+log_acceptance, log_surrogate_acceptance = map(
+    from_python, (log_acceptance, log_surrogate_acceptance)
 )
 
 # Up to 400 times too much or too little against the target FULL.

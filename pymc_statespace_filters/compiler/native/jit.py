@@ -14,7 +14,7 @@ from numba import njit
 
 from pymc_statespace_filters.compiler.native.code_library import LinkedCompiler
 
-_linked = partial(
+linked = partial(
     njit,
     error_model="numpy",
     nogil=True,
@@ -22,17 +22,18 @@ _linked = partial(
     no_cfunc_wrapper=True,
     pipeline_class=LinkedCompiler,
 )
+"""The decorator, with arguments, of a function that only compiled functions call."""
 
-njit_internal = _linked(fastmath={"contract"})
+njit_internal = linked(fastmath={"contract"})
 """For all functions without a reason for another decorator."""
 
 njit_callable = njit(error_model="numpy", nogil=True, fastmath={"contract"})
 """For a function that Python calls, too."""
 
-njit_reassoc = _linked(fastmath={"contract", "reassoc"})
+njit_reassoc = linked(fastmath={"contract", "reassoc"})
 """For sums over members, which may be reordered in order to vectorise."""
 
-inlined = _linked(forceinline=True)
+inlined = linked(forceinline=True)
 """For functions inside vector loops, without fused operations: LLVM inlines them."""
 
 inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")

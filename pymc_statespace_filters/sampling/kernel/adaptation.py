@@ -37,8 +37,8 @@ A. Gelman, G. Roberts and W. Gilks (1996). Efficient Metropolis jumping rules. B
 """
 
 import numpy as np
-from numba import njit
 
+from pymc_statespace_filters.compiler.native.jit import linked
 from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     FIRST,
     MOVED,
@@ -65,7 +65,7 @@ PRIOR_MOVES = 0.2
 JITTER = 1e-8
 
 # For functions called only by compiled ones: the wrappers for Python double the compile time.
-_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_internal = linked()
 
 
 @_internal

@@ -28,10 +28,11 @@ P. J. Green and A. Mira (2001). Delayed rejection in reversible jump Metropolis-
 """
 
 import numpy as np
-from numba import njit
+
+from pymc_statespace_filters.compiler.native.jit import linked
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def log_acceptance(log_pi: np.ndarray, log_q: np.ndarray, stage: int) -> float:
     """Log-probability of accepting the proposal of a stage, thesis Eq. 3.32.
 
@@ -86,7 +87,7 @@ def log_acceptance(log_pi: np.ndarray, log_q: np.ndarray, stage: int) -> float:
     return log_alpha[0, stage]
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def gaussian_log_proposals(offsets: np.ndarray, stage_scale: float, stage: int) -> np.ndarray:
     """Table ``log_q`` of Gaussian stages centred at the current point.
 
@@ -121,7 +122,7 @@ def gaussian_log_proposals(offsets: np.ndarray, stage_scale: float, stage: int) 
     return log_q
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def gaussian_log_acceptance(
     log_pi: np.ndarray, offsets: np.ndarray, stage_scale: float, stage: int
 ) -> float:
@@ -131,7 +132,7 @@ def gaussian_log_acceptance(
     return log_acceptance(log_pi, gaussian_log_proposals(offsets, stage_scale, stage), stage)
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def _log_ratio_to_one(log_numerator: float, log_denominator: float) -> float:
     """Log of min(1, N/D), with 0/0 = 0 and N/0 = 1."""
     if log_numerator == -np.inf:
@@ -139,7 +140,7 @@ def _log_ratio_to_one(log_numerator: float, log_denominator: float) -> float:
     return min(0.0, log_numerator - log_denominator)
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def _log_one_minus_exp(log_p: float) -> float:
     """Log of 1 - p for a probability given by its log."""
     if log_p >= 0.0:

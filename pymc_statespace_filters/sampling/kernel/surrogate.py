@@ -15,10 +15,11 @@ J. S. Liu (2001). Monte Carlo Strategies in Scientific Computing. Springer.
 """
 
 import numpy as np
-from numba import njit
+
+from pymc_statespace_filters.compiler.native.jit import linked
 
 
-@njit(cache=True, error_model="numpy")
+@linked()
 def log_surrogate_acceptance(
     log_pi_here: float, log_pi_there: float, log_c_here: float, log_c_there: float
 ) -> float:

@@ -23,6 +23,7 @@ from numba import njit
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.jit import linked
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
@@ -60,9 +61,7 @@ class _Move(NamedTuple):
     failure: int
 
 
-_internal = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-# For a function with one caller, which would otherwise be optimised twice.
-_inlined = njit(error_model="numpy", nogil=True, inline="always")
+_internal = linked()
 
 
 @_internal
@@ -154,7 +153,7 @@ def _set_current(state, density, value, log_screen):
     _copy(density.call.out[first:], state.carried)
 
 
-@_inlined
+@_internal
 def _move(settings, target, state, chol, random, k, counts):
     """One iteration without a screen; the acceptance probability of its first proposal."""
     log_density = state.numbers[LOG_DENSITY]
@@ -167,7 +166,7 @@ def _move(settings, target, state, chol, random, k, counts):
     return move.acceptance
 
 
-@_inlined
+@_internal
 def _screened_move(settings, target, screen, state, chol, random, k, counts):
     """One iteration on a screen; the probability of accepting its end point."""
     log_screen = state.numbers[LOG_SCREEN]
