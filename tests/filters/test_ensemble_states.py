@@ -33,6 +33,7 @@ from tests.small_systems import PAIR, PAIR_DATA, STEPS
 ROWS = np.arange(7)
 NO_INPUTS = np.zeros((0, 0))
 N_SEEDS = 40
+# Each number of members compiles again, so most tests take these.
 FILTERS = {
     "enkf": (psf.EnKF(500), 0.02),
     "bootstrap": (psf.BootstrapPF(500), 0.02),
@@ -132,15 +133,16 @@ def test_draws_have_the_law_of_the_states(name, moment):
 
 def test_the_draw_is_apart_from_the_filter():
     """Another seed of the draws leaves the moments of a filter as they are."""
+    filter, _ = FILTERS["enkf"]
     for moment in ("predicted", "filtered", "smoothed"):
-        first, second = (states(moment, psf.EnKF(50), draw_seed=i) for i in (1, 2))
+        first, second = (states(moment, filter, draw_seed=i) for i in (1, 2))
         np.testing.assert_array_equal(first.mean, second.mean)
         assert (first.drawn != second.drawn).any()
 
 
 @pytest.mark.parametrize("moment", ["predicted", "filtered"])
 def test_members_are_those_of_the_likelihood(moment):
-    filter = psf.BootstrapPF(64)
+    filter, _ = FILTERS["bootstrap"]
     n_effective = states("filtered", filter, rows=STEPS, seed=5).n_effective
     _, expected = evaluator(LogLikelihood(PAIR, filter))(
         np.array([0.7, 0.2]), STEPS, PAIR_DATA, NO_INPUTS, 0.0, 5
@@ -151,7 +153,7 @@ def test_members_are_those_of_the_likelihood(moment):
 
 
 def test_rows_are_unknown_from_a_failing_observation_on():
-    filter, data = psf.BootstrapPF(64), PAIR_DATA.copy()
+    (filter, _), data = FILTERS["bootstrap"], PAIR_DATA.copy()
     data[1, 1] = 1e200  # at step 2
     for moment, n_known in (("predicted", 2), ("filtered", 2), ("smoothed", 0)):
         found = states(moment, filter, observed=data)
@@ -200,7 +202,7 @@ def test_ancestries_are_settled_after_a_lag(name):
 
 def test_distinct_ancestors_are_counted():
     rows = np.array([2, 29])
-    arguments = (psf.BootstrapPF(500), SWING, [1.2], LONG_STEPS, LONG_DATA, rows)
+    arguments = (FILTERS["bootstrap"][0], SWING, [1.2], LONG_STEPS, LONG_DATA, rows)
     found, filtered = (states(moment, *arguments) for moment in ("smoothed", "filtered"))
     assert 1 < found.n_effective[0] < 0.8 * found.n_effective[1] <= 400
     assert found.n_effective[1] == int(found.n_effective[1]) != filtered.n_effective[1]
@@ -344,12 +346,17 @@ def test_noise_that_depends_on_the_state():
     assert_right(several, truth, 0.03)
 
 
-@pytest.mark.parametrize("below", [0.0, 1.0], ids=["weighted", "resampled"])
-@pytest.mark.parametrize("kind", [psf.EnKF, psf.BootstrapPF, psf.PFEnKF])
-def test_at_its_end_a_record_is_filtered(kind, below):
+@pytest.mark.parametrize(
+    "filter",
+    [
+        FILTERS["enkf"][0],
+        *(k(60, resample_below=b) for k in (psf.BootstrapPF, psf.PFEnKF) for b in (0.0, 1.0)),
+    ],
+    ids=repr,
+)
+def test_at_its_end_a_record_is_filtered(filter):
     """The past is nudged and weighted as the present is, to rounding."""
-    settings = {} if kind is psf.EnKF else {"resample_below": below}
-    arguments = (kind(60, **settings), SWING, [1.2], LONG_STEPS[:9], LONG_DATA[:9])
+    arguments = (filter, SWING, [1.2], LONG_STEPS[:9], LONG_DATA[:9])
     rows = np.array([4, 9])
     smoothed, filtered = (states(m, *arguments, rows=rows) for m in ("smoothed", "filtered"))
     np.testing.assert_allclose(smoothed.mean[1], filtered.mean[1], rtol=1e-9)
