@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -68,6 +69,8 @@ def cubature():
     definitions = [cell for cell in cells if re.search(r"^(@njit|@dataclass|from )", cell, re.M)]
     namespace = {"__name__": "a_users_file"}
     exec("\n".join(definitions), namespace)
+    # Likelihood, run and states of one system share a pass, which takes long to compile.
+    namespace["compile_pass"] = cache(namespace["compile_pass"])
     return namespace["CubatureKF"]()
 
 
