@@ -5,6 +5,7 @@ within five of its standard errors, and a stated share of the state's deviation 
 any finite number has. A right filter fails that once in a million times the numbers compared.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
 from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
@@ -21,7 +23,6 @@ from pymc_statespace_filters.filters.ensemble.backward_simulation import (
 )
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.filters.test_ekf_states import assert_drawn_from
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
@@ -62,13 +63,20 @@ class States(NamedTuple):
     health: np.ndarray
 
 
+@cache
+def compiled_states(filter, system, moment):
+    """What the filter compiles, without PyTensor's layers around it."""
+    compiled = filter.compile_states(compile_system(system), moment)
+    return cached_on_disk(compiled.function, compiled.key)
+
+
 def states(
     moment, filter, system=PAIR, theta=(0.7, 0.2), steps=STEPS, observed=PAIR_DATA, rows=ROWS,
     seed=0, draw_seed=0, inputs=NO_INPUTS,
 ):  # fmt: skip
-    evaluate = evaluator(StatesOp(system, filter, moment))
-    theta = np.array(theta)
-    return States(*evaluate(theta, steps, observed, inputs, 0.0, seed, rows, draw_seed))
+    run = compiled_states(filter, system, moment)
+    theta, observed, inputs = (np.array(a, dtype=float) for a in (theta, observed, inputs))
+    return States(*run(theta, steps, observed, inputs, 0.0, seed, rows, draw_seed))
 
 
 def exact(moment, rows=ROWS, **changes):
