@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.states import States
+from tests.filters.test_ensemble_states import states
 from tests.references.linear_states import linear_states
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
@@ -61,11 +60,9 @@ def test_moments_are_those_of_the_weighted_particles_and_of_filtered_states(name
     np.testing.assert_allclose(found["mean"], mean, rtol=1e-10, atol=1e-12)
     covs = [np.cov(x[t].T, aweights=w[t]) for t in range(len(x))]
     np.testing.assert_allclose(found["cov"], covs, rtol=1e-9, atol=1e-12)
-    evaluate = evaluator(States(PAIR, MEMBERS[name], "filtered"))
-    theta, no_inputs = np.array([0.7, 0.2]), np.zeros((0, 0))
-    states = evaluate(theta, STEPS, PAIR_DATA, no_inputs, 0.0, 3, ROWS[at], 0)
-    np.testing.assert_allclose(found["mean"], states[0], rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(found["sd"], states[1], rtol=1e-12)
+    filtered = states("filtered", MEMBERS[name], rows=ROWS[at], seed=3)
+    np.testing.assert_allclose(found["mean"], filtered.mean, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(found["sd"], filtered.sd, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
