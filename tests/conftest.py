@@ -8,9 +8,41 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 # A compilation cache of the tests' own: they neither fill the user's cache nor are fed by it.
-# No BLAS to link C code against: numba needs none, and the search for one ends in a warning.
+# No C compiler: numba needs none, and each operation that C code is made of takes a second. No BLAS
+# to link C code against either: the search for one ends in a warning.
 CACHE = Path(__file__).parents[1] / ".cache" / "pytensor"
-os.environ.setdefault("PYTENSOR_FLAGS", f"base_compiledir={CACHE},blas__ldflags=")
+os.environ.setdefault("PYTENSOR_FLAGS", f"base_compiledir={CACHE},blas__ldflags=,cxx=")
 
 # Pictures are drawn without a screen.
 os.environ.setdefault("MPLBACKEND", "agg")
+
+# Files that compile for longest, which come first: at the end one process would wait for the other.
+# Neighbours share no system, so that the two processes do not compile the same code at once.
+LONGEST = (
+    "filters/test_outside_filters.py",
+    "filters/test_ensemble_states.py",
+    "compiler/test_large_states.py",
+    "sampling/test_noisy_chains.py",
+    "ops/test_batch.py",
+    "evaluation/test_run_filter.py",
+    "filters/test_truth_ekf.py",
+    "pymc_model/test_in_pymc.py",
+    "diagnostics/test_filter_health.py",
+    "test_processes.py",
+    "sampling/test_checkpoint_resume.py",
+    "evaluation/test_explosions.py",
+    "compiler/test_unroll.py",
+    "sampling/test_lockstep.py",
+)
+
+
+def pytest_configure(config):
+    """Give files to the processes in our order, not by their numbers of tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first."""
+    tests = Path(__file__).parent
+    order = {tests / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path, len(LONGEST)))

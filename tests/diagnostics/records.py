@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
-from tests.sampling.autoregression import autoregression
+from tests.sampling.autoregression import autoregression, simulated
 
 SYSTEM = autoregression()
 SPREAD = 0.7
@@ -22,8 +22,7 @@ MISSING = 7  # the row of the record that is wholly missing
 
 @cache
 def record():
-    simulated = psf.simulate(SYSTEM, {"phi": 0.7, "spread": SPREAD}, steps=STEPS, random_seed=4)
-    observed = simulated["observations"].values[:, 0]
+    observed = simulated(STEPS, 4, phi=0.7, spread=SPREAD)
     observed[MISSING] = np.nan
     return observed
 
@@ -53,8 +52,8 @@ def log_evidences():
 
 @cache
 def scores():
-    """log p(d_j | d_1 .. d_{j-1}) of every row, phi integrated out; 0 of the missing one."""
-    return np.diff(log_evidences())
+    """log p(d_j | d_1 .. d_{j-1}) of every row that is seen, phi integrated out."""
+    return np.delete(np.diff(log_evidences()), MISSING)
 
 
 def posterior_draws(n_rows, rng, shape=(4, 1000)):

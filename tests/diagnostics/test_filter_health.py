@@ -10,6 +10,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics.calibration import uniformity_of
 from tests.diagnostics.records import SYSTEM
 from tests.references.linear_states import linear_states
+from tests.sampling.autoregression import simulated
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 TRUTH = {"phi": 0.7, "spread": 0.7}
@@ -32,7 +33,7 @@ def diagnosed(system, filter, observed, steps, shape=(2, 500), **values):
 
 @pytest.fixture(scope="module")
 def long_record():
-    return psf.simulate(SYSTEM, TRUTH, steps=LONG, random_seed=5)["observations"].values
+    return simulated(LONG, 5, **TRUTH)
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(300)])

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.states import States
+from tests.filters.test_ensemble_states import states
 from tests.references.linear_states import linear_states
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
@@ -61,11 +60,9 @@ def test_moments_are_those_of_the_weighted_particles_and_of_filtered_states(name
     np.testing.assert_allclose(found["mean"], mean, rtol=1e-10, atol=1e-12)
     covs = [np.cov(x[t].T, aweights=w[t]) for t in range(len(x))]
     np.testing.assert_allclose(found["cov"], covs, rtol=1e-9, atol=1e-12)
-    evaluate = evaluator(States(PAIR, MEMBERS[name], "filtered"))
-    theta, no_inputs = np.array([0.7, 0.2]), np.zeros((0, 0))
-    states = evaluate(theta, STEPS, PAIR_DATA, no_inputs, 0.0, 3, ROWS[at], 0)
-    np.testing.assert_allclose(found["mean"], states[0], rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(found["sd"], states[1], rtol=1e-12)
+    filtered = states("filtered", MEMBERS[name], rows=ROWS[at], seed=3)
+    np.testing.assert_allclose(found["mean"], filtered.mean, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(found["sd"], filtered.sd, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -106,27 +103,34 @@ def test_grid_filter_and_ekf_agree_on_a_linear_system():
 
 
 def test_coordinates_are_times():
-    found = run(psf.EnKF(60), steps=None, times=2.0 + STEPS, t0=2.0, at="steps")
+    found = run(MEMBERS["enkf"], steps=None, times=2.0 + STEPS, t0=2.0, at="steps")
     assert found["time"].values.tolist() == [2, 3, 4, 5, 6, 7, 8]
     assert found["obs_time"].values.tolist() == (2.0 + STEPS).tolist()
     assert found["cov"].dims == ("time", "state", "state_bis")
     assert found["state"].values.tolist() == list(PAIR.states)
-    assert found.attrs["filter"] == repr(psf.EnKF(60))
+    assert found.attrs["filter"] == repr(MEMBERS["enkf"])
+
+
+PAIR_START = multivariate_normal([0.0, 0.3], [[1.5, 0.1], [0.1, 2.4]])
 
 
 @pytest.mark.parametrize(
-    "filter", [psf.EKF(), psf.BootstrapPF(50), psf.EnKF(50), psf.GridFilter()], ids=repr
+    ("filter", "system", "observed", "inputs", "first"),
+    [
+        *((f, PAIR, PAIR_DATA, None, PAIR_START) for f in (psf.EKF(), *MEMBERS.values())),
+        (psf.GridFilter(), FORCED, FORCED_DATA, FORCE, norm(0.0, np.sqrt(1.5))),
+    ],
+    ids=["ekf", *MEMBERS, "grid"],
 )
-def test_a_failure_leaves_what_was_known_before_it(filter):
-    impossible = [0.1, 1e200, 0.3, 0.9]  # its square is infinite
+def test_a_failure_leaves_what_was_known_before_it(filter, system, observed, inputs, first):
+    impossible = observed.copy()
+    impossible[1] *= 1e200  # its square is infinite
     with pytest.warns(psf.FilterWarning, match="-inf"):
         found = psf.run_filter(
-            FORCED, filter, POINT, impossible, steps=STEPS, inputs=FORCE, at="steps"
+            system, filter, POINT, impossible, steps=STEPS, inputs=inputs, at="steps"
         )
     assert found["log_likelihood"].values[1:].tolist() == [-np.inf] * 3
-    np.testing.assert_allclose(
-        found["log_likelihood"][0], norm.logpdf(0.1, 0.0, np.sqrt(1.5)), atol=0.2
-    )
+    np.testing.assert_allclose(found["log_likelihood"][0], first.logpdf(observed[0]), atol=0.2)
     for name in found.data_vars.keys() - {"log_likelihood"}:
         assert np.isfinite(found[name][:2]).all()  # the second observation is at step 2
         assert np.isnan(found[name][2:]).all()

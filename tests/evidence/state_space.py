@@ -9,7 +9,7 @@ from scipy.stats import lognorm, norm
 
 import pymc_statespace_filters as psf
 from tests.evidence.targets import POSITIVE, REAL, Independent, Line, Target
-from tests.sampling.autoregression import autoregression
+from tests.sampling.autoregression import autoregression, simulated
 
 
 class StateSpace(Target):
@@ -27,9 +27,7 @@ class StateSpace(Target):
         self.n_normals = 2
         self.prior = Independent((self.PHI, REAL), (self.SPREAD, POSITIVE))
         self.steps = np.arange(1, self.N_STEPS + 1)
-        truth = {"phi": 0.8, "spread": 0.6}
-        record = psf.simulate(self.SYSTEM, truth, steps=self.steps, random_seed=3)
-        self.record = record["observations"].values
+        self.record = simulated(self.steps, 3, phi=0.8, spread=0.6)
 
         x, y = (np.linspace(*ends, n_points) for ends in self.ENDS)
         grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)

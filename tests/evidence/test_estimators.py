@@ -22,10 +22,7 @@ ALL = tuple(ESTIMATORS)
 
 @pytest.fixture(scope="module")
 def model():
-    with pm.Model() as model:
-        w = pm.Normal("w", 0, REGRESSION.scale, shape=4)
-        pm.Normal("y", REGRESSION.x @ w, REGRESSION.sd, observed=REGRESSION.y)
-    return model
+    return REGRESSION.model()
 
 
 @pytest.fixture(scope="module")

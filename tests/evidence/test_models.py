@@ -20,10 +20,7 @@ REGRESSION = Regression(4, 30, RNG)
 
 @pytest.fixture(scope="module")
 def regression_model():
-    with pm.Model() as model:
-        w = pm.Normal("w", 0, REGRESSION.scale, shape=4)
-        pm.Normal("y", REGRESSION.x @ w, REGRESSION.sd, observed=REGRESSION.y)
-    return model
+    return REGRESSION.model()
 
 
 def exact_draws(shape=(4, 5000), correlation=0.0, seed=21):
@@ -200,9 +197,7 @@ def test_other_data_are_an_error(regression_model):
         idata = pm.sample(
             50, tune=50, chains=1, random_seed=1, progressbar=False, nuts_sampler="pymc"
         )
-    with pm.Model() as rival:
-        w = pm.Normal("w", 0, REGRESSION.scale, shape=4)
-        pm.Normal("y", REGRESSION.x @ w, REGRESSION.sd, observed=REGRESSION.y + 0.5)
+    rival = REGRESSION.model(shift=0.5)
     with pytest.raises(DataMismatchError, match="other data"):
         chib_jeliazkov(idata, rival)
 

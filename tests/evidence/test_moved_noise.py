@@ -5,30 +5,26 @@ import pymc as pm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters
+from tests.sampling.autoregression import autoregression, simulated
 
 STEPS = np.arange(1, 31)
-LINEAR = psf.StateSpaceModel(
-    transition=lambda x, q, phi: [phi * x[0] + q[0]],
-    observation=lambda x: [x[0]],
-    process_noise=[[0.3]],
-    observation_noise=[[0.4]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
-OBSERVED = psf.simulate(LINEAR, {"phi": 0.8}, steps=STEPS, random_seed=3)["observations"].values
+LINEAR = autoregression()
+KNOWN = {"spread": np.sqrt(0.3)}
+OBSERVED = simulated(STEPS, 3, phi=0.8, **KNOWN)
 
 
 def model_with(filter):
     with pm.Model() as model:
         pm.Uniform("phi", -1, 1)
-        psf.StateSpace("d", LINEAR, filter, steps=STEPS, observed=OBSERVED)
+        psf.StateSpace("d", LINEAR, filter, params=KNOWN, steps=STEPS, observed=OBSERVED)
     return model
 
 
 def test_the_evidence_is_that_of_the_exact_likelihood():
     """4 standard errors: one false alarm in 16 000 seeds; the exact number by quadrature."""
     phi = np.linspace(-1, 1, 4001)[1:-1]
-    terms = psf.log_likelihood(LINEAR, psf.EKF(), {"phi": phi}, OBSERVED, steps=STEPS).sum(axis=-1)
+    params = {"phi": phi, **KNOWN}
+    terms = psf.log_likelihood(LINEAR, psf.EKF(), params, OBSERVED, steps=STEPS).sum(axis=-1)
     truth = np.log(np.mean(np.exp(terms - terms.max()))) + terms.max()
     with model_with(psf.BootstrapPF(40)) as noisy:
         idata = psf.sample_dram(

@@ -5,6 +5,7 @@ within five of its standard errors, and a stated share of the state's deviation 
 any finite number has. A right filter fails that once in a million times the numbers compared.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
 from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
@@ -21,7 +23,6 @@ from pymc_statespace_filters.filters.ensemble.backward_simulation import (
 )
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.compiled import from_python
 from tests.filters.test_ekf_states import assert_drawn_from
@@ -38,6 +39,7 @@ _choose_particles, _fill_intervals, _settlement = map(
 ROWS = np.arange(7)
 NO_INPUTS = np.zeros((0, 0))
 N_SEEDS = 40
+# Each number of members compiles again, so most tests take these.
 FILTERS = {
     "enkf": (psf.EnKF(500), 0.02),
     "bootstrap": (psf.BootstrapPF(500), 0.02),
@@ -66,13 +68,20 @@ class States(NamedTuple):
     health: np.ndarray
 
 
+@cache
+def compiled_states(filter, system, moment):
+    """What the filter compiles, without PyTensor's layers around it."""
+    compiled = filter.compile_states(compile_system(system), moment)
+    return cached_on_disk(compiled.function, compiled.key)
+
+
 def states(
     moment, filter, system=PAIR, theta=(0.7, 0.2), steps=STEPS, observed=PAIR_DATA, rows=ROWS,
     seed=0, draw_seed=0, inputs=NO_INPUTS,
 ):  # fmt: skip
-    evaluate = evaluator(StatesOp(system, filter, moment))
-    theta = np.array(theta)
-    return States(*evaluate(theta, steps, observed, inputs, 0.0, seed, rows, draw_seed))
+    run = compiled_states(filter, system, moment)
+    theta, observed, inputs = (np.array(a, dtype=float) for a in (theta, observed, inputs))
+    return States(*run(theta, steps, observed, inputs, 0.0, seed, rows, draw_seed))
 
 
 def exact(moment, rows=ROWS, **changes):
@@ -137,15 +146,16 @@ def test_draws_have_the_law_of_the_states(name, moment):
 
 def test_the_draw_is_apart_from_the_filter():
     """Another seed of the draws leaves the moments of a filter as they are."""
+    filter, _ = FILTERS["enkf"]
     for moment in ("predicted", "filtered", "smoothed"):
-        first, second = (states(moment, psf.EnKF(50), draw_seed=i) for i in (1, 2))
+        first, second = (states(moment, filter, draw_seed=i) for i in (1, 2))
         np.testing.assert_array_equal(first.mean, second.mean)
         assert (first.drawn != second.drawn).any()
 
 
 @pytest.mark.parametrize("moment", ["predicted", "filtered"])
 def test_members_are_those_of_the_likelihood(moment):
-    filter = psf.BootstrapPF(64)
+    filter, _ = FILTERS["bootstrap"]
     n_effective = states("filtered", filter, rows=STEPS, seed=5).n_effective
     _, expected = evaluator(LogLikelihood(PAIR, filter))(
         np.array([0.7, 0.2]), STEPS, PAIR_DATA, NO_INPUTS, 0.0, 5
@@ -156,7 +166,7 @@ def test_members_are_those_of_the_likelihood(moment):
 
 
 def test_rows_are_unknown_from_a_failing_observation_on():
-    filter, data = psf.BootstrapPF(64), PAIR_DATA.copy()
+    (filter, _), data = FILTERS["bootstrap"], PAIR_DATA.copy()
     data[1, 1] = 1e200  # at step 2
     for moment, n_known in (("predicted", 2), ("filtered", 2), ("smoothed", 0)):
         found = states(moment, filter, observed=data)
@@ -205,7 +215,7 @@ def test_ancestries_are_settled_after_a_lag(name):
 
 def test_distinct_ancestors_are_counted():
     rows = np.array([2, 29])
-    arguments = (psf.BootstrapPF(500), SWING, [1.2], LONG_STEPS, LONG_DATA, rows)
+    arguments = (FILTERS["bootstrap"][0], SWING, [1.2], LONG_STEPS, LONG_DATA, rows)
     found, filtered = (states(moment, *arguments) for moment in ("smoothed", "filtered"))
     assert 1 < found.n_effective[0] < 0.8 * found.n_effective[1] <= 400
     assert found.n_effective[1] == int(found.n_effective[1]) != filtered.n_effective[1]
@@ -349,12 +359,17 @@ def test_noise_that_depends_on_the_state():
     assert_right(several, truth, 0.03)
 
 
-@pytest.mark.parametrize("below", [0.0, 1.0], ids=["weighted", "resampled"])
-@pytest.mark.parametrize("kind", [psf.EnKF, psf.BootstrapPF, psf.PFEnKF])
-def test_at_its_end_a_record_is_filtered(kind, below):
+@pytest.mark.parametrize(
+    "filter",
+    [
+        FILTERS["enkf"][0],
+        *(k(60, resample_below=b) for k in (psf.BootstrapPF, psf.PFEnKF) for b in (0.0, 1.0)),
+    ],
+    ids=repr,
+)
+def test_at_its_end_a_record_is_filtered(filter):
     """The past is nudged and weighted as the present is, to rounding."""
-    settings = {} if kind is psf.EnKF else {"resample_below": below}
-    arguments = (kind(60, **settings), SWING, [1.2], LONG_STEPS[:9], LONG_DATA[:9])
+    arguments = (filter, SWING, [1.2], LONG_STEPS[:9], LONG_DATA[:9])
     rows = np.array([4, 9])
     smoothed, filtered = (states(m, *arguments, rows=rows) for m in ("smoothed", "filtered"))
     np.testing.assert_allclose(smoothed.mean[1], filtered.mean[1], rtol=1e-9)

@@ -1,5 +1,7 @@
 """One state that decays, seen with noise: the likelihood by the EKF is exact."""
 
+import numpy as np
+
 import pymc_statespace_filters as psf
 
 
@@ -26,3 +28,14 @@ def autoregression(**changes):
         "initial_cov": [[1.0]],
     }
     return psf.StateSpaceModel(**settings | changes)
+
+
+def simulated(steps, random_seed, phi, spread, observation_noise=0.4):
+    """A record (J,), by NumPy: importing a test file must not compile anything."""
+    rng = np.random.default_rng(random_seed)
+    x, observed = rng.standard_normal(), []
+    for k in range(steps[-1] + 1):
+        if k in steps:
+            observed.append(x + np.sqrt(observation_noise) * rng.standard_normal())
+        x = phi * x + spread * rng.standard_normal()
+    return np.array(observed)

@@ -13,13 +13,13 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpre
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
 from pymc_statespace_filters.sampling.particle_number.search import Row
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
-from tests.sampling.autoregression import autoregression
+from tests.sampling.autoregression import autoregression, simulated
 from tests.test_readme import run_code_of
 
 STEPS = np.arange(1, 61)
 LINEAR = autoregression(observation_noise=[[0.2]])
 TRUTH = {"phi": 0.8, "spread": 0.7}
-DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=5)["observations"].to_numpy()
+DATA = simulated(STEPS, 5, **TRUTH, observation_noise=0.2)
 
 
 def linear_model(filter):

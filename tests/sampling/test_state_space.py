@@ -17,7 +17,7 @@ from pymc_statespace_filters.ops.noise import StoredNoise
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
-from tests.sampling.autoregression import autoregression
+from tests.sampling.autoregression import autoregression, simulated
 from tests.sampling.test_dram import sample
 from tests.sampling.test_noise import Redrawing
 
@@ -26,7 +26,7 @@ STEPS = np.arange(1, 21)
 
 LINEAR = autoregression()
 TRUTH = {"phi": 0.7, "spread": 0.7}
-DATA = psf.simulate(LINEAR, TRUTH, steps=STEPS, random_seed=3)["observations"].to_numpy()
+DATA = simulated(STEPS, 3, **TRUTH)
 
 
 def linear_model(filter):
