@@ -207,8 +207,10 @@ def density_of(draws: np.ndarray, is_positive: bool) -> tuple[np.ndarray, np.nda
     # autocorrelation of the chains as bumps.
     spread = min(draws.std(), np.subtract(*np.quantile(draws, [0.75, 0.25])) / 1.34)
     bandwidth = 0.9 * spread * float(az.ess(draws)) ** -0.2
+    low = 0.0 if is_positive else draws.min() - 3 * bandwidth
+    limits = (low, draws.max() + 3 * bandwidth)
     x, density, _ = array_stats.kde(
-        draws.ravel(), bw=bandwidth, bound_correction=is_positive, extend=not is_positive
+        draws.ravel(), bw=bandwidth, bound_correction=is_positive, custom_lims=limits
     )
     return x, density
 
