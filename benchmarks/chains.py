@@ -21,6 +21,7 @@ from numba import njit
 import pymc_statespace_filters as psf
 from benchmarks.sampling import double_well_model
 from benchmarks.systems import DOUBLE_WELL_TRUTH
+from benchmarks.timing import Timed
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -53,6 +54,12 @@ def four_normals() -> pm.Model:
     with pm.Model() as model:
         pm.Normal("x", 0, 1, shape=4)
     return model
+
+
+def first_draws() -> Timed:
+    """The shortest chain on four normals, as a task whose first call compiles."""
+    run = partial(psf.sample_dram, 4, 4, chains=1, progressbar=False, model=four_normals())
+    return Timed(lambda seed: float(run(random_seed=seed)["posterior"]["x"][0, -1, 0]))
 
 
 def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:

@@ -1,7 +1,8 @@
 """Cost of the first call of a model, including compilation but not imports.
 
 Each first call runs in its own process with an empty cache, then again in a second process, then
-for another system with as many states and the same cache.
+for another system with as many states and the same cache. `GridFilter` has one system here, and the
+chain is that of a model without a filter, so that its row is the sampler's own cost.
 """
 
 import os
@@ -13,19 +14,23 @@ from dataclasses import asdict, dataclass
 from benchmarks.measure import ROOT
 from benchmarks.peers.client import ONE_THREAD
 
+TWO_STATES = ("mass_spring_damper", "linear")
 KINDS = {
     "EKF, value": "ours.of(name, psf.EKF()).value()",
     "EKF, value and gradient": "ours.of(name, psf.EKF()).value_and_gradient()",
     "EnKF(1250)": "ours.of(name, psf.EnKF(1250)).value()",
     "BootstrapPF(1250)": "ours.of(name, psf.BootstrapPF(1250)).value()",
     "PFEnKF(250)": "ours.of(name, psf.PFEnKF(250)).value()",
+    "GridFilter()": "ours.of(name, psf.GridFilter()).value()",
+    "a chain by sample_dram": "chains.first_draws()",
 }
+SYSTEMS = {"GridFilter()": ("double_well",), "a chain by sample_dram": ("double_well",)}
 
 # Simulating the record compiles too, so do it before the clock starts.
 CHILD = """
 import sys, time
 import pymc_statespace_filters as psf
-from benchmarks import ours
+from benchmarks import chains, ours
 name = sys.argv[1]
 ours.simulated = (lambda data: lambda *_: data)(ours.simulated(*ours.SYSTEMS[name]))
 start = time.process_time()
@@ -42,7 +47,7 @@ class Cold:
     states: int
     first: float
     second: float
-    another: float
+    another: float | None
 
     def as_json(self) -> dict:
         return asdict(self)
@@ -64,8 +69,9 @@ def seconds(what: str, name: str, cache: str) -> float:
 def cold() -> list[Cold]:
     rows = []
     for kind, what in KINDS.items():
+        name, *others = SYSTEMS.get(kind, TWO_STATES)
         with tempfile.TemporaryDirectory() as cache:
-            first, second = (seconds(what, "mass_spring_damper", cache) for _ in range(2))
-            another = seconds(what, "linear", cache)
-        rows.append(Cold(kind, 2, first, second, another))
+            first, second = (seconds(what, name, cache) for _ in range(2))
+            another = seconds(what, others[0], cache) if others else None
+        rows.append(Cold(kind, 2 if others else 1, first, second, another))
     return rows

@@ -9,30 +9,40 @@ from pathlib import Path
 from benchmarks import figures
 from benchmarks.chains import ChainCost
 from benchmarks.cold import Cold
+from benchmarks.demo import Demo
 from benchmarks.growth import Curve
 from benchmarks.measure import FOLDER, ROOT, Row
+from benchmarks.noise import Noise, Normals
 from benchmarks.ratios import ratios
 from benchmarks.sampling import Chains
 
 TARGET = ROOT / "docs" / "_static"
 KINDS = {
     "sampling": lambda **row: (Chains if "sampler" in row else ChainCost)(**row),
-    "cold": Cold,
     "particles": Curve,
     "steps": Curve,
     "states": Curve,
 }
+# Parts that need no other package.
+OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 
 
 def write(parts: list[str]) -> str:
-    """Write everything; return the tables as text."""
+    """Write all tables and figures whose parts are stored; return the tables as text."""
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
+    own = {part: k for part, k in kept.items() if part in OWN}
+    compared = {part: k for part, k in kept.items() if part not in OWN}
+    return (write_comparison(compared) if compared else "") + (write_own(own) if own else "")
+
+
+def write_comparison(kept: dict[str, dict]) -> str:
+    """Write the comparison with other packages, and the growth curves."""
     found = {
         part: [KINDS[part](**row) if part in KINDS else Row.of_json(row) for row in k["rows"]]
         for part, k in kept.items()
     }
-    rows = [row for part in parts if part not in KINDS for row in found[part]]
-    sampled, cold, *curves = (found.get(part, []) for part in KINDS)
+    rows = [row for part in found if part not in KINDS for row in found[part]]
+    sampled, *curves = (found.get(part, []) for part in KINDS)
     sampling = [row for row in sampled if isinstance(row, Chains)]
     growth = [curve for part in curves for curve in part]
     sections = [
@@ -41,13 +51,31 @@ def write(parts: list[str]) -> str:
         likelihood_tables(rows),
         sampling_table(sampling),
         chain_table([row for row in sampled if isinstance(row, ChainCost)]),
-        cold_table(cold),
     ]
     text = "\n".join(section for section in sections if section)
     (TARGET / "benchmarks.inc").write_text(text)
     write_csv(rows, TARGET / "benchmarks.csv")
     figures.bars(rows, TARGET / "benchmarks.png")
     figures.curves(growth, TARGET / "benchmarks_growth.png")
+    return text
+
+
+def write_own(kept: dict[str, dict]) -> str:
+    """Write the tables that compare with no other package."""
+    tables = {
+        "normals": normals_table,
+        "noise": noise_table,
+        "cold": cold_table,
+        "demo": demo_table,
+    }
+    sections = [machine(kept)]
+    sections += [
+        tables[part]([OWN[part](**row) for row in kept[part]["rows"]])
+        for part in OWN
+        if part in kept
+    ]
+    text = "\n".join(sections)
+    (TARGET / "benchmarks_own.inc").write_text(text)
     return text
 
 
@@ -147,12 +175,34 @@ def chain_table(rows: list[ChainCost]) -> str:
     return "\n### Compiled chains\n\n" + table(["", "", ""], lines)
 
 
+def normals_table(rows: list[Normals]) -> str:
+    lines = [[r.vectors, seconds(r.ours), seconds(r.numpy), number(r.numpy / r.ours)] for r in rows]
+    head = ["compiled for vectors of", "a normal", "NumPy's standard_normal", "NumPy / ours"]
+    return "\n## Normals\n\n" + table(head, lines)
+
+
+def noise_table(rows: list[Noise]) -> str:
+    lines = [
+        [r.filter, r.system, seconds(r.fresh), seconds(r.held), number(r.fresh / r.held)]
+        for r in rows
+    ]
+    head = ["filter", "system", "fresh noise", "held noise", "fresh / held"]
+    return "\n## Fresh and held noise\n\n" + table(head, lines)
+
+
 def cold_table(rows: list[Cold]) -> str:
-    if not rows:
-        return ""
-    lines = [[r.kind, *(f"{s:.1f} s" for s in (r.first, r.second, r.another))] for r in rows]
-    head = ["two states", "first call", "in a second process", "another model, same install"]
+    lines = [
+        [r.kind, str(r.states)]
+        + ["" if s is None else f"{s:.1f} s" for s in (r.first, r.second, r.another)]
+        for r in rows
+    ]
+    head = ["", "states", "first call", "in a second process", "another model, same install"]
     return "\n## First calls\n\n" + table(head, lines)
+
+
+def demo_table(rows: list[Demo]) -> str:
+    lines = [[r.command, f"{r.first:.0f} s", f"{r.second:.0f} s"] for r in rows]
+    return "\n## The demo\n\n" + table(["CPU time", "first run", "second run"], lines)
 
 
 def write_csv(rows: list[Row], target: Path) -> None:
