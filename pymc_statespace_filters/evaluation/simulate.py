@@ -12,6 +12,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.compiler.lowering.observation_sampler import observation_sampler
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import check_finite, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -38,7 +39,7 @@ def continuation(system: StateSpaceModel) -> CompiledFunction:
             while k < steps[j]:
                 propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), now)
                 k += 1
-            states[j] = now[:, 0]
+            copy_into(states[j], now[:, 0])
             observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
         return states, observations
 

@@ -10,6 +10,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunc
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
 from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -45,8 +46,14 @@ def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -
         f"    u = {'inputs[k]' if n_inputs else 'no_inputs'}\n"
         "    (drawn,) = draw_code(c[:n_theta].copy(), x[:, 0].copy(), u, np.asarray(t), "
         f"{copies})\n"
-        "    out[:] = drawn\n"
+        "    copy_into(out, drawn)\n"
     )
-    namespace = {"np": np, "draw_code": draw_code, "n_theta": n_theta, "no_inputs": no_inputs}
+    namespace = {
+        "np": np,
+        "copy_into": copy_into,
+        "draw_code": draw_code,
+        "n_theta": n_theta,
+        "no_inputs": no_inputs,
+    }
     exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
     return CompiledFunction(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))

@@ -49,3 +49,13 @@ njit_strict = njit(error_model="numpy", nogil=True, inline="always")
 @njit_internal
 def keep_alive(array):
     """Do nothing; called after the last use of an array's address, to keep the array until then."""
+
+
+@njit_internal
+def copy_into(target, source):
+    """Set a vector to another one of its length.
+
+    Assigning a slice would take a second of compilation more, for messages about shapes.
+    """
+    for i in range(target.size):
+        target[i] = source[i]

@@ -24,6 +24,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunc
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
 from pymc_statespace_filters.compiler.native.jit import (
+    copy_into,
     inline_always,
     keep_alive,
     njit_callable,
@@ -122,14 +123,14 @@ def _carry_past(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     elif event == UPDATED:
         if header[_UPDATES]:
             _update_past(past, carray(d, (p,)), carray(D, (p, N)))
-        past.last_log_w[:] = log_weights
+        copy_into(past.last_log_w, log_weights)
         while header[_SETTLED] < header[_STORED] and past.settled_at[header[_SETTLED]] <= j:
             _settle(past, log_weights)
     elif event == RESAMPLED:
         parents = carray(ancestors, (N,))
         for row in range(header[_SETTLED], header[_STORED]):
             _resample_past(parents, past.states[row % S], past.origins[row % S])
-        past.last_log_w[:] = log_weights
+        copy_into(past.last_log_w, log_weights)
     elif event == ENDED:
         while header[_SETTLED] < header[_STORED]:
             _settle(past, log_weights)
@@ -288,10 +289,12 @@ def ancestral_smoother(
         header[_SLOTS], header[_FREE], header[_SEED] = S, free.size, draw_seed
         header[_UPDATES], header[_STORED], header[_SETTLED] = np.int64(updates), 0, 0
         integers, reals = np.empty(_n_integers(header), np.int64), np.empty(_n_reals(header))
-        integers[:_N_HEADER] = header
+        copy_into(integers[:_N_HEADER], header)
         to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(reals.ctypes.data))
         past = _past_of(integers, reals)
-        past.free[:], past.rows[:], past.settled_at[:] = free, rows, settled_at
+        copy_into(past.free, free)
+        copy_into(past.rows, rows)
+        copy_into(past.settled_at, settled_at)
         past.results[:], past.last_log_w[:] = np.nan, -math.log(N)
         _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
         keep_alive(integers)

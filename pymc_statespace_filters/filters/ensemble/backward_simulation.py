@@ -28,6 +28,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     arguments_class,
 )
 from pymc_statespace_filters.compiler.native.jit import (
+    copy_into,
     inline_always,
     keep_alive,
     njit_callable,
@@ -124,13 +125,15 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
     means, roots, log_constants = kernel
     n, N = X.shape
     m, width = noise.shape
-    means[:] = X
+    for a in range(n):
+        copy_into(means[a], X[a])
     noise[:] = 0.0
     propagate(system, k, t, noise.ctypes.data, width, means)
     roots[:] = 0.0
     for q in range(m):
         noise[q] = 1.0
-        scratch[:] = X
+        for a in range(n):
+            copy_into(scratch[a], X[a])
         propagate(system, k, t, noise.ctypes.data, width, scratch)
         noise[q] = 0.0
         for i in range(N):

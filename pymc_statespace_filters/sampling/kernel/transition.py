@@ -23,7 +23,7 @@ from numba import njit
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
-from pymc_statespace_filters.compiler.native.jit import linked
+from pymc_statespace_filters.compiler.native.jit import copy_into, linked
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
@@ -62,13 +62,6 @@ class _Move(NamedTuple):
 
 
 _internal = linked()
-
-
-@_internal
-def _copy(source, target):
-    # Assigning slices would spend seconds on compiling messages about their shapes.
-    for i in range(target.size):
-        target[i] = source[i]
 
 
 _SOURCES = (
@@ -125,7 +118,7 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
             for j in range(i + 1):
                 moved += chol[i, j] * offsets[stage, j]
             density.position[i] = moved
-        _copy(random.seeds[k, stage - 1], density.seeds)
+        copy_into(density.seeds, random.seeds[k, stage - 1])
         value = evaluate(density)
         if value.failure != 0:
             n_failed, failure = n_failed + 1, value.failure
@@ -144,13 +137,13 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
 @_internal
 def _set_current(state, density, value, log_screen):
     """Take the point just evaluated, and its estimate, as the current state."""
-    _copy(density.position, state.position)
-    _copy(density.seeds, state.seeds)
+    copy_into(state.position, density.position)
+    copy_into(state.seeds, density.seeds)
     state.numbers[LOG_DENSITY] = value.log_density
     state.numbers[N_EFFECTIVE] = value.n_effective
     state.numbers[LOG_SCREEN] = log_screen
     first = density.call.out.size - state.carried.size
-    _copy(density.call.out[first:], state.carried)
+    copy_into(state.carried, density.call.out[first:])
 
 
 @_internal
@@ -176,8 +169,8 @@ def _screened_move(settings, target, screen, state, chol, random, k, counts):
     counts[N_SCREENED], counts[N_SCREEN_FAILED] = move.n_evaluations, move.n_failed
     if move.stage == 0:
         return 0.0
-    _copy(screen.position, target.position)
-    _copy(random.seeds[k, 0], target.seeds)
+    copy_into(target.position, screen.position)
+    copy_into(target.seeds, random.seeds[k, 0])
     value = evaluate(target)
     counts[N_EVALUATIONS], counts[FAILURE] = 1, value.failure
     if value.failure != 0:
@@ -222,14 +215,14 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
             acceptance = _move(settings, target, state, adapted.chol, random, k, counts)
         if counts[FAILURE] == RAISED:
             break
-        _copy(state.position, draws.positions[at])
-        _copy(state.seeds, draws.seeds[at])
+        copy_into(draws.positions[at], state.position)
+        copy_into(draws.seeds[at], state.seeds)
         numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]
         numbers[N_EFFECTIVE] = state.numbers[N_EFFECTIVE]
         numbers[ACCEPTANCE], numbers[SCALING] = acceptance, scaling
         if at < draws.covs.shape[0]:
             for i in range(state.position.size):
-                _copy(adapted.cov[i], draws.covs[at, i])
+                copy_into(draws.covs[at, i], adapted.cov[i])
         if settings.adapts:
             learn(settings.adapt_every, settings.continuous, adapted, state.position, counts[STAGE])
             scaling = _scaling(adapted.chol)
