@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from benchmarks.measure import ROOT
 from benchmarks.peers.client import ONE_THREAD
 
-TWO_STATES = ("mass_spring_damper", "linear")
+TWO_STATES = 2, ("mass_spring_damper", "linear")
 KINDS = {
     "EKF, value": "ours.of(name, psf.EKF()).value()",
     "EKF, value and gradient": "ours.of(name, psf.EKF()).value_and_gradient()",
@@ -24,7 +24,11 @@ KINDS = {
     "GridFilter()": "ours.of(name, psf.GridFilter()).value()",
     "a chain by sample_dram": "chains.first_draws()",
 }
-SYSTEMS = {"GridFilter()": ("double_well",), "a chain by sample_dram": ("double_well",)}
+# Number of states, and the systems.
+SYSTEMS = {
+    "GridFilter()": (1, ("double_well",)),
+    "a chain by sample_dram": (0, ("double_well",)),
+}
 
 # Simulating the record compiles too, so do it before the clock starts.
 CHILD = """
@@ -69,9 +73,9 @@ def seconds(what: str, name: str, cache: str) -> float:
 def cold() -> list[Cold]:
     rows = []
     for kind, what in KINDS.items():
-        name, *others = SYSTEMS.get(kind, TWO_STATES)
+        n_states, (name, *others) = SYSTEMS.get(kind, TWO_STATES)
         with tempfile.TemporaryDirectory() as cache:
             first, second = (seconds(what, name, cache) for _ in range(2))
             another = seconds(what, others[0], cache) if others else None
-        rows.append(Cold(kind, 2 if others else 1, first, second, another))
+        rows.append(Cold(kind, n_states, first, second, another))
     return rows

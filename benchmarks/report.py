@@ -192,7 +192,7 @@ def noise_table(rows: list[Noise]) -> str:
 
 def cold_table(rows: list[Cold]) -> str:
     lines = [
-        [r.kind, str(r.states)]
+        [r.kind, str(r.states or "")]
         + ["" if s is None else f"{s:.1f} s" for s in (r.first, r.second, r.another)]
         for r in rows
     ]
