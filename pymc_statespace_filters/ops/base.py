@@ -10,7 +10,6 @@ from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
-import pytensor
 import pytensor.tensor as pt
 from pytensor.gradient import grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
@@ -25,6 +24,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import (
 )
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
+from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -101,18 +101,19 @@ def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
 def evaluator(op: FilterOp) -> Any:
     """A compiled Python function of the operation's inputs; its machine code is cached on disk.
 
-    It calls the machine code directly. PyTensor's function object stores the arguments of a call in
-    cells that all threads would overwrite.
+    It is compiled without PyTensor's function around it, which would take as long to compile again,
+    and whose object stores the arguments of a call in cells that all threads would overwrite.
     """
-    inputs = [pt.tensor(name, dtype=dtype, shape=(None,) * n) for name, dtype, n in op.input_types]
-    function = pytensor.function(
-        inputs, op(*inputs, return_list=True), mode="NUMBA", on_unused_input="ignore"
-    )
-    machine_code = with_internal_linkage(function.vm.jit_fn)
-    dtypes = [dtype for _, dtype, _ in op.input_types]
+    function, key = _call(op)
+    compiled = jit(function)
+    machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
+    kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]
 
     def evaluate(*values: Any) -> tuple:
-        return machine_code(*map(np.asarray, values, dtypes))
+        # Other types of arrays (in another order, or read-only) would be compiled again.
+        arrays = [np.require(v, kind, ("C", "W")) for v, kind in zip(values, kinds, strict=True)]
+        results = machine_code(*arrays)
+        return results if isinstance(results, tuple) else (results,)
 
     return evaluate
 
@@ -183,7 +184,13 @@ def theta_cotangent_only(op: Op, inputs: Sequence[Variable], theta_bar: Variable
 
 @register_funcify_and_cache_key(FilterOp)
 def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
-    """Check the record, then call the kernel.
+    """The compiled function of an operation, and its key."""
+    function, key = _call(op)
+    return numba_njit(function), key
+
+
+def _call(op: FilterOp) -> tuple[Any, str | None]:
+    """The function that checks the record, then calls the kernel; and its key.
 
     Kernels receive copies: constants and variables, C and Fortran order differ in type, and each
     combination of types would be compiled separately, which takes seconds where a copy takes
@@ -207,6 +214,6 @@ def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
         "check_observed": check_observed(op.system.p),
         "no_normals": np.empty(0),
     }
-    exec(compile(source, f"<call of {op}>", "exec"), namespace)
+    exec(compile(source, f"<call of {type(op).__name__}>", "exec"), namespace)
     key = cache_key(op.system, compiled)
-    return numba_njit(namespace["call"]), None if key is None else key_of(source, key)
+    return namespace["call"], None if key is None else key_of(source, key)
