@@ -98,7 +98,7 @@ few_particles = pytest.mark.filterwarnings("ignore:.*fewer than 3 particles")
 @few_particles
 def test_an_unbiased_filter_has_the_scores_of_the_exact_one(noisy):
     """Draws of parameter and noise together, by weighting 20 000: errors seen below 0.05."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(5)
     idata = noisy_draws(UNBIASED, STEPS.size, rng, (2, 1000))
     found = psf.leave_future_out(idata, noisy, min_observations=16)
     np.testing.assert_allclose(found.elpd_i, scores()[16:], atol=0.1)

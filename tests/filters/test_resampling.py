@@ -20,6 +20,7 @@ from tests.compiled import from_python
 choose_ancestors, choose_in_order, copy_ancestors, multinomial, systematic = map(
     from_python, (choose_ancestors, choose_in_order, copy_ancestors, multinomial, systematic)
 )
+points_of = {scheme: from_python(function) for scheme, function in POINTS.items()}
 
 
 def ancestors_at(weights, points):
@@ -42,7 +43,7 @@ def normals_of(scheme, n_particles, seed, step):
 def draw(scheme, weights, seed, step=0):
     w = np.array(weights, dtype=float)
     points, out = np.empty(w.size + 1), np.empty(w.size, dtype=np.int64)
-    POINTS[scheme](normals_of(scheme, w.size, seed, step), points)
+    points_of[scheme](normals_of(scheme, w.size, seed, step), points)
     choose_ancestors(w, points, np.empty(n_blocks(w)), out)
     return out
 

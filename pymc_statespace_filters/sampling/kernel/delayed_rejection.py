@@ -62,7 +62,9 @@ def log_acceptance(log_pi: np.ndarray, log_q: np.ndarray, stage: int) -> float:
     One stage of a symmetric proposal is Metropolis' rule:
 
     >>> import numpy as np
-    >>> log_acceptance(np.array([0.0, -1.5]), np.zeros((2, 2)), 1)
+    >>> from numba import njit
+    >>> accept = njit(lambda log_pi, log_q: log_acceptance(log_pi, log_q, 1))
+    >>> accept(np.array([0.0, -1.5]), np.zeros((2, 2)))
     -1.5
     """
     n_points = stage + 1

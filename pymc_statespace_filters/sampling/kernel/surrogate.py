@@ -42,9 +42,9 @@ def log_surrogate_acceptance(
     --------
     The surrogate has already accounted for the change of density:
 
-    >>> log_surrogate_acceptance(0.0, -1.5, 0.0, -1.5)
+    >>> log_surrogate_acceptance.py_func(0.0, -1.5, 0.0, -1.5)
     0.0
-    >>> log_surrogate_acceptance(0.0, -1.5, 0.0, -1.0)
+    >>> log_surrogate_acceptance.py_func(0.0, -1.5, 0.0, -1.0)
     -0.5
     """
     if log_pi_there == -np.inf or log_c_here == -np.inf:
