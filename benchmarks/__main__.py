@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import warnings
+from dataclasses import asdict
 from importlib.metadata import version
 
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
@@ -66,7 +67,7 @@ def measure(part: str) -> None:
     """Measure one part and store it."""
     start, peers = time.perf_counter(), Peers()
     try:
-        rows = [row.as_json() for row in PARTS[part](peers)]
+        rows = [asdict(row) for row in PARTS[part](peers)]
         kept = {"versions": versions(peers), "load": os.getloadavg()[0], "rows": rows}
     finally:
         peers.close()

@@ -10,7 +10,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from statistics import median
 
@@ -36,9 +36,6 @@ class ChainCost:
     what: str
     figure: str
     note: str
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 @njit(nogil=True)

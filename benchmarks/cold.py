@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from benchmarks.measure import ROOT
 from benchmarks.peers.client import ONE_THREAD
@@ -52,9 +52,6 @@ class Cold:
     first: float
     second: float
     another: float | None
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 def seconds(what: str, name: str, cache: str) -> float:

@@ -5,7 +5,7 @@ import resource
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from benchmarks.measure import ROOT
 
@@ -19,9 +19,6 @@ class Demo:
     command: str
     first: float
     second: float
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 def seconds(options: list[str], cache: str) -> float:

@@ -1,7 +1,7 @@
 """Growth of the cost of one likelihood with particles, steps and states."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,9 +29,6 @@ class Curve:
     sizes: list[int]
     seconds: list[float]
     ends: str = ""
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 def curve(against: str, who: str, sizes: Iterable[int], make: Callable[[int], Timed]) -> Curve:

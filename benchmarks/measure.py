@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.peers.client import Peer, PeerError, RemoteTask
@@ -22,9 +22,6 @@ class Row:
     timing: Timing | None
     answer: str = ""
     note: str = ""
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
     @classmethod
     def of_json(cls, row: dict) -> "Row":

@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import pymc_statespace_filters as psf
 from benchmarks import ours
@@ -52,9 +52,6 @@ class Normals:
     ours: float
     numpy: float
 
-    def as_json(self) -> dict:
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Noise:
@@ -64,9 +61,6 @@ class Noise:
     system: str
     fresh: float
     held: float
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 def normals() -> list[Normals]:

@@ -11,7 +11,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -42,9 +42,6 @@ class Chains:
     note: str = ""
     kept_per_second: float = np.nan
     kept_ess_per_second: float = np.nan
-
-    def as_json(self) -> dict:
-        return asdict(self)
 
 
 def double_well_model(filter, steps=STEPS) -> pm.Model:

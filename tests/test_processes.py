@@ -48,6 +48,28 @@ def test_a_compiled_model_gives_the_same_bits_in_a_child(method):
     assert there == [logp(POINT) for logp in models]
 
 
+UNPICKLE = """
+import sys
+import cloudpickle
+model = cloudpickle.load(sys.stdin.buffer)
+print(repr(float(model.compile_logp()({"a": 0.6}))))
+"""
+
+
+def test_a_pickled_model_is_whole_where_nothing_was_imported():
+    """Public names are imported on first use; what draws and evaluates a variable comes with it."""
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.2)
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
+    done = subprocess.run(
+        [sys.executable, "-c", UNPICKLE],
+        input=cloudpickle.dumps(model),
+        capture_output=True,
+        check=True,
+    )
+    assert float(done.stdout) == float(model.compile_logp()(POINT))
+
+
 # What a script of the user's does, in a process of its own: settings on the command line.
 SCRIPT = """
 import json, sys

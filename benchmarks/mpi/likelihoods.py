@@ -33,9 +33,6 @@ class Wall:
         """Scaled to the whole record."""
         return self.case.scale * median(self.one if n_ranks == 1 else self.two)
 
-    def as_json(self) -> dict:
-        return asdict(self)
-
     @classmethod
     def of_json(cls, row: dict) -> "Wall":
         return cls(**(row | {"case": Case(**row["case"])}))
@@ -87,7 +84,7 @@ def main(target: str, kernels: str) -> None:
             last = found[-1]
             print(f"{case.name}: {median(last.one):.4g} s, {median(last.two):.4g} s", flush=True)
     if MPI.COMM_WORLD.rank == 0:
-        Path(target).write_text(json.dumps([wall.as_json() for wall in found]))
+        Path(target).write_text(json.dumps([asdict(wall) for wall in found]))
 
 
 if __name__ == "__main__":
