@@ -28,7 +28,7 @@ from .evidence import (
     marginal_modes,
     prior_sensitivity,
 )
-from .filters import EKF, BootstrapPF, EnKF, GridFilter, PFEnKF
+from .filters import EKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
 from .plots import (
     plot_average,
     plot_evidence,
@@ -61,6 +61,7 @@ __all__ = [
     "FilterWarning",
     "GradientUnavailableError",
     "GridFilter",
+    "GuidedPF",
     "LoweringError",
     "ModelError",
     "PFEnKF",

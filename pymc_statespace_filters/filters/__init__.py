@@ -12,6 +12,7 @@ from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
 from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.grid import GridFilter
+from pymc_statespace_filters.filters.guided_pf import GuidedPF
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from pymc_statespace_filters.filters.protocol import (
     BatchFilter,
@@ -34,6 +35,7 @@ __all__ = [
     "EnsembleFilterBase",
     "Filter",
     "GridFilter",
+    "GuidedPF",
     "PFEnKF",
     "ParticleFilter",
     "RunFilter",

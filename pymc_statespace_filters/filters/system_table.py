@@ -32,12 +32,17 @@ class Slots(NamedTuple):
     n_constants: int = 4
     n_free: int = 5
     is_time_invariant: int = 6
-    prepare: int = 7
-    initialise: int = 8
-    propagate: int = 9
-    observe: int = 10
-    log_density: int = 11
-    step_moments: int = 12
+    m: int = 7
+    has_gaussian_observation: int = 8
+    prepare: int = 9
+    initialise: int = 10
+    propagate: int = 11
+    observe: int = 12
+    log_density: int = 13
+    step_moments: int = 14
+    propagate_guided: int = 15
+    linearized_step: int = 16
+    observation_information: int = 17
 
 
 TABLE = Slots()
@@ -61,10 +66,12 @@ class TabledSystem(NamedTuple):
     """
 
     n: int
+    m: int
     p: int
     n_theta: int
     dt: float
     is_time_invariant: bool
+    has_gaussian_observation: bool
     free: np.ndarray
     c: np.ndarray
     inputs: np.ndarray
@@ -73,6 +80,9 @@ class TabledSystem(NamedTuple):
     observe: int
     log_density: int
     step_moments: int
+    propagate_guided: int
+    linearized_step: int
+    observation_information: int
 
 
 class SystemTable(NamedTuple):
@@ -91,8 +101,12 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     prepare, initialise = symbols["prepare"], symbols.get("initialise", "")
     propagate, observe = symbols.get("propagate", ""), symbols.get("observe", "")
     log_density, step_moments = symbols.get("log_density", ""), symbols.get("step_moments", "")
+    propagate_guided = symbols.get("propagate_guided", "")
+    linearized_step = symbols.get("linearized_step", "")
+    information = symbols.get("observation_information", "")
     constants = np.zeros(N_SLOTS + system.free.size, dtype=np.int64)
-    constants[TABLE.n], constants[TABLE.p] = system.n, system.p
+    constants[TABLE.n], constants[TABLE.m], constants[TABLE.p] = system.n, system.m, system.p
+    constants[TABLE.has_gaussian_observation] = system.gaussian_observation
     constants[TABLE.n_inputs], constants[TABLE.n_theta] = system.n_inputs, system.n_theta
     constants[TABLE.n_constants], constants[TABLE.n_free] = system.n_constants, system.free.size
     constants[TABLE.is_time_invariant] = "step_moments" in used and system.is_time_invariant
@@ -107,6 +121,9 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
         table[TABLE.observe] = address_of(observe)
         table[TABLE.log_density] = address_of(log_density)
         table[TABLE.step_moments] = address_of(step_moments)
+        table[TABLE.propagate_guided] = address_of(propagate_guided)
+        table[TABLE.linearized_step] = address_of(linearized_step)
+        table[TABLE.observation_information] = address_of(information)
         return table
 
     keys = [entry.key for entry in used.values()]
@@ -121,12 +138,16 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
     c = np.empty(slots[TABLE.n_constants])
     call_address(slots[TABLE.prepare], (theta, n_theta, c))
     return TabledSystem(
-        n=slots[TABLE.n], p=slots[TABLE.p], n_theta=slots[TABLE.n_theta], dt=dt,
-        is_time_invariant=slots[TABLE.is_time_invariant] != 0, free=free, c=c,
+        n=slots[TABLE.n], m=slots[TABLE.m], p=slots[TABLE.p], n_theta=slots[TABLE.n_theta], dt=dt,
+        is_time_invariant=slots[TABLE.is_time_invariant] != 0,
+        has_gaussian_observation=slots[TABLE.has_gaussian_observation] != 0, free=free, c=c,
         inputs=carray(inputs, (n_rows, slots[TABLE.n_inputs])),
         initialise=slots[TABLE.initialise], propagate=slots[TABLE.propagate],
         observe=slots[TABLE.observe], log_density=slots[TABLE.log_density],
         step_moments=slots[TABLE.step_moments],
+        propagate_guided=slots[TABLE.propagate_guided],
+        linearized_step=slots[TABLE.linearized_step],
+        observation_information=slots[TABLE.observation_information],
     )  # fmt: skip
 
 
@@ -161,6 +182,24 @@ def observe(system, k, t, z, width, X, D):
 def log_density(system, k, t, d, X, log_p):
     """Write log p(d | x) of every member; components of d that are NaN are left out."""
     _call(system.log_density, system, k, t, d, NULL, X, log_p)
+
+
+@njit_internal
+def propagate_guided(system, k, t, z, width, X, gains):
+    """Move every member by noise that these gains shift; X is followed by a row of log ratios."""
+    _call(system.propagate_guided, system, k, t, z, width, X, gains)
+
+
+@njit_internal
+def linearized_step(system, k, t, z, x, out):
+    """Write the next state of a point x (n, 1) with noise z (m,), and its Jacobians A and B."""
+    _call(system.linearized_step, system, k, t, z, NULL, x, out)
+
+
+@njit_internal
+def observation_information(system, k, t, d, x, out):
+    """Write log p(d | x) at a point x (n, 1), its score and its information."""
+    _call(system.observation_information, system, k, t, d, NULL, x, out)
 
 
 @njit_internal

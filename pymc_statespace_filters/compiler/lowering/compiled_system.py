@@ -6,14 +6,24 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, Graph
-from pymc_statespace_filters.compiler.codegen.functions import member_function
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+)
+from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
 from pymc_statespace_filters.compiler.lowering import structure
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
 )
 from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
+from pymc_statespace_filters.compiler.lowering.guidance import (
+    guided_noise,
+    linearize_step,
+    n_gains,
+    observation_information,
+)
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -39,6 +49,12 @@ class CompiledSystem:
     * ``observe(c, inputs, k, t, Z, X, D)`` simulates observations D (p, N), where the user wrote an
       observation function.
     * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
+    * ``propagate_guided(c, inputs, k, t, s, Z, X)`` moves every member by noise that depends on its
+      state, see `guided_noise`; X has one row more, to which the log of the density ratio is added.
+    * ``linearized_step(c, inputs, k, t, Z, X, member)`` returns one member's next state and its
+      Jacobians, see `linearize_step`.
+    * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
+      its information.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
 
@@ -99,14 +115,35 @@ class CompiledSystem:
     def propagate(self) -> CompiledFunction:
         """Move every member one step, in place."""
         z = _normals(self.m)
-        noise = self._coloured("process_noise", z)
-        transition = self.model.equations.transition
-        if self._merged_noise is None:
-            step = call(transition, self.model, self._given("xut") | {"q": noise})
-        else:
-            step = call(transition, self.model, self._given("xut")) + noise
         arguments = "c, inputs, k, t, Z, X"
+        step = self._step(self._symbols["x"], z)
         return self._member_function("propagate", arguments, step, "X[{i}, member]", "xut", z=z)
+
+    @cached_property
+    def propagate_guided(self) -> CompiledFunction:
+        """Move every member one step by guided noise, in place, and weigh its move."""
+        n, m, z = self.n, self.m, _normals(self.m)
+        member = pt.tensor("x", shape=(n + 1,), dtype="float64")
+        gains = pt.tensor("s", shape=(n_gains(n, m),), dtype="float64")
+        noise, log_ratio = guided_noise(gains, member[:n], z)
+        moved = pt.concatenate([self._step(member[:n], noise), [member[n] + log_ratio]])
+        inputs = {"theta": self._c, "u": self._symbols["u"], "t": self._symbols["t"]}
+        graph = Graph(inputs | {"x": member, "z": z, "s": gains}, [moved])
+        arguments = "c, inputs, k, t, s, Z, X"
+        return member_function("propagate_guided", arguments, graph, "X[{i}, member]")
+
+    @cached_property
+    def linearized_step(self) -> CompiledFunction:
+        """The next state and its Jacobians, at one member and its noise."""
+        z, x = _normals(self.m), self._symbols["x"]
+        linearized = linearize_step(self._step(x, z), x, z, self.free)
+        return self._point_function("linearized_step", [linearized], "xut", z=z)
+
+    @cached_property
+    def observation_information(self) -> CompiledFunction:
+        """log p(d | x), its score and its information, at one member."""
+        information = observation_information(self.model, self._given("xutd"), self.free)
+        return self._point_function("observation_information", [information], "xutd")
 
     @cached_property
     def observe(self) -> CompiledFunction:
@@ -131,6 +168,14 @@ class CompiledSystem:
         moments = structure.step_moments(self.model, self._given("xut"))
         return self._member_function("step_moments", arguments, moments, "M[{i}, member]", "xut")
 
+    def _step(self, x: TensorVariable, z: TensorVariable) -> TensorVariable:
+        """The next state, from standard normals."""
+        noise, transition = self._coloured("process_noise", z), self.model.equations.transition
+        given = self._given("ut") | {"x": x}
+        if self._merged_noise is None:
+            return call(transition, self.model, given | {"q": noise})
+        return call(transition, self.model, given) + noise
+
     def _given(self, names: str) -> dict[str, TensorVariable]:
         return {name: self._symbols[name] for name in ("theta", *names)}
 
@@ -143,6 +188,14 @@ class CompiledSystem:
     ) -> CompiledFunction:
         graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
+
+    def _point_function(
+        self, name: str, outputs: list[TensorVariable], inputs: str, **z
+    ) -> CompiledFunction:
+        graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
+        arguments = "c, inputs, k, t, " + ("Z" if z else "d") + ", X, member"
+        function = VectorFunction(arguments, Graph(graph_inputs, outputs))
+        return vector_functions({name: function})[name]
 
     # Properties
 

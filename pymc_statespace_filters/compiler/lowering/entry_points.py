@@ -6,6 +6,7 @@ from typing import Any
 
 from numba import carray, types
 
+from pymc_statespace_filters.compiler.lowering.guidance import n_gains
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
 
@@ -63,5 +64,29 @@ def _with_addresses(
         points, M = carray(X, (n, n_members)), carray(out, (2, n_members))
         function(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, points, M)
 
-    calls = (prepare, initialise, propagate, observe, log_density, step_moments)
+    size = n_gains(n, m)
+
+    def propagate_guided(c, inputs, k, t, z, width, X, out, n_members):
+        members, Z = carray(X, (n + 1, n_members)), carray(z, (m, width))
+        gains, rows = carray(out, (size,)), carray(inputs, (k + 1, n_inputs))
+        function(carray(c, (n_constants,)), rows, k, t, gains, Z, members)
+
+    def linearized_step(c, inputs, k, t, z, width, X, out, n_members):
+        member, Z, rows = carray(X, (n, 1)), carray(z, (m, 1)), carray(inputs, (k + 1, n_inputs))
+        values = function(carray(c, (n_constants,)), rows, k, t, Z, member, 0)
+        results = carray(out, (n + n * n + n * m,))
+        for i in range(results.size):
+            results[i] = values[i]
+
+    def observation_information(c, inputs, k, t, z, width, X, out, n_members):
+        member, d, rows = carray(X, (n, 1)), carray(z, (p,)), carray(inputs, (k + 1, n_inputs))
+        values = function(carray(c, (n_constants,)), rows, k, t, d, member, 0)
+        results = carray(out, (1 + n + n * n,))
+        for i in range(results.size):
+            results[i] = values[i]
+
+    calls = (
+        prepare, initialise, propagate, observe, log_density, step_moments, propagate_guided,
+        linearized_step, observation_information,
+    )  # fmt: skip
     return {call.__name__: call for call in calls}[name]

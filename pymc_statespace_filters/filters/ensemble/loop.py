@@ -50,7 +50,8 @@ FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
 
 FilterArguments = arguments_class("FilterArguments", FILTER_ARGUMENTS, __name__)
 
-_N_LEADING = 6  # number of members and five of `NoiseSizes`
+N_LEADING = 6
+"""Settings of every filter: the number of members and five of `NoiseSizes`."""
 
 
 class Members(NamedTuple):
@@ -71,25 +72,26 @@ class Members(NamedTuple):
 
 
 @njit_internal
-def _members(n, p, local):
+def new_members(X, p, local):
+    """Members of equal weight with the states X."""
     N = local.size
     log_w = np.empty(N)
     for i in range(N):
         log_w[i] = -math.log(local.n_members)
     return Members(
-        X=np.empty((n, N)), D=np.empty((p, N)), X_f=np.empty((n, N)), w=np.empty(N), log_w=log_w,
+        X=X, D=np.empty((p, N)), X_f=np.empty(X.shape), w=np.empty(N), log_w=log_w,
         log_p=np.empty(N), alive=np.empty(N, np.bool_),
     )  # fmt: skip
 
 
 @inline_always
-def _n_sums(system):
+def n_sums(system):
     """Enough rows of sums for the weights, means and covariances of an update."""
     return 8 + 2 * (system.n + system.p) ** 2
 
 
 @njit_internal
-def _noise(seed, normals, given, steps, local):
+def noise_of_rank(seed, normals, given, steps, local):
     """The normals of this rank: padded to its own width, else of the sizes that the filter gave."""
     sizes = NoiseSizes(local.width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
     n_steps = steps[-1] if steps.size else np.int64(0)
@@ -153,16 +155,17 @@ def ensemble_filter(
         seed, normals, n_normals, callback, integers, reals, rank, n_ranks, exchange,
         terms, health,
     ):  # fmt: skip
-        given = carray(settings, (_N_LEADING + n_settings,))
+        given = carray(settings, (N_LEADING + n_settings,))
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-        n_members, n_sums = int(given[0]), _n_sums(system)
-        local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums)
+        n_members = int(given[0])
+        local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums(system))
         at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
-        noise = _noise(seed, carray(normals, (n_normals,)), given, at, local)
-        work = workspace(system, local, given[_N_LEADING:])
-        resampling = resampler(given[_N_LEADING:], system.n, local)
-        members, width = _members(system.n, system.p, local), local.width
+        noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
+        work = workspace(system, local, given[N_LEADING:])
+        resampling = resampler(given[N_LEADING:], system.n, local)
+        members = new_members(np.empty((system.n, local.size)), system.p, local)
+        width = local.width
         to = (callback, integers, reals)
         state[0], state[1], state[2] = n_members, NONE, -1
         initialise(system, initial_normals(noise), width, members.X)

@@ -87,6 +87,15 @@ def initial_normals(noise):
 
 
 @njit_internal
+def initial_rows(noise):
+    """The normals of the start, a matrix (n, width)."""
+    initial_normals(noise)
+    rows, width = noise.sizes.initial, noise.sizes.width
+    given = noise.stored if noise.stored.size > 0 else noise.buffer
+    return given[: rows * width].reshape(rows, width)
+
+
+@njit_internal
 def process_normals(noise, k):
     """Address of the normals of step k."""
     sizes = noise.sizes

@@ -97,6 +97,15 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
     """
     if not (resampling.always or n_effective < resampling.threshold):
         return False
+    resample(resampling, z, w, X, local)
+    for i in range(log_w.size):
+        log_w[i] = -math.log(local.n_members)
+    return True
+
+
+@njit_internal
+def resample(resampling, z, w, X, local):
+    """Replace the particles by draws in proportion to w."""
     points, ancestors = resampling.points, resampling.ancestors
     if resampling.multinomial:
         multinomial(z, points)
@@ -112,9 +121,6 @@ def resample_if_few(resampling, n_effective, z, log_w, w, X, local):
     else:
         choose_ancestors(w_all, local_points, resampling.cumulative, ancestors)
     copy_ancestors(X_all, ancestors, X)
-    for i in range(log_w.size):
-        log_w[i] = -math.log(local.n_members)
-    return True
 
 
 def smooth_resampling(filter: Any, n_states: int) -> Any:

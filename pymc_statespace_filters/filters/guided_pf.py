@@ -1,0 +1,243 @@
+"""Guided particle filter: particles move towards what the rest of the record says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numba import carray
+
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
+from pymc_statespace_filters.filters.ensemble.callbacks import (
+    ENDED,
+    FORECAST,
+    RESAMPLED,
+    UPDATED,
+    emit,
+)
+from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
+from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
+from pymc_statespace_filters.filters.ensemble.loop import (
+    FILTER_ARGUMENTS,
+    N_LEADING,
+    Members,
+    new_members,
+    noise_of_rank,
+    n_sums,
+)
+from pymc_statespace_filters.filters.ensemble.noise import (
+    initial_rows,
+    process_normals,
+    resampling_normals,
+)
+from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter
+from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import count, local_partition
+from pymc_statespace_filters.filters.ensemble.resampling import resample, resampler
+from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
+from pymc_statespace_filters.filters.outcomes import (
+    NO_FINITE_MEMBER,
+    NONE,
+    ZERO_WEIGHTS,
+    is_missing,
+)
+from pymc_statespace_filters.filters.system_table import (
+    initialise,
+    log_density,
+    propagate_guided,
+    read_system,
+)
+
+
+class _Particles(NamedTuple):
+    """Members, with what guided moves add to them.
+
+    ``log_ratio`` (N,) follows the states in memory: the log density ratios of moves since they were
+    last added to the weights. ``log_det`` (1,) is their common term. ``log_v`` and ``v`` (N,) are
+    the weights times psi.
+    """
+
+    members: Members
+    log_ratio: np.ndarray
+    log_det: np.ndarray
+    log_v: np.ndarray
+    v: np.ndarray
+    start: np.ndarray
+
+
+@njit_internal
+def _particles(n, p, local):
+    rows = np.empty((n + 1, local.size))
+    rows[n] = 0.0
+    members = new_members(rows[:n], p, local)
+    N = local.size
+    return _Particles(
+        members, rows[n], np.zeros(1), np.empty(N), np.empty(N), np.empty((n, local.width))
+    )
+
+
+@njit_internal
+def _start(system, guide, given, particles, local):
+    """Draw the states at step 0 from normals (n, width), shifted by the guide."""
+    n, N = system.n, local.size
+    shifted = particles.start
+    root = guide.start[n:].reshape(n, n)
+    for r in range(n):
+        for i in range(N):
+            value = guide.start[r]
+            for c in range(r, n):
+                value += root[r, c] * given[c, i]
+            shifted[r, i] = value
+            particles.log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
+    particles.log_det[0] = guide.start_log_det[0]
+    initialise(system, shifted.ctypes.data, local.width, particles.members.X)
+
+
+@njit_internal
+def _weigh_moves(particles):
+    """Add the density ratios of the moves to the weights."""
+    log_w, log_ratio = particles.members.log_w, particles.log_ratio
+    for i in range(log_w.size):
+        log_w[i] += log_ratio[i] + particles.log_det[0]
+        log_ratio[i] = 0.0
+    particles.log_det[0] = 0.0
+
+
+@njit_internal
+def _log_psi(guide, j, k, X, out):
+    """Write log psi of every particle after observation j, without its constant."""
+    n, N = X.shape
+    x, lam, Lam = guide.path[k], guide.psi[j, :n], guide.psi[j, n:].reshape(n, n)
+    for i in range(N):
+        out[i] = 0.0
+    for a in range(n):
+        for i in range(N):
+            out[i] += (lam[a] - 0.5 * Lam[a, a] * (X[a, i] - x[a])) * (X[a, i] - x[a])
+        for b in range(a):
+            for i in range(N):
+                out[i] -= Lam[a, b] * (X[a, i] - x[a]) * (X[b, i] - x[b])
+
+
+@njit_internal
+def _update(system, j, k, t, d, particles, local):
+    """Weight the particles by the density of the observation (Eq. 4.28)."""
+    members = particles.members
+    X, log_w, alive = members.X, members.log_w, members.alive
+    mark_finite(X, X, alive)
+    log_density(system, k, t, d, X, members.log_p)
+    for i in range(alive.size):
+        log_w[i] = log_w[i] + members.log_p[i] if alive[i] else -np.inf
+    increment, _ = normalise_weights(log_w, members.w, local)
+    if increment == -np.inf:
+        return increment, NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS
+    return increment, NONE
+
+
+@njit_internal
+def _look_ahead(guide, j, k, particles, local):
+    """Weigh the particles by psi; return the log of the sum of w psi and its effective number."""
+    members, log_v = particles.members, particles.log_v
+    _log_psi(guide, j, k, members.X, log_v)
+    for i in range(log_v.size):
+        log_v[i] = members.log_w[i] + log_v[i] if members.alive[i] else -np.inf
+    return normalise_weights(log_v, particles.v, local)
+
+
+@njit_internal
+def _resample(guide, j, k, log_total, resampling, z, particles, local):
+    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it."""
+    log_w, log_psi = particles.members.log_w, particles.log_v
+    resample(resampling, z, particles.v, particles.members.X, local)
+    _log_psi(guide, j, k, particles.members.X, log_psi)
+    for i in range(log_w.size):
+        log_w[i] = log_total - math.log(local.n_members) - log_psi[i]
+
+
+@njit_internal
+def _move(system, guide, record, k, z, particles, local):
+    """Move the particles from step k to k + 1."""
+    t, gains = record.t0 + k * system.dt, guide.gains[k].ctypes.data
+    propagate_guided(system, k, t, z, local.width, particles.members.X, gains)
+    particles.log_det[0] += guide.log_dets[k]
+
+
+@njit_internal
+def _emit_forecast(callback, j, k, particles, nothing, ancestors):
+    """Show the particles with the weights that their moves have left them."""
+    if callback[0] == 0:
+        return
+    members, log_v = particles.members, particles.log_v
+    for i in range(log_v.size):
+        log_v[i] = members.log_w[i] + particles.log_ratio[i] + particles.log_det[0]
+    shown = Members(
+        X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
+        alive=members.alive,
+    )  # fmt: skip
+    emit(callback, FORECAST, j, k, shown, nothing, ancestors)
+
+
+def _run(
+    table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
+    seed, normals, n_normals, callback, integers, reals, rank, n_ranks, exchange,
+    terms, health,
+):  # fmt: skip
+    given = carray(settings, (N_LEADING + 2,))
+    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
+    n_members = int(given[0])
+    local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums(system))
+    at = carray(steps, (n_observations,))
+    record = Record(at, carray(observed, (n_observations, system.p)), t0)
+    out, state = carray(terms, (n_observations,)), carray(health, (3,))
+    noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
+    resampling = resampler(given[N_LEADING], int(given[N_LEADING + 1]), system.n, local)
+    particles, guide = _particles(system.n, system.p, local), make_guide(system, record)
+    members, to = particles.members, (callback, integers, reals)
+    state[0], state[1], state[2] = n_members, NONE, -1
+    nothing, ancestors = np.empty(0), resampling.ancestors
+    k = np.int64(0)
+    _start(system, guide, initial_rows(noise), particles, local)
+    _emit_forecast(to, -1, k, particles, nothing, ancestors)
+    for j in range(n_observations):
+        while k < at[j]:
+            _move(system, guide, record, k, process_normals(noise, k), particles, local)
+            k += 1
+            _emit_forecast(to, j, k, particles, nothing, ancestors)
+        if is_missing(record.observed, j):
+            out[j] = 0.0
+            continue
+        _weigh_moves(particles)
+        d = record.observed[j]
+        increment, failure = _update(system, j, k, t0 + k * dt, d, particles, local)
+        if failure != NONE:
+            state[0], state[1], state[2] = 0.0, failure, j
+            break
+        out[j] = increment
+        log_total, n_effective = _look_ahead(guide, j, k, particles, local)
+        state[0] = min(state[0], n_effective)
+        emit(to, UPDATED, j, k, members, d, ancestors)
+        if resampling.always or n_effective < resampling.threshold:
+            z = resampling_normals(noise, j, k)
+            _resample(guide, j, k, log_total, resampling, z, particles, local)
+            emit(to, RESAMPLED, j, k, members, nothing, ancestors)
+    if state[1] == NONE:
+        emit(to, ENDED, n_observations, k, members, nothing, ancestors)
+
+
+@dataclass(frozen=True)
+class GuidedPF(ParticleFilter):
+    """Guided particle filter."""
+
+    unbiased: ClassVar[bool] = True
+    entry: ClassVar[EntryPoint] = EntryPoint(
+        _run, FILTER_ARGUMENTS, "guided_pf", digest("guided_pf"), needs=(FILL_NORMALS,)
+    )
+    resample_below: float = 0.5
+
+    def functions(self) -> Sequence[str]:
+        """Return the names of the system's functions that the entry calls."""
+        guide = ("linearized_step", "observation_information", "propagate_guided")
+        return "initialise", "log_density", *guide
