@@ -85,15 +85,16 @@ def _start(system, guide, given, particles, local):
     """Draw the states at step 0 from normals (n, width), shifted by the guide."""
     n, N = system.n, local.size
     shifted = particles.start
-    root = guide.start[n:].reshape(n, n)
+    place = 1 + n + n * n
     for r in range(n):
         for i in range(N):
-            value = guide.start[r]
+            value = guide.start[1 + r]
             for c in range(r, n):
-                value += root[r, c] * given[c, i]
+                value += guide.start[place + c - r] * given[c, i]
             shifted[r, i] = value
             particles.log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
-    particles.log_det[0] = guide.start_log_det[0]
+        place += n - r
+    particles.log_det[0] = guide.start[0]
     initialise(system, shifted.ctypes.data, local.width, particles.members.X)
 
 
@@ -111,15 +112,17 @@ def _weigh_moves(particles):
 def _log_psi(guide, j, k, X, out):
     """Write log psi of every particle after observation j, without its constant."""
     n, N = X.shape
-    x, lam, Lam = guide.path[k], guide.psi[j, :n], guide.psi[j, n:].reshape(n, n)
+    x, psi, place = guide.path[k], guide.psi[j], n
     for i in range(N):
         out[i] = 0.0
     for a in range(n):
-        for i in range(N):
-            out[i] += (lam[a] - 0.5 * Lam[a, a] * (X[a, i] - x[a])) * (X[a, i] - x[a])
         for b in range(a):
             for i in range(N):
-                out[i] -= Lam[a, b] * (X[a, i] - x[a]) * (X[b, i] - x[b])
+                out[i] -= psi[place] * (X[a, i] - x[a]) * (X[b, i] - x[b])
+            place += 1
+        for i in range(N):
+            out[i] += (psi[a] - 0.5 * psi[place] * (X[a, i] - x[a])) * (X[a, i] - x[a])
+        place += 1
 
 
 @njit_internal
@@ -160,9 +163,9 @@ def _resample(guide, j, k, log_total, resampling, z, particles, local):
 @njit_internal
 def _move(system, guide, record, k, z, particles, local):
     """Move the particles from step k to k + 1."""
-    t, gains = record.t0 + k * system.dt, guide.gains[k].ctypes.data
+    t, gains = record.t0 + k * system.dt, guide.gains[k, 1:].ctypes.data
     propagate_guided(system, k, t, z, local.width, particles.members.X, gains)
-    particles.log_det[0] += guide.log_dets[k]
+    particles.log_det[0] += guide.gains[k, 0]
 
 
 @njit_internal
@@ -240,4 +243,5 @@ class GuidedPF(ParticleFilter):
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""
         guide = ("linearized_step", "observation_information", "propagate_guided")
-        return "initialise", "log_density", *guide
+        algebra = ("forecast_cov", "step_back", "start_back")
+        return "initialise", "log_density", *guide, *algebra

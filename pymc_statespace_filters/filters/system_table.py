@@ -43,6 +43,9 @@ class Slots(NamedTuple):
     propagate_guided: int = 15
     linearized_step: int = 16
     observation_information: int = 17
+    forecast_cov: int = 18
+    step_back: int = 19
+    start_back: int = 20
 
 
 TABLE = Slots()
@@ -83,6 +86,9 @@ class TabledSystem(NamedTuple):
     propagate_guided: int
     linearized_step: int
     observation_information: int
+    forecast_cov: int
+    step_back: int
+    start_back: int
 
 
 class SystemTable(NamedTuple):
@@ -104,6 +110,8 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     propagate_guided = symbols.get("propagate_guided", "")
     linearized_step = symbols.get("linearized_step", "")
     information = symbols.get("observation_information", "")
+    forecast_cov, step_back = symbols.get("forecast_cov", ""), symbols.get("step_back", "")
+    start_back = symbols.get("start_back", "")
     constants = np.zeros(N_SLOTS + system.free.size, dtype=np.int64)
     constants[TABLE.n], constants[TABLE.m], constants[TABLE.p] = system.n, system.m, system.p
     constants[TABLE.has_gaussian_observation] = system.gaussian_observation
@@ -124,6 +132,9 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
         table[TABLE.propagate_guided] = address_of(propagate_guided)
         table[TABLE.linearized_step] = address_of(linearized_step)
         table[TABLE.observation_information] = address_of(information)
+        table[TABLE.forecast_cov] = address_of(forecast_cov)
+        table[TABLE.step_back] = address_of(step_back)
+        table[TABLE.start_back] = address_of(start_back)
         return table
 
     keys = [entry.key for entry in used.values()]
@@ -148,6 +159,8 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
         propagate_guided=slots[TABLE.propagate_guided],
         linearized_step=slots[TABLE.linearized_step],
         observation_information=slots[TABLE.observation_information],
+        forecast_cov=slots[TABLE.forecast_cov], step_back=slots[TABLE.step_back],
+        start_back=slots[TABLE.start_back],
     )  # fmt: skip
 
 
@@ -191,9 +204,9 @@ def propagate_guided(system, k, t, z, width, X, gains):
 
 
 @njit_internal
-def linearized_step(system, k, t, z, x, out):
-    """Write the next state of a point x (n, 1) with noise z (m,), and its Jacobians A and B."""
-    _call(system.linearized_step, system, k, t, z, NULL, x, out)
+def linearized_step(system, k, t, gains, x, out):
+    """Write the linearised step of a point x (n, 1) by the mean noise of these gains."""
+    _call(system.linearized_step, system, k, t, gains, NULL, x, out)
 
 
 @njit_internal

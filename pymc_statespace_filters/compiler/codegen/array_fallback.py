@@ -22,12 +22,10 @@ from pymc_statespace_filters.compiler.codegen.source import SCALAR_NAMESPACE
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.errors import LoweringError
 
-# The code that reads a whole input.
+# The code that reads a whole input, if not its name.
 _WHOLE = {
-    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "d": "d", "x": "X[:, member].copy()",
-    "z": "Z[:{n}, member].copy()", "s": "s", "s_bar": "s_bar", "c_bar": "c_bar",
-    "term_bar": "np.asarray(term_bar)",
-    "tape": "tape[row]",
+    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "x": "X[:, member].copy()",
+    "z": "Z[:{n}, member].copy()", "term_bar": "np.asarray(term_bar)", "tape": "tape[row]",
 }  # fmt: skip
 
 
@@ -93,7 +91,7 @@ def _build(
 
 def _whole(inputs: Mapping[str, Variable]) -> str:
     sizes = {n: (v.type.shape[0] if v.type.ndim else 1) for n, v in inputs.items()}
-    return ", ".join(_WHOLE[name].format(n=n) for name, n in sizes.items())
+    return ", ".join(_WHOLE.get(name, name).format(n=n) for name, n in sizes.items())
 
 
 def _used(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[str, Variable]:

@@ -41,12 +41,10 @@ MAX_OUTPUT_ELEMENTS = 200
 MAX_ROWS_COMPARED = 8
 BLOCK = 64
 
-# The code that reads element i of an input; members are columns.
+# The code that reads element i of an input, if not that of a vector; members are columns.
 _ELEMENT = {
-    "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "d": "d[{i}]", "x": "X[{i}, member]",
-    "z": "Z[{i}, member]", "s": "s[{i}]", "s_bar": "s_bar[{i}]", "c_bar": "c_bar[{i}]",
-    "term_bar": "term_bar",
-    "tape": "tape[row, {i}]",
+    "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "x": "X[{i}, member]",
+    "z": "Z[{i}, member]", "term_bar": "term_bar", "tape": "tape[row, {i}]",
 }  # fmt: skip
 
 
@@ -71,7 +69,7 @@ def _input_elements(arena: Arena, name: str, variable: Variable) -> np.ndarray:
 
 def _element_code(graph: Graph) -> dict[str, str]:
     return {
-        f"{name}.{i}": _ELEMENT[name].format(i=i)
+        f"{name}.{i}": _ELEMENT.get(name, name + "[{i}]").format(i=i)
         for name, variable in graph.inputs.items()
         for i in range(variable.type.shape[0] if variable.type.ndim else 1)
     }

@@ -4,6 +4,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
@@ -19,10 +20,12 @@ from pymc_statespace_filters.compiler.lowering.covariances import (
 )
 from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
 from pymc_statespace_filters.compiler.lowering.guidance import (
+    forecast_cov,
     guided_noise,
     linearize_step,
     n_gains,
     observation_information,
+    step_back,
 )
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -49,12 +52,14 @@ class CompiledSystem:
     * ``observe(c, inputs, k, t, Z, X, D)`` simulates observations D (p, N), where the user wrote an
       observation function.
     * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
-    * ``propagate_guided(c, inputs, k, t, s, Z, X)`` moves every member by noise that depends on its
-      state, see `guided_noise`; X has one row more, to which the log of the density ratio is added.
-    * ``linearized_step(c, inputs, k, t, Z, X, member)`` returns one member's next state and its
-      Jacobians, see `linearize_step`.
+    * ``propagate_guided(c, inputs, k, t, gains, Z, X)`` moves every member by noise that depends on
+      its state, see `guided_noise`; X has one row more, to which log density ratios are added.
+    * ``linearized_step(c, inputs, k, t, gains, X, member)`` returns one member's next state and its
+      Jacobians at the mean of this noise, see `linearize_step`.
     * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
       its information.
+    * ``forecast_cov(step, cov)``, ``step_back(step, path, psi)`` and ``start_back`` are the algebra
+      of a guide in these numbers of states and noises, see `guidance`.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
 
@@ -124,26 +129,44 @@ class CompiledSystem:
         """Move every member one step by guided noise, in place, and weigh its move."""
         n, m, z = self.n, self.m, _normals(self.m)
         member = pt.tensor("x", shape=(n + 1,), dtype="float64")
-        gains = pt.tensor("s", shape=(n_gains(n, m),), dtype="float64")
+        gains = pt.tensor("gains", shape=(n_gains(n, m),), dtype="float64")
         noise, log_ratio = guided_noise(gains, member[:n], z)
         moved = pt.concatenate([self._step(member[:n], noise), [member[n] + log_ratio]])
         inputs = {"theta": self._c, "u": self._symbols["u"], "t": self._symbols["t"]}
-        graph = Graph(inputs | {"x": member, "z": z, "s": gains}, [moved])
-        arguments = "c, inputs, k, t, s, Z, X"
+        graph = Graph(inputs | {"x": member, "z": z, "gains": gains}, [moved])
+        arguments = "c, inputs, k, t, gains, Z, X"
         return member_function("propagate_guided", arguments, graph, "X[{i}, member]")
 
     @cached_property
     def linearized_step(self) -> CompiledFunction:
-        """The next state and its Jacobians, at one member and its noise."""
-        z, x = _normals(self.m), self._symbols["x"]
+        """The next state and its Jacobians, at one state and noise that gains shift."""
+        x, z, size = self._symbols["x"], _normals(self.m), n_gains(self.n, self.m)
+        gains = pt.tensor("gains", shape=(size,), dtype="float64")
+        noise, _ = guided_noise(gains, x, pt.zeros(self.m))
         linearized = linearize_step(self._step(x, z), x, z, self.free)
-        return self._point_function("linearized_step", [linearized], "xut", z=z)
+        (at_noise,) = graph_replace([linearized], {z: noise}, strict=False)
+        return self._point_function("linearized_step", at_noise, "xut", gains=gains)
 
     @cached_property
     def observation_information(self) -> CompiledFunction:
-        """log p(d | x), its score and its information, at one member."""
+        """log p(d | x), its score and its information, at one state."""
         information = observation_information(self.model, self._given("xutd"), self.free)
-        return self._point_function("observation_information", [information], "xutd")
+        return self._point_function("observation_information", information, "xutd")
+
+    @cached_property
+    def forecast_cov(self) -> CompiledFunction:
+        """Covariance of the next state."""
+        return _vector_function("forecast_cov", "step, cov", forecast_cov(self.n, self.m))
+
+    @cached_property
+    def step_back(self) -> CompiledFunction:
+        """A step of the recursion of a guide."""
+        return _vector_function("step_back", "step, path, psi", step_back(self.n, self.m))
+
+    @cached_property
+    def start_back(self) -> CompiledFunction:
+        """The same for the normals of the state at step 0."""
+        return _vector_function("start_back", "step, path, psi", step_back(self.n, self.n))
 
     @cached_property
     def observe(self) -> CompiledFunction:
@@ -190,12 +213,13 @@ class CompiledSystem:
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 
     def _point_function(
-        self, name: str, outputs: list[TensorVariable], inputs: str, **z
+        self, name: str, output: TensorVariable, inputs: str, **given: TensorVariable
     ) -> CompiledFunction:
-        graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
-        arguments = "c, inputs, k, t, " + ("Z" if z else "d") + ", X, member"
-        function = VectorFunction(arguments, Graph(graph_inputs, outputs))
-        return vector_functions({name: function})[name]
+        graph = Graph(
+            {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **given}, [output]
+        )
+        arguments = "c, inputs, k, t, " + ("gains" if given else "d") + ", X, member"
+        return _vector_function(name, arguments, graph)
 
     # Properties
 
@@ -231,6 +255,10 @@ class CompiledSystem:
     def has_exact_observation_density(self) -> bool:
         """Whether `log_density` is exact; noise that is not additive enters by linearization."""
         return self.additive_noise or not self.gaussian_observation
+
+
+def _vector_function(name: str, arguments: str, graph: Graph) -> CompiledFunction:
+    return vector_functions({name: VectorFunction(arguments, graph)})[name]
 
 
 def _normals(size: int) -> TensorVariable:

@@ -6,7 +6,7 @@ from typing import Any
 
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.lowering.guidance import n_gains
+from pymc_statespace_filters.compiler.lowering.guidance import n_gains, step_size
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
 
@@ -22,9 +22,23 @@ MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
 PREPARE_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "c": F64_PTR}
 
 
+GUIDE_ARGUMENTS = {
+    "forecast_cov": {"step": F64_PTR, "cov": F64_PTR},
+    "step_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
+    "start_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
+}
+"""Arguments of the functions of a guide; ``cov`` and ``psi`` are replaced by their new values."""
+
+
 @lru_cache(maxsize=2048)
 def entry_point(system: Any, name: str) -> EntryPoint:
     """A function of a compiled system by its name, not compiled yet."""
+    if name in GUIDE_ARGUMENTS:
+        function = getattr(system, name)
+        m = system.n if name == "start_back" else system.m
+        key = key_of(repr((name, system.n, m)), function.key)
+        of_addresses = _of_guide(function.function, name, system.n, m)
+        return EntryPoint(of_addresses, GUIDE_ARGUMENTS[name], name, key)
     sizes = (system.n, system.m, system.p, system.r, system.n_inputs, system.n_constants)
     function = getattr(system, name)
     arguments = PREPARE_ARGUMENTS if name == "prepare" else MEMBER_ARGUMENTS
@@ -64,7 +78,7 @@ def _with_addresses(
         points, M = carray(X, (n, n_members)), carray(out, (2, n_members))
         function(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, points, M)
 
-    size = n_gains(n, m)
+    size, n_step, n_information = n_gains(n, m), step_size(n, m), 1 + n + n * n
 
     def propagate_guided(c, inputs, k, t, z, width, X, out, n_members):
         members, Z = carray(X, (n + 1, n_members)), carray(z, (m, width))
@@ -72,17 +86,18 @@ def _with_addresses(
         function(carray(c, (n_constants,)), rows, k, t, gains, Z, members)
 
     def linearized_step(c, inputs, k, t, z, width, X, out, n_members):
-        member, Z, rows = carray(X, (n, 1)), carray(z, (m, 1)), carray(inputs, (k + 1, n_inputs))
-        values = function(carray(c, (n_constants,)), rows, k, t, Z, member, 0)
-        results = carray(out, (n + n * n + n * m,))
-        for i in range(results.size):
+        member, gains = carray(X, (n, 1)), carray(z, (size,))
+        constants, rows = carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs))
+        values = function(constants, rows, k, t, gains, member, 0)
+        results = carray(out, (n_step,))
+        for i in range(n_step):
             results[i] = values[i]
 
     def observation_information(c, inputs, k, t, z, width, X, out, n_members):
         member, d, rows = carray(X, (n, 1)), carray(z, (p,)), carray(inputs, (k + 1, n_inputs))
         values = function(carray(c, (n_constants,)), rows, k, t, d, member, 0)
-        results = carray(out, (1 + n + n * n,))
-        for i in range(results.size):
+        results = carray(out, (n_information,))
+        for i in range(n_information):
             results[i] = values[i]
 
     calls = (
@@ -90,3 +105,25 @@ def _with_addresses(
         linearized_step, observation_information,
     )  # fmt: skip
     return {call.__name__: call for call in calls}[name]
+
+
+def _of_guide(function: Any, name: str, n: int, m: int) -> Callable:
+    """A function of the algebra of a guide."""
+    n_step, n_cov = step_size(n, m), n * (n + 1) // 2
+    n_psi, n_out = n + n_cov, 1 + n_gains(n, m)
+
+    def forecast_cov(step, cov):
+        P = carray(cov, (n_cov,))
+        values = function(carray(step, (n_step,)), P)
+        for i in range(n_cov):
+            P[i] = values[i]
+
+    def step_back(step, path, psi, out):
+        ahead, gains = carray(psi, (n_psi,)), carray(out, (n_out,))
+        values = function(carray(step, (n_step,)), carray(path, (2 * n,)), ahead)
+        for i in range(n_psi):
+            ahead[i] = values[i]
+        for i in range(n_out):
+            gains[i] = values[n_psi + i]
+
+    return forecast_cov if name == "forecast_cov" else step_back

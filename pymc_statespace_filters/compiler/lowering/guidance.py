@@ -8,6 +8,7 @@ import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.lowering.gaussian import (
     log_normal,
     observation_log_density,
@@ -43,7 +44,7 @@ def guided_noise(
 def linearize_step(
     step: TensorVariable, x: TensorVariable, z: TensorVariable, free: np.ndarray
 ) -> TensorVariable:
-    """The next state, then the rows of its Jacobians A with respect to x and B to z.
+    """The next state, the rows of its Jacobians A with respect to x and B to z, and z.
 
     States that are not free are taken as known: their rows and columns are zero.
     """
@@ -51,7 +52,66 @@ def linearize_step(
     is_free[free] = 1.0
     A = jacobian_of(step, x) * np.outer(is_free, is_free)
     B = jacobian_of(step, z) * is_free[:, None]
-    return pt.concatenate([step, A.ravel(), B.ravel()])
+    return pt.concatenate([step, A.ravel(), B.ravel(), z])
+
+
+def step_size(n: int, m: int) -> int:
+    """Length of a linearised step."""
+    return n + n * n + n * m + m
+
+
+def forecast_cov(n: int, m: int) -> Graph:
+    """A P A^T + B B^T from a linearised step and the lower triangle of P."""
+    step, cov = _vector("step", step_size(n, m)), _vector("cov", n * (n + 1) // 2)
+    _, A, B, _ = _parts(step, n, m)
+    forecast = A @ _symmetric(cov, n) @ A.T + B @ B.T
+    return Graph({"step": step, "cov": cov}, [forecast[np.tril_indices(n)]])
+
+
+def step_back(n: int, m: int) -> Graph:
+    """Condition the noise of a step on what is ahead, and move psi back over the step.
+
+    Inputs are a linearised step, the reference ``path`` (2 n) before and after it, and ``psi``:
+    score, then the lower triangle of the information, at the reference after it. The output is
+    psi before the step, then log det R, then the gains of `guided_noise`.
+
+    With the closed loop F = A - B K the information is F^T Lam F + K^T K, which rounding cannot
+    make negative.
+    """
+    step, path = _vector("step", step_size(n, m)), _vector("path", 2 * n)
+    psi = _vector("psi", n + n * (n + 1) // 2)
+    after, A, B, q = _parts(step, n, m)
+    score, Lam = psi[:n], _symmetric(psi[n:], n)
+    slope = score - Lam @ (after - path[n:] - B @ q)
+    weighted = B.T @ Lam
+    root = cholesky(pt.eye(m) + weighted @ B, lower=True)
+    R = solve_triangular(root.T, np.eye(m), lower=False, b_ndim=2)
+    K = R @ (R.T @ (weighted @ A))
+    mean = R @ (R.T @ (B.T @ slope))
+    F = A - B @ K
+    information = F.T @ Lam @ F + K.T @ K
+    before = [F.T @ slope, information[np.tril_indices(n)]]
+    log_det = -pt.sum(pt.log(pt.diagonal(root)))
+    gains = [mean + K @ path[:n], K.ravel(), R[np.triu_indices(m)]]
+    return Graph(
+        {"step": step, "path": path, "psi": psi}, [pt.concatenate([*before, [log_det], *gains])]
+    )
+
+
+def _vector(name: str, size: int) -> TensorVariable:
+    return pt.tensor(name, shape=(size,), dtype="float64")
+
+
+def _parts(step: TensorVariable, n: int, m: int) -> tuple[TensorVariable, ...]:
+    """The next state, A, B and z of a linearised step."""
+    first, last = n + n * n, n + n * n + n * m
+    return step[:n], step[n:first].reshape((n, n)), step[first:last].reshape((n, m)), step[last:]
+
+
+def _symmetric(triangle: TensorVariable, n: int) -> TensorVariable:
+    position = np.zeros((n, n), dtype="int64")
+    position[np.tril_indices(n)] = np.arange(n * (n + 1) // 2)
+    return triangle[np.maximum(position, position.T)]
 
 
 def observation_information(

@@ -19,20 +19,13 @@ time; residual bridges, Whitaker, Golightly, Boys and Sherlock (2017); Gauss-New
 (1994).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.compiler.numerics.small_cholesky import (
-    cholesky,
-    solve_lower,
-    solve_lower_transposed,
-)
 from pymc_statespace_filters.filters.ensemble.information import (
-    Information,
-    UpdateWork,
     information_at,
     new_information,
     newton_update,
@@ -55,72 +48,45 @@ class Record(NamedTuple):
 class Guide(NamedTuple):
     """The guide along a record of T steps and J observations, n states and m noises.
 
-    ``path`` (T + 1, n) and ``noise`` (T, m) are the reference; ``steps`` (T, n + n^2 + n m) its
-    linearised steps. ``gains`` (T, ..) shift the noise of a step, see `lowering.guidance`, and
-    ``log_dets`` (T,) are log det R. ``start`` (n + n^2) is the mean and the root of the normals at
-    step 0, and ``start_log_det`` (1,) its log-determinant. ``psi`` (J, n + n^2) is lam, then Lam,
-    of log psi at an observation, without the observation itself.
+    ``path`` (T + 1, n) is the reference, ``steps`` (T, ..) its linearised steps. A row of ``gains``
+    (T, ..) is log det R of a step and what shifts its noise, ``start`` the same for the normals at
+    step 0, of which there are n. ``psi`` (J, n + n (n + 1) / 2) is log psi at an observation, lam
+    and the lower triangle of Lam, without the observation itself. See `lowering.guidance`.
     """
 
     path: np.ndarray
-    noise: np.ndarray
     steps: np.ndarray
     gains: np.ndarray
-    log_dets: np.ndarray
     start: np.ndarray
-    start_log_det: np.ndarray
     psi: np.ndarray
-
-
-class _Work(NamedTuple):
-    """Vectors and matrices of one step.
-
-    ``ahead`` is the score and information of later observations, ``here`` that of one. ``shift`` is
-    the next state at the old reference and no noise, ``slope`` the score there. Row a of ``gain``
-    is column a of K, ``root`` the lower factor of R^-T R^-1, row r of ``spread`` that of R.
-    """
-
-    P: np.ndarray
-    product: np.ndarray
-    shift: np.ndarray
-    slope: np.ndarray
-    weighted: np.ndarray
-    mean: np.ndarray
-    root: np.ndarray
-    spread: np.ndarray
-    gain: np.ndarray
-    ahead: Information
-    here: Information
-    update: UpdateWork
-
-
-@njit_internal
-def _work(n, m):
-    size = max(n, m)
-    return _Work(
-        P=np.empty((n, n)), product=np.empty((n, n)), shift=np.empty(n), slope=np.empty(n),
-        weighted=np.empty((size, n)), mean=np.empty(size), root=np.empty((size, size)),
-        spread=np.empty((size, size)), gain=np.empty((n, size)), ahead=new_information(n),
-        here=new_information(n), update=update_work(n),
-    )  # fmt: skip
 
 
 @njit_internal
 def make_guide(system, record):
-    """Compute the guide of a record."""
+    """Compute the guide of a record; one that changes nothing if the equations cannot be followed.
+
+    Where they cannot be followed along the iterated path, the first one is taken.
+    """
     n, m, J = system.n, system.m, record.steps.size
-    T = record.steps[-1] if J else np.int64(0)
+    T, n_psi = record.steps[-1] if J else np.int64(0), n + n * (n + 1) // 2
     guide = Guide(
-        path=np.zeros((T + 1, n)), noise=np.zeros((T, m)), steps=np.zeros((T, n + n * n + n * m)),
-        gains=np.zeros((T, m + m * n + m * (m + 1) // 2)), log_dets=np.zeros(T),
-        start=np.zeros(n + n * n), start_log_det=np.zeros(1), psi=np.zeros((J, n + n * n)),
+        path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m)),
+        gains=np.zeros((T, 1 + m + m * n + m * (m + 1) // 2)),
+        start=np.zeros(1 + n + n * n + n * (n + 1) // 2), psi=np.zeros((J, n_psi)),
     )  # fmt: skip
-    work = _work(n, m)
-    _filter(system, record, guide, work)
-    _look_back(system, record, guide, work)
-    for _ in range(_N_ITERATIONS):
-        _follow(system, record, guide)
-        _look_back(system, record, guide, work)
+    for n_iterations in (_N_ITERATIONS, 0):
+        _filter(system, record, guide)
+        _look_back(system, record, guide)
+        for _ in range(n_iterations):
+            _follow(system, record, guide)
+            _look_back(system, record, guide)
+        if np.isfinite(guide.path).all():
+            return guide
+    guide.path[:] = 0.0
+    guide.psi[:] = 0.0
+    for k in range(T):
+        _leave_unguided(guide.gains[k], n, m)
+    _leave_unguided(guide.start, n, n)
     return guide
 
 
@@ -133,238 +99,99 @@ def _initial(system):
 
 
 @njit_internal
-def _linearize(system, record, guide, k):
-    """Linearise step k at the path and the noise, and move the path to the next state."""
-    x, z, row = guide.path[k], guide.noise[k], guide.steps[k]
-    point = x.reshape(x.size, 1)
-    linearized_step(system, k, record.t0 + k * system.dt, z.ctypes.data, point, row.ctypes.data)
-    copy_into(guide.path[k + 1], row[: x.size])
+def _move_path(system, record, guide, k):
+    """Linearise step k at the path, with the mean noise of its gains, and move the path there."""
+    x, gains, step = guide.path[k], guide.gains[k, 1:], guide.steps[k]
+    point, t = x.reshape(x.size, 1), record.t0 + k * system.dt
+    linearized_step(system, k, t, gains.ctypes.data, point, step.ctypes.data)
+    copy_into(guide.path[k + 1], step[: x.size])
 
 
 @njit_internal
-def _jacobians(guide, k, n, m):
-    row = guide.steps[k]
-    return row[n : n + n * n].reshape(n, n), row[n + n * n :].reshape(n, m)
-
-
-@njit_internal
-def _filter(system, record, guide, work):
+def _filter(system, record, guide):
     """Take as path the means of an extended Kalman filter with iterated updates."""
+    n = system.n
     mean, root = _initial(system)
-    P = work.P
+    cov, update, here = np.empty(n * (n + 1) // 2), update_work(n), new_information(n)
+    guide.gains[:] = 0.0
     copy_into(guide.path[0], mean)
-    _add_outer(root, P, 0.0)
+    place = 0
+    for a in range(n):
+        for b in range(a + 1):
+            cov[place] = 0.0
+            for c in range(n):
+                cov[place] += root[a, c] * root[b, c]
+            place += 1
     k = np.int64(0)
     for j in range(record.steps.size):
         while k < record.steps[j]:
-            _linearize(system, record, guide, k)
-            A, B = _jacobians(guide, k, system.n, system.m)
-            _congruence(A, P, work.product)
-            _add_outer(B, P, 1.0)
+            _move_path(system, record, guide, k)
+            call_address(system.forecast_cov, (guide.steps[k], cov))
             k += 1
         if not is_missing(record.observed, j):
-            newton_update(system, record, j, guide.path[k], P, work.update, work.here)
-
-
-@njit_internal
-def _add_outer(B, P, keep):
-    """Set P to keep P + B B^T."""
-    for a in range(B.shape[0]):
-        for b in range(a + 1):
-            value = keep * P[a, b] if keep else 0.0
-            for r in range(B.shape[1]):
-                value += B[a, r] * B[b, r]
-            P[a, b] = P[b, a] = value
-
-
-@njit_internal
-def _congruence(A, P, product):
-    """Set the symmetric P to A P A^T."""
-    n = P.shape[0]
-    for a in range(n):
-        for b in range(n):
-            product[a, b] = 0.0
-            for c in range(n):
-                product[a, b] += A[a, c] * P[c, b]
-    for a in range(n):
-        for b in range(a + 1):
-            value = 0.0
-            for c in range(n):
-                value += product[a, c] * A[b, c]
-            P[a, b] = P[b, a] = value
+            newton_update(system, record, j, guide.path[k], cov, update, here)
 
 
 @njit_internal
 def _follow(system, record, guide):
     """Replace the path by the one along which the guide's mean noise leads."""
-    n, m = system.n, system.m
+    n = system.n
     mean, root = _initial(system)
     x = guide.path[0]
     for a in range(n):
         x[a] = mean[a]
         for b in range(n):
-            x[a] += root[a, b] * guide.start[b]
-    for k in range(guide.noise.shape[0]):
-        gains, x = guide.gains[k], guide.path[k]
-        for r in range(m):
-            q = gains[r]
-            for a in range(n):
-                q -= gains[m + r * n + a] * x[a]
-            guide.noise[k, r] = q
-        _linearize(system, record, guide, np.int64(k))
+            x[a] += root[a, b] * guide.start[1 + b]
+    for k in range(guide.steps.shape[0]):
+        _move_path(system, record, guide, np.int64(k))
 
 
 @njit_internal
-def _look_back(system, record, guide, work):
+def _look_back(system, record, guide):
     """Compute psi, the gains and the start from the end of the record back to step 0."""
-    n, ahead = system.n, work.ahead
-    ahead.score[:] = 0.0
-    ahead.matrix[:] = 0.0
+    n, m, T = system.n, system.m, guide.steps.shape[0]
+    psi, here = np.zeros(n + n * (n + 1) // 2), new_information(n)
     j = record.steps.size - 1
-    for k in range(guide.noise.shape[0], -1, -1):
-        if k < guide.noise.shape[0]:
-            _step_back(system, guide, k, work)
+    for k in range(T, -1, -1):
+        if k < T:
+            call_address(
+                system.step_back, (guide.steps[k], guide.path[k], psi, guide.gains[k])
+            )
+            if not np.isfinite(guide.gains[k, 0]):
+                psi[:] = 0.0
+                _leave_unguided(guide.gains[k], n, m)
         if j >= 0 and record.steps[j] == k:
-            copy_into(guide.psi[j, :n], ahead.score)
-            copy_into(guide.psi[j, n:], ahead.matrix.reshape(n * n))
-            _observe(system, record, j, guide.path[k], work)
+            copy_into(guide.psi[j], psi)
+            if not is_missing(record.observed, j):
+                _add_observation(system, record, j, guide.path[k], here, psi)
             j -= 1
-    _guide_start(system, guide, work)
-
-
-@njit_internal
-def _observe(system, record, j, x, work):
-    """Add the information of an observation."""
-    ahead, here = work.ahead, work.here
-    if is_missing(record.observed, j) or not information_at(system, record, j, x, here):
-        return
-    for a in range(x.size):
-        ahead.score[a] += here.score[a]
-        for b in range(x.size):
-            ahead.matrix[a, b] += here.matrix[a, b]
-
-
-@njit_internal
-def _step_back(system, guide, k, work):
-    """Condition the noise of step k on what is ahead, and move psi from step k + 1 to k."""
-    n, m = system.n, system.m
-    A, B = _jacobians(guide, k, n, m)
-    for a in range(n):
-        work.shift[a] = guide.steps[k, a] - guide.path[k + 1, a]
-        for r in range(m):
-            work.shift[a] -= B[a, r] * guide.noise[k, r]
-    guide.log_dets[k] = _condition(B, work)
-    for a in range(n):
-        column = work.gain[a, :m]
-        for r in range(m):
-            column[r] = 0.0
-            for b in range(n):
-                column[r] += work.weighted[r, b] * A[b, a]
-        solve_lower(work.root[:m, :m], column)
-        solve_lower_transposed(work.root[:m, :m], column)
-    _store_gains(guide.gains[k], guide.path[k], m, work)
-    _pull_back(A, B, work)
-
-
-@njit_internal
-def _condition(B, work):
-    """Mean and root of noise that moves the next state by B; return log det R.
-
-    Its precision is I + B^T Lam B, so the factorisation cannot fail unless psi is not finite; what
-    is ahead is then forgotten.
-    """
-    n, m = B.shape
-    ahead, H = work.ahead, work.root[:m, :m]
-    for a in range(n):
-        work.slope[a] = ahead.score[a]
-        for b in range(n):
-            work.slope[a] -= ahead.matrix[a, b] * work.shift[b]
-    for r in range(m):
-        work.mean[r] = 0.0
-        for a in range(n):
-            work.mean[r] += B[a, r] * work.slope[a]
-            work.weighted[r, a] = 0.0
-            for b in range(n):
-                work.weighted[r, a] += B[b, r] * ahead.matrix[b, a]
-    for r in range(m):
-        for c in range(m):
-            H[r, c] = 1.0 if r == c else 0.0
-            for a in range(n):
-                H[r, c] += work.weighted[r, a] * B[a, c]
-    if not (np.isfinite(work.mean[:m]).all() and cholesky(H)):
-        ahead.score[:] = 0.0
-        ahead.matrix[:] = 0.0
-        work.slope[:] = 0.0
-        work.weighted[:] = 0.0
-        work.mean[:] = 0.0
-        for r in range(m):
-            for c in range(m):
-                H[r, c] = 1.0 if r == c else 0.0
-    solve_lower(H, work.mean[:m])
-    solve_lower_transposed(H, work.mean[:m])
-    log_det = 0.0
-    for r in range(m):
-        for c in range(m):
-            work.spread[r, c] = 1.0 if r == c else 0.0
-        solve_lower(H, work.spread[r, :m])
-        log_det -= math.log(H[r, r])
-    return log_det
-
-
-@njit_internal
-def _store_gains(gains, x, m, work):
-    """Write a, K and the upper triangle of R."""
-    n = x.size
-    place = m + m * n
-    for r in range(m):
-        gains[r] = work.mean[r]
-        for a in range(n):
-            gains[r] += work.gain[a, r] * x[a]
-            gains[m + r * n + a] = work.gain[a, r]
-        for c in range(r, m):
-            gains[place] = work.spread[r, c]
-            place += 1
-
-
-@njit_internal
-def _pull_back(A, B, work):
-    """Move psi over a step, in a form whose information cannot become negative.
-
-    With the closed loop F = A - B K: lam = F^T l and Lam = F^T Lam' F + K^T K.
-    """
-    n, m = B.shape
-    ahead, F, product = work.ahead, work.P, work.product
-    for a in range(n):
-        for b in range(n):
-            F[a, b] = A[a, b]
-            for r in range(m):
-                F[a, b] -= B[a, r] * work.gain[b, r]
-    for a in range(n):
-        ahead.score[a] = 0.0
-        for b in range(n):
-            ahead.score[a] += F[b, a] * work.slope[b]
-            product[a, b] = 0.0
-            for c in range(n):
-                product[a, b] += ahead.matrix[a, c] * F[c, b]
-    for a in range(n):
-        for b in range(a + 1):
-            value = 0.0
-            for c in range(n):
-                value += F[c, a] * product[c, b]
-            for r in range(m):
-                value += work.gain[a, r] * work.gain[b, r]
-            ahead.matrix[a, b] = ahead.matrix[b, a] = value
-
-
-@njit_internal
-def _guide_start(system, guide, work):
-    """Condition the normals of the state at step 0."""
-    n = system.n
     mean, root = _initial(system)
-    for a in range(n):
-        work.shift[a] = mean[a] - guide.path[0, a]
-    guide.start_log_det[0] = _condition(root, work)
-    for r in range(n):
-        guide.start[r] = work.mean[r]
-        for c in range(n):
-            guide.start[n + r * n + c] = work.spread[r, c] if c >= r else 0.0
+    first, path = np.zeros(n + 2 * n * n + n), np.zeros(2 * n)
+    copy_into(first[:n], mean)
+    copy_into(first[n + n * n : n + 2 * n * n], root.reshape(n * n))
+    copy_into(path[n:], guide.path[0])
+    call_address(system.start_back, (first, path, psi, guide.start))
+    if not np.isfinite(guide.start[0]):
+        _leave_unguided(guide.start, n, n)
+
+
+@njit_internal
+def _add_observation(system, record, j, x, here, psi):
+    """Add the information of an observation to psi."""
+    if information_at(system, record, j, x, here):
+        place = n = x.size
+        for a in range(n):
+            psi[a] += here.score[a]
+            for b in range(a + 1):
+                psi[place] += here.matrix[a, b]
+                place += 1
+
+
+@njit_internal
+def _leave_unguided(gains, n, m):
+    """Gains of noise that is not shifted."""
+    gains[:] = 0.0
+    place = 1 + m + m * n
+    for r in range(m):
+        gains[place] = 1.0
+        place += m - r

@@ -101,6 +101,7 @@ class UpdateWork(NamedTuple):
     target: np.ndarray
     trial: np.ndarray
     matrix: np.ndarray
+    cov: np.ndarray
     new_cov: np.ndarray
 
 
@@ -108,19 +109,25 @@ class UpdateWork(NamedTuple):
 def update_work(n):
     """Room for updates of n states."""
     return UpdateWork(
-        np.empty(n), np.empty(n), np.empty((1, n)), np.empty(n), np.empty((n, n)), np.empty((n, n))
-    )
+        mean=np.empty(n), coordinates=np.empty(n), target=np.empty((1, n)), trial=np.empty(n),
+        matrix=np.empty((n, n)), cov=np.empty((n, n)), new_cov=np.empty((n, n)),
+    )  # fmt: skip
 
 
 @njit_internal
-def newton_update(system, record, j, x, P, work, here):
-    """Move the mean x to the mode given observation j, by Newton's method, and update P.
+def newton_update(system, record, j, x, cov, work, here):
+    """Move the mean x to the mode given observation j, by Newton's method, and update ``cov``.
 
     The iteration is in s with x = mean + P s, so that P may be singular. A step that does not
     raise the density is halved. If the observation has no finite density at the mean, nothing is
     updated.
     """
-    n, s, target = x.size, work.coordinates, work.target
+    n, s, target, P = x.size, work.coordinates, work.target, work.cov
+    place = 0
+    for a in range(n):
+        for b in range(a + 1):
+            P[a, b] = P[b, a] = cov[place]
+            place += 1
     copy_into(work.mean, x)
     s[:] = 0.0
     if not information_at(system, record, j, x, here):
@@ -143,7 +150,7 @@ def newton_update(system, record, j, x, P, work, here):
         copy_into(s, work.trial)
         if last - cost < _CONVERGED:
             break
-    _update_cov(P, work, here)
+    _update_cov(cov, work, here)
 
 
 @njit_internal
@@ -174,9 +181,10 @@ def _cost_at(system, record, j, x, P, work, here):
 
 
 @njit_internal
-def _update_cov(P, work, here):
-    """Set P to (I + P Lam)^-1 P."""
-    n, new = P.shape[0], work.new_cov
+def _update_cov(cov, work, here):
+    """Set the lower triangle ``cov`` to that of (I + P Lam)^-1 P."""
+    P, new = work.cov, work.new_cov
+    n, place = P.shape[0], 0
     for a in range(n):
         for b in range(n):
             new[a, b] = P[a, b]
@@ -186,7 +194,8 @@ def _update_cov(P, work, here):
     _solve(work.matrix, new)
     for a in range(n):
         for b in range(a + 1):
-            P[a, b] = P[b, a] = 0.5 * (new[a, b] + new[b, a])
+            cov[place] = 0.5 * (new[a, b] + new[b, a])
+            place += 1
 
 
 @njit_internal
