@@ -46,6 +46,7 @@ class Slots(NamedTuple):
     forecast_cov: int = 18
     step_back: int = 19
     start_back: int = 20
+    smoothed_cov: int = 21
 
 
 TABLE = Slots()
@@ -89,6 +90,7 @@ class TabledSystem(NamedTuple):
     forecast_cov: int
     step_back: int
     start_back: int
+    smoothed_cov: int
 
 
 class SystemTable(NamedTuple):
@@ -111,7 +113,7 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     linearized_step = symbols.get("linearized_step", "")
     information = symbols.get("observation_information", "")
     forecast_cov, step_back = symbols.get("forecast_cov", ""), symbols.get("step_back", "")
-    start_back = symbols.get("start_back", "")
+    start_back, smoothed_cov = symbols.get("start_back", ""), symbols.get("smoothed_cov", "")
     constants = np.zeros(N_SLOTS + system.free.size, dtype=np.int64)
     constants[TABLE.n], constants[TABLE.m], constants[TABLE.p] = system.n, system.m, system.p
     constants[TABLE.has_gaussian_observation] = system.gaussian_observation
@@ -135,6 +137,7 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
         table[TABLE.forecast_cov] = address_of(forecast_cov)
         table[TABLE.step_back] = address_of(step_back)
         table[TABLE.start_back] = address_of(start_back)
+        table[TABLE.smoothed_cov] = address_of(smoothed_cov)
         return table
 
     keys = [entry.key for entry in used.values()]
@@ -160,7 +163,7 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
         linearized_step=slots[TABLE.linearized_step],
         observation_information=slots[TABLE.observation_information],
         forecast_cov=slots[TABLE.forecast_cov], step_back=slots[TABLE.step_back],
-        start_back=slots[TABLE.start_back],
+        start_back=slots[TABLE.start_back], smoothed_cov=slots[TABLE.smoothed_cov],
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
     linearize_step,
     n_gains,
     observation_information,
+    smoothed_cov,
     step_back,
 )
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
@@ -157,6 +158,11 @@ class CompiledSystem:
     def forecast_cov(self) -> CompiledFunction:
         """Covariance of the next state."""
         return _vector_function("forecast_cov", "step, cov", forecast_cov(self.n, self.m))
+
+    @cached_property
+    def smoothed_cov(self) -> CompiledFunction:
+        """Covariance of the next state given the record."""
+        return _vector_function("smoothed_cov", "step, gains, cov", smoothed_cov(self.n, self.m))
 
     @cached_property
     def step_back(self) -> CompiledFunction:

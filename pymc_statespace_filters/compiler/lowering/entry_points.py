@@ -24,6 +24,7 @@ PREPARE_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "c": F64_PTR}
 
 GUIDE_ARGUMENTS = {
     "forecast_cov": {"step": F64_PTR, "cov": F64_PTR},
+    "smoothed_cov": {"step": F64_PTR, "gains": F64_PTR, "cov": F64_PTR},
     "step_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
     "start_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
 }
@@ -118,6 +119,12 @@ def _of_guide(function: Any, name: str, n: int, m: int) -> Callable:
         for i in range(n_cov):
             P[i] = values[i]
 
+    def smoothed_cov(step, gains, cov):
+        P, of_noise = carray(cov, (n_cov,)), carray(gains, (n_out - 1,))
+        values = function(carray(step, (n_step,)), of_noise, P)
+        for i in range(n_cov):
+            P[i] = values[i]
+
     def step_back(step, path, psi, out):
         ahead, gains = carray(psi, (n_psi,)), carray(out, (n_out,))
         values = function(carray(step, (n_step,)), carray(path, (2 * n,)), ahead)
@@ -126,4 +133,5 @@ def _of_guide(function: Any, name: str, n: int, m: int) -> Callable:
         for i in range(n_out):
             gains[i] = values[n_psi + i]
 
-    return forecast_cov if name == "forecast_cov" else step_back
+    calls = {"forecast_cov": forecast_cov, "smoothed_cov": smoothed_cov}
+    return calls.get(name, step_back)

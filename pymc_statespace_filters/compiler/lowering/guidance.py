@@ -32,12 +32,8 @@ def guided_noise(
     lacks log det R, which all members share.
     """
     n, m = x.type.shape[0], z.type.shape[0]
-    K = gains[m : m + m * n].reshape((m, n))
-    position = np.full((m, m), m + m * n)
-    upper = np.triu_indices(m)
-    position[upper] += np.arange(m * (m + 1) // 2)
-    R = gains[position] * np.triu(np.ones((m, m)))
-    q = gains[:m] - K @ x + R @ z
+    a, K, R = _gain_parts(gains, n, m)
+    q = a - K @ x + R @ z
     return q, 0.5 * (pt.sum(z**2) - pt.sum(q**2))
 
 
@@ -66,6 +62,26 @@ def forecast_cov(n: int, m: int) -> Graph:
     _, A, B, _ = _parts(step, n, m)
     forecast = A @ _symmetric(cov, n) @ A.T + B @ B.T
     return Graph({"step": step, "cov": cov}, [forecast[np.tril_indices(n)]])
+
+
+def smoothed_cov(n: int, m: int) -> Graph:
+    """Covariance of the next state given the record, from that of the state and its gains."""
+    step, gains = _vector("step", step_size(n, m)), _vector("gains", n_gains(n, m))
+    cov = _vector("cov", n * (n + 1) // 2)
+    _, A, B, _ = _parts(step, n, m)
+    _, K, R = _gain_parts(gains, n, m)
+    F, spread = A - B @ K, B @ R
+    forecast = F @ _symmetric(cov, n) @ F.T + spread @ spread.T
+    return Graph({"step": step, "gains": gains, "cov": cov}, [forecast[np.tril_indices(n)]])
+
+
+def _gain_parts(gains: TensorVariable, n: int, m: int) -> tuple[TensorVariable, ...]:
+    """The vector a and the matrices K and R."""
+    position = np.full((m, m), m + m * n)
+    upper = np.triu_indices(m)
+    position[upper] += np.arange(m * (m + 1) // 2)
+    R = gains[position] * np.triu(np.ones((m, m)))
+    return gains[:m], gains[m : m + m * n].reshape((m, n)), R
 
 
 def step_back(n: int, m: int) -> Graph:

@@ -26,7 +26,7 @@ import numpy as np
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
 from pymc_statespace_filters.filters.ensemble.information import (
-    information_at,
+    mean_information,
     new_information,
     newton_update,
     update_work,
@@ -59,6 +59,7 @@ class Guide(NamedTuple):
     gains: np.ndarray
     start: np.ndarray
     psi: np.ndarray
+    cov: np.ndarray
 
 
 @njit_internal
@@ -73,6 +74,7 @@ def make_guide(system, record):
         path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m)),
         gains=np.zeros((T, 1 + m + m * n + m * (m + 1) // 2)),
         start=np.zeros(1 + n + n * n + n * (n + 1) // 2), psi=np.zeros((J, n_psi)),
+        cov=np.zeros((J, n_psi - n)),
     )  # fmt: skip
     for n_iterations in (_N_ITERATIONS, 0):
         _filter(system, record, guide)
@@ -142,8 +144,35 @@ def _follow(system, record, guide):
         x[a] = mean[a]
         for b in range(n):
             x[a] += root[a, b] * guide.start[1 + b]
-    for k in range(guide.steps.shape[0]):
-        _move_path(system, record, guide, np.int64(k))
+    cov, j, T = np.zeros(n * (n + 1) // 2), 0, guide.steps.shape[0]
+    _start_cov(root, guide.start[1 + n + n * n :], cov)
+    for k in range(T + 1):
+        if j < record.steps.size and record.steps[j] == k:
+            copy_into(guide.cov[j], cov)
+            j += 1
+        if k < T:
+            _move_path(system, record, guide, np.int64(k))
+            call_address(system.smoothed_cov, (guide.steps[k], guide.gains[k, 1:], cov))
+
+
+@njit_internal
+def _start_cov(root, spread, cov):
+    """Lower triangle of L R R^T L^T, R upper triangular."""
+    n = root.shape[0]
+    LR = np.zeros((n, n))
+    place = 0
+    for r in range(n):
+        for c in range(r, n):
+            for a in range(n):
+                LR[a, c] += root[a, r] * spread[place]
+            place += 1
+    place = 0
+    for a in range(n):
+        for b in range(a + 1):
+            cov[place] = 0.0
+            for c in range(n):
+                cov[place] += LR[a, c] * LR[b, c]
+            place += 1
 
 
 @njit_internal
@@ -163,7 +192,7 @@ def _look_back(system, record, guide):
         if j >= 0 and record.steps[j] == k:
             copy_into(guide.psi[j], psi)
             if not is_missing(record.observed, j):
-                _add_observation(system, record, j, guide.path[k], here, psi)
+                _add_observation(system, record, j, guide.path[k], guide.cov[j], here, psi)
             j -= 1
     mean, root = _initial(system)
     first, path = np.zeros(n + 2 * n * n + n), np.zeros(2 * n)
@@ -176,9 +205,9 @@ def _look_back(system, record, guide):
 
 
 @njit_internal
-def _add_observation(system, record, j, x, here, psi):
+def _add_observation(system, record, j, x, cov, here, psi):
     """Add the information of an observation to psi."""
-    if information_at(system, record, j, x, here):
+    if mean_information(system, record, j, x, cov, here):
         place = n = x.size
         for a in range(n):
             psi[a] += here.score[a]

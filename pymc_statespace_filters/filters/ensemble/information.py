@@ -1,10 +1,12 @@
 """What one observation says about the state: a quadratic form of its log-density at a point."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
+from pymc_statespace_filters.compiler.numerics.small_cholesky import semidefinite_cholesky
 from pymc_statespace_filters.filters.system_table import observation_information
 
 _N_NEWTON, _N_HALVINGS = 12, 12
@@ -43,6 +45,42 @@ def information_at(system, record, j, x, out):
         return False
     if not system.has_gaussian_observation:
         _drop_negative(out.matrix)
+    return True
+
+
+@njit_internal
+def mean_information(system, record, j, x, cov, out):
+    """As `information_at`, in the mean over a normal distribution around x.
+
+    The mean over 2 n + 1 points is a better quadratic form than that at x where the log-density is
+    skewed. That of Gaussian noise is taken at x.
+    """
+    if not information_at(system, record, j, x, out):
+        return False
+    if system.has_gaussian_observation:
+        return True
+    n = x.size
+    spread, floor, active = np.empty((n, n)), np.zeros(n), np.empty(n, np.bool_)
+    place = 0
+    for a in range(n):
+        for b in range(a + 1):
+            spread[a, b] = spread[b, a] = cov[place]
+            place += 1
+    if not semidefinite_cholesky(spread, floor, active):
+        return True
+    total, point, scale = out.row.copy(), x.copy(), max(3.0, n)
+    weight = 1.0 - n / scale
+    for i in range(total.size):
+        total[i] *= weight
+    for a in range(n):
+        for sign in (-1.0, 1.0):
+            for b in range(n):
+                point[b] = x[b] + sign * math.sqrt(scale) * spread[b, a]
+            if not information_at(system, record, j, point, out):
+                return information_at(system, record, j, x, out)
+            for i in range(total.size):
+                total[i] += 0.5 / scale * out.row[i]
+    copy_into(out.row, total)
     return True
 
 
