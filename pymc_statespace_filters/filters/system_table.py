@@ -207,9 +207,9 @@ def propagate_guided(system, k, t, z, width, X, gains):
 
 
 @njit_internal
-def linearized_step(system, k, t, gains, x, out):
-    """Write the linearised step of a point x (n, 1) by the mean noise of these gains."""
-    _call(system.linearized_step, system, k, t, gains, NULL, x, out)
+def linearized_step(system, k, t, noise, X, out):
+    """Write the next state of every column of X with this noise, and its Jacobians."""
+    _call(system.linearized_step, system, k, t, noise, NULL, X, out)
 
 
 @njit_internal

@@ -4,7 +4,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
@@ -55,12 +54,12 @@ class CompiledSystem:
     * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
     * ``propagate_guided(c, inputs, k, t, gains, Z, X)`` moves every member by noise that depends on
       its state, see `guided_noise`; X has one row more, to which log density ratios are added.
-    * ``linearized_step(c, inputs, k, t, gains, X, member)`` returns one member's next state and its
-      Jacobians at the mean of this noise, see `linearize_step`.
+    * ``linearized_step(c, inputs, k, t, noise, X, out)`` writes the next state of every column of X
+      with this noise and its Jacobians, see `linearize_step`.
     * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
       its information.
-    * ``forecast_cov(step, cov)``, ``step_back(step, path, psi)`` and ``start_back`` are the algebra
-      of a guide in these numbers of states and noises, see `guidance`.
+    * ``forecast_cov(step, cov)``, ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
+      and ``start_back`` are the algebra of a guide, see `guidance`.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
 
@@ -140,19 +139,21 @@ class CompiledSystem:
 
     @cached_property
     def linearized_step(self) -> CompiledFunction:
-        """The next state and its Jacobians, at one state and noise that gains shift."""
-        x, z, size = self._symbols["x"], _normals(self.m), n_gains(self.n, self.m)
-        gains = pt.tensor("gains", shape=(size,), dtype="float64")
-        noise, _ = guided_noise(gains, x, pt.zeros(self.m))
-        linearized = linearize_step(self._step(x, z), x, z, self.free)
-        (at_noise,) = graph_replace([linearized], {z: noise}, strict=False)
-        return self._point_function("linearized_step", at_noise, "xut", gains=gains)
+        """The next state and its Jacobians, at points with the same noise."""
+        x, noise = self._symbols["x"], pt.tensor("noise", shape=(self.m,), dtype="float64")
+        linearized = linearize_step(self._step(x, noise), x, noise, self.free)
+        inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xut"}, "noise": noise}
+        arguments = "c, inputs, k, t, noise, X, out"
+        graph = Graph(inputs, [linearized])
+        return member_function("linearized_step", arguments, graph, "out[{i}, member]")
 
     @cached_property
     def observation_information(self) -> CompiledFunction:
         """log p(d | x), its score and its information, at one state."""
         information = observation_information(self.model, self._given("xutd"), self.free)
-        return self._point_function("observation_information", information, "xutd")
+        inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xutd"}}
+        arguments = "c, inputs, k, t, d, X, member"
+        return _vector_function("observation_information", arguments, Graph(inputs, [information]))
 
     @cached_property
     def forecast_cov(self) -> CompiledFunction:
@@ -217,15 +218,6 @@ class CompiledSystem:
     ) -> CompiledFunction:
         graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
-
-    def _point_function(
-        self, name: str, output: TensorVariable, inputs: str, **given: TensorVariable
-    ) -> CompiledFunction:
-        graph = Graph(
-            {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **given}, [output]
-        )
-        arguments = "c, inputs, k, t, " + ("gains" if given else "d") + ", X, member"
-        return _vector_function(name, arguments, graph)
 
     # Properties
 

@@ -79,7 +79,7 @@ def _with_addresses(
         points, M = carray(X, (n, n_members)), carray(out, (2, n_members))
         function(carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs)), k, t, points, M)
 
-    size, n_step, n_information = n_gains(n, m), step_size(n, m), 1 + n + n * n
+    size, n_information = n_gains(n, m), 1 + n + n * n
 
     def propagate_guided(c, inputs, k, t, z, width, X, out, n_members):
         members, Z = carray(X, (n + 1, n_members)), carray(z, (m, width))
@@ -87,12 +87,10 @@ def _with_addresses(
         function(carray(c, (n_constants,)), rows, k, t, gains, Z, members)
 
     def linearized_step(c, inputs, k, t, z, width, X, out, n_members):
-        member, gains = carray(X, (n, 1)), carray(z, (size,))
-        constants, rows = carray(c, (n_constants,)), carray(inputs, (k + 1, n_inputs))
-        values = function(constants, rows, k, t, gains, member, 0)
-        results = carray(out, (n_step,))
-        for i in range(n_step):
-            results[i] = values[i]
+        points, noise = carray(X, (n, n_members)), carray(z, (m,))
+        results = carray(out, (n + n * n + n * m, n_members))
+        rows = carray(inputs, (k + 1, n_inputs))
+        function(carray(c, (n_constants,)), rows, k, t, noise, points, results)
 
     def observation_information(c, inputs, k, t, z, width, X, out, n_members):
         member, d, rows = carray(X, (n, 1)), carray(z, (p,)), carray(inputs, (k + 1, n_inputs))

@@ -38,21 +38,21 @@ def guided_noise(
 
 
 def linearize_step(
-    step: TensorVariable, x: TensorVariable, z: TensorVariable, free: np.ndarray
+    step: TensorVariable, x: TensorVariable, q: TensorVariable, free: np.ndarray
 ) -> TensorVariable:
-    """The next state, the rows of its Jacobians A with respect to x and B to z, and z.
+    """The next state and the rows of its Jacobians A with respect to x and B to q.
 
     States that are not free are taken as known: their rows and columns are zero.
     """
     is_free = np.zeros(x.type.shape[0])
     is_free[free] = 1.0
     A = jacobian_of(step, x) * np.outer(is_free, is_free)
-    B = jacobian_of(step, z) * is_free[:, None]
-    return pt.concatenate([step, A.ravel(), B.ravel(), z])
+    B = jacobian_of(step, q) * is_free[:, None]
+    return pt.concatenate([step, A.ravel(), B.ravel()])
 
 
 def step_size(n: int, m: int) -> int:
-    """Length of a linearised step."""
+    """Length of a linearised step: the next state, A, B and the noise q there."""
     return n + n * n + n * m + m
 
 
@@ -119,7 +119,7 @@ def _vector(name: str, size: int) -> TensorVariable:
 
 
 def _parts(step: TensorVariable, n: int, m: int) -> tuple[TensorVariable, ...]:
-    """The next state, A, B and z of a linearised step."""
+    """The next state, A, B and q of a linearised step."""
     first, last = n + n * n, n + n * n + n * m
     return step[:n], step[n:first].reshape((n, n)), step[first:last].reshape((n, m)), step[last:]
 

@@ -1,30 +1,36 @@
 """The guide of a particle filter: what the rest of the record says about each step.
 
-Along a reference path E with noise qhat, E_{k+1} = g(E_k, qhat_k), the equations are linear in
-delta = x - E, and the record from step k on has the log-density
+Along a reference path E with noise qhat the equations are replaced by linear ones,
 
-    log psi_k(x) = c_k + lam_k' delta - 1/2 delta' Lam_k delta,
+    x_{k+1} = E_{k+1} + A_k (x_k - E_k) + B_k (q_k - qhat_k),
+
+and the record from step k on then has the log-density
+
+    log psi_k(x) = c_k + lam_k' delta - 1/2 delta' Lam_k delta,    delta = x - E_k,
 
 which a recursion from the last observation back to step 0 computes. It also gives the noise of step
 k given the state and all later observations, q | x ~ N(a - K x, R R'): an affine map of the state,
 equal for all particles. Noise is standardised, q ~ N(0, I), so that nothing is divided by its
 covariance, which may be singular.
 
-The reference is the most probable path, by Gauss-Newton iterations from that of an extended Kalman
-filter: each follows the noise a - K x and linearises along the new path. It depends on the record
-and the parameters, not on particles.
+The linear equations are those of least mean square error over the distribution of the state given
+the whole record, as that follows from the last guide (posterior linearisation, Garcia-Fernandez,
+Svensson and Sarkka 2017): E_{k+1}, A and B are means over 2 n + 1 points. Its mean and covariance
+come from following the guide, x_{k+1} = E_{k+1} with the noise a - K E_k, to which the first guide
+is a Kalman filter. The guide depends on the record and the parameters, not on particles.
 
-Sources: information filter, Mider, Schauer and van der Meulen (2021), Eqs. 2.9 to 2.14, in discrete
-time; residual bridges, Whitaker, Golightly, Boys and Sherlock (2017); Gauss-Newton smoother, Bell
-(1994).
+Other sources: backward information filter, Mider, Schauer and van der Meulen (2021); residual
+bridges, Whitaker, Golightly, Boys and Sherlock (2017).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
+from pymc_statespace_filters.compiler.numerics.small_cholesky import semidefinite_cholesky
 from pymc_statespace_filters.filters.ensemble.information import (
     mean_information,
     new_information,
@@ -34,7 +40,8 @@ from pymc_statespace_filters.filters.ensemble.information import (
 from pymc_statespace_filters.filters.outcomes import is_missing
 from pymc_statespace_filters.filters.system_table import linearized_step
 
-_N_ITERATIONS = 2  # Gauss-Newton iterations; a third changes nothing on the records of the docs
+_MOST_ITERATIONS = 6
+_SETTLED = 1e-3  # square of the move of the path, over the variance of the state
 
 
 class Record(NamedTuple):
@@ -51,7 +58,8 @@ class Guide(NamedTuple):
     ``path`` (T + 1, n) is the reference, ``steps`` (T, ..) its linearised steps. A row of ``gains``
     (T, ..) is log det R of a step and what shifts its noise, ``start`` the same for the normals at
     step 0, of which there are n. ``psi`` (J, n + n (n + 1) / 2) is log psi at an observation, lam
-    and the lower triangle of Lam, without the observation itself. See `lowering.guidance`.
+    and the lower triangle of Lam, without the observation itself. ``cov`` (J, n (n + 1) / 2) is the
+    covariance around the path there. See `lowering.guidance`.
     """
 
     path: np.ndarray
@@ -62,6 +70,31 @@ class Guide(NamedTuple):
     cov: np.ndarray
 
 
+class _Points(NamedTuple):
+    """Points x +- sqrt(scale) L e_a around a state, with the covariance L L^T.
+
+    ``scale`` is 3, with which means of polynomials of the fifth degree in one state are exact, or
+    the number of states, if larger, with which no weight is negative.
+    """
+
+    root: np.ndarray
+    floor: np.ndarray
+    active: np.ndarray
+    X: np.ndarray
+    results: np.ndarray
+    scale: float
+
+
+@njit_internal
+def _points(n, m):
+    n_points = 2 * n + 1
+    return _Points(
+        root=np.empty((n, n)), floor=np.zeros(n), active=np.empty(n, np.bool_),
+        X=np.empty((n, n_points)), results=np.empty((n + n * n + n * m, n_points)),
+        scale=float(max(3, n)),
+    )  # fmt: skip
+
+
 @njit_internal
 def make_guide(system, record):
     """Compute the guide of a record; one that changes nothing if the equations cannot be followed.
@@ -69,19 +102,22 @@ def make_guide(system, record):
     Where they cannot be followed along the iterated path, the first one is taken.
     """
     n, m, J = system.n, system.m, record.steps.size
-    T, n_psi = record.steps[-1] if J else np.int64(0), n + n * (n + 1) // 2
+    T, n_cov = record.steps[-1] if J else np.int64(0), n * (n + 1) // 2
     guide = Guide(
         path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m)),
         gains=np.zeros((T, 1 + m + m * n + m * (m + 1) // 2)),
-        start=np.zeros(1 + n + n * n + n * (n + 1) // 2), psi=np.zeros((J, n_psi)),
-        cov=np.zeros((J, n_psi - n)),
+        start=np.zeros(1 + n + n * n + n_cov), psi=np.zeros((J, n + n_cov)),
+        cov=np.zeros((J, n_cov)),
     )  # fmt: skip
-    for n_iterations in (_N_ITERATIONS, 0):
-        _filter(system, record, guide)
+    points = _points(n, m)
+    for most_iterations in (_MOST_ITERATIONS, 0):
+        _filter(system, record, guide, points)
         _look_back(system, record, guide)
-        for _ in range(n_iterations):
-            _follow(system, record, guide)
+        for _ in range(most_iterations):
+            moved = _follow(system, record, guide, points)
             _look_back(system, record, guide)
+            if moved < _SETTLED:
+                break
         if np.isfinite(guide.path).all():
             return guide
     guide.path[:] = 0.0
@@ -101,78 +137,118 @@ def _initial(system):
 
 
 @njit_internal
-def _move_path(system, record, guide, k):
-    """Linearise step k at the path, with the mean noise of its gains, and move the path there."""
-    x, gains, step = guide.path[k], guide.gains[k, 1:], guide.steps[k]
-    point, t = x.reshape(x.size, 1), record.t0 + k * system.dt
-    linearized_step(system, k, t, gains.ctypes.data, point, step.ctypes.data)
-    copy_into(guide.path[k + 1], step[: x.size])
+def _move_path(system, record, guide, k, cov, points):
+    """Linearise step k around the path, with the mean noise of its gains, and move the path."""
+    n, m = system.n, system.m
+    x, gains, step = guide.path[k], guide.gains[k], guide.steps[k]
+    n_means = n + n * n + n * m
+    for r in range(m):
+        q = gains[1 + r]
+        for a in range(n):
+            q -= gains[1 + m + r * n + a] * x[a]
+        step[n_means + r] = q
+    _place(x, cov, points)
+    t, noise = record.t0 + k * system.dt, step[n_means:]
+    linearized_step(system, k, t, noise.ctypes.data, points.X, points.results.ctypes.data)
+    weight = 0.5 / points.scale
+    for i in range(n_means):
+        total = 0.0
+        for point in range(1, 2 * n + 1):
+            total += points.results[i, point]
+        step[i] = weight * total + (1.0 - n / points.scale) * points.results[i, 0]
+    for a in range(n):
+        guide.path[k + 1, a] = step[a]
 
 
 @njit_internal
-def _filter(system, record, guide):
-    """Take as path the means of an extended Kalman filter with iterated updates."""
+def _place(x, cov, points):
+    """Place the points around x; at x itself if there is no root of the covariance."""
+    n, root, X, place = x.size, points.root, points.X, 0
+    for a in range(n):
+        for b in range(a + 1):
+            root[a, b] = root[b, a] = cov[place]
+            place += 1
+    if not semidefinite_cholesky(root, points.floor, points.active):
+        root[:] = 0.0
+    reach = math.sqrt(points.scale)
+    for a in range(n):
+        X[a, 0] = x[a]
+        for b in range(n):
+            X[a, 1 + b] = x[a] + reach * root[a, b]
+            X[a, 1 + n + b] = x[a] - reach * root[a, b]
+
+
+@njit_internal
+def _filter(system, record, guide, points):
+    """Take as path the means of a Kalman filter with iterated updates."""
     n = system.n
     mean, root = _initial(system)
     cov, update, here = np.empty(n * (n + 1) // 2), update_work(n), new_information(n)
     guide.gains[:] = 0.0
     copy_into(guide.path[0], mean)
-    place = 0
-    for a in range(n):
-        for b in range(a + 1):
-            cov[place] = 0.0
-            for c in range(n):
-                cov[place] += root[a, c] * root[b, c]
-            place += 1
+    _cov_of(root, cov)
     k = np.int64(0)
     for j in range(record.steps.size):
         while k < record.steps[j]:
-            _move_path(system, record, guide, k)
+            _move_path(system, record, guide, k, cov, points)
             call_address(system.forecast_cov, (guide.steps[k], cov))
             k += 1
         if not is_missing(record.observed, j):
             newton_update(system, record, j, guide.path[k], cov, update, here)
+        copy_into(guide.cov[j], cov)
 
 
 @njit_internal
-def _follow(system, record, guide):
-    """Replace the path by the one along which the guide's mean noise leads."""
-    n = system.n
-    mean, root = _initial(system)
-    x = guide.path[0]
-    for a in range(n):
-        x[a] = mean[a]
-        for b in range(n):
-            x[a] += root[a, b] * guide.start[1 + b]
-    cov, j, T = np.zeros(n * (n + 1) // 2), 0, guide.steps.shape[0]
-    _start_cov(root, guide.start[1 + n + n * n :], cov)
+def _cov_of(root, cov):
+    """Write the lower triangle of L L^T."""
+    place = 0
+    for a in range(root.shape[0]):
+        for b in range(a + 1):
+            cov[place] = 0.0
+            for c in range(root.shape[0]):
+                cov[place] += root[a, c] * root[b, c]
+            place += 1
+
+
+@njit_internal
+def _follow(system, record, guide, points):
+    """Replace the path by the one along which the guide's mean noise leads; how far it moved."""
+    n, T = system.n, guide.steps.shape[0]
+    cov, last, moved, j = np.empty(n * (n + 1) // 2), np.empty(n), 0.0, 0
+    _guided_start(system, guide, cov)
     for k in range(T + 1):
+        if k > 0:
+            copy_into(last, guide.path[k])
+            _move_path(system, record, guide, np.int64(k - 1), cov, points)
+            call_address(system.smoothed_cov, (guide.steps[k-1], guide.gains[k-1, 1:], cov))
         if j < record.steps.size and record.steps[j] == k:
             copy_into(guide.cov[j], cov)
+            place = 0
+            for a in range(n):
+                change = guide.path[k, a] - last[a]
+                if k > 0 and cov[place + a] > 0.0:
+                    moved = max(moved, change * change / cov[place + a])
+                place += a + 1
             j += 1
-        if k < T:
-            _move_path(system, record, guide, np.int64(k))
-            call_address(system.smoothed_cov, (guide.steps[k], guide.gains[k, 1:], cov))
+    return moved
 
 
 @njit_internal
-def _start_cov(root, spread, cov):
-    """Lower triangle of L R R^T L^T, R upper triangular."""
-    n = root.shape[0]
-    LR = np.zeros((n, n))
-    place = 0
+def _guided_start(system, guide, cov):
+    """Begin the path at the mean of the guided start, and write its covariance."""
+    n, place = system.n, 1 + system.n + system.n * system.n
+    mean, root = _initial(system)
+    spread = np.zeros((n, n))
+    for a in range(n):
+        guide.path[0, a] = mean[a]
+        for b in range(n):
+            guide.path[0, a] += root[a, b] * guide.start[1 + b]
     for r in range(n):
         for c in range(r, n):
             for a in range(n):
-                LR[a, c] += root[a, r] * spread[place]
+                spread[a, c] += root[a, r] * guide.start[place]
             place += 1
-    place = 0
-    for a in range(n):
-        for b in range(a + 1):
-            cov[place] = 0.0
-            for c in range(n):
-                cov[place] += LR[a, c] * LR[b, c]
-            place += 1
+    _cov_of(spread, cov)
 
 
 @njit_internal
