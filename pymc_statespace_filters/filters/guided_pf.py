@@ -242,6 +242,5 @@ class GuidedPF(ParticleFilter):
 
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""
-        guide = ("linearized_step", "observation_information", "propagate_guided")
-        algebra = ("forecast_cov", "step_back", "start_back", "smoothed_cov")
-        return "initialise", "log_density", *guide, *algebra
+        guide = ("observation_information", "follow", "look_back", "start_back")
+        return "initialise", "log_density", "propagate_guided", *guide

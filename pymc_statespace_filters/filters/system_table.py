@@ -11,6 +11,10 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.lowering.entry_points import MemberArguments, entry_point
+from pymc_statespace_filters.compiler.lowering.guide_loops import (
+    FollowArguments,
+    LookBackArguments,
+)
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
@@ -41,12 +45,10 @@ class Slots(NamedTuple):
     log_density: int = 13
     step_moments: int = 14
     propagate_guided: int = 15
-    linearized_step: int = 16
-    observation_information: int = 17
-    forecast_cov: int = 18
-    step_back: int = 19
-    start_back: int = 20
-    smoothed_cov: int = 21
+    observation_information: int = 16
+    follow: int = 17
+    look_back: int = 18
+    start_back: int = 19
 
 
 TABLE = Slots()
@@ -85,12 +87,10 @@ class TabledSystem(NamedTuple):
     log_density: int
     step_moments: int
     propagate_guided: int
-    linearized_step: int
     observation_information: int
-    forecast_cov: int
-    step_back: int
+    follow: int
+    look_back: int
     start_back: int
-    smoothed_cov: int
 
 
 class SystemTable(NamedTuple):
@@ -110,10 +110,9 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
     propagate, observe = symbols.get("propagate", ""), symbols.get("observe", "")
     log_density, step_moments = symbols.get("log_density", ""), symbols.get("step_moments", "")
     propagate_guided = symbols.get("propagate_guided", "")
-    linearized_step = symbols.get("linearized_step", "")
     information = symbols.get("observation_information", "")
-    forecast_cov, step_back = symbols.get("forecast_cov", ""), symbols.get("step_back", "")
-    start_back, smoothed_cov = symbols.get("start_back", ""), symbols.get("smoothed_cov", "")
+    follow, look_back = symbols.get("follow", ""), symbols.get("look_back", "")
+    start_back = symbols.get("start_back", "")
     constants = np.zeros(N_SLOTS + system.free.size, dtype=np.int64)
     constants[TABLE.n], constants[TABLE.m], constants[TABLE.p] = system.n, system.m, system.p
     constants[TABLE.has_gaussian_observation] = system.gaussian_observation
@@ -132,12 +131,10 @@ def system_table(system: System, functions: Sequence[str]) -> SystemTable:
         table[TABLE.log_density] = address_of(log_density)
         table[TABLE.step_moments] = address_of(step_moments)
         table[TABLE.propagate_guided] = address_of(propagate_guided)
-        table[TABLE.linearized_step] = address_of(linearized_step)
         table[TABLE.observation_information] = address_of(information)
-        table[TABLE.forecast_cov] = address_of(forecast_cov)
-        table[TABLE.step_back] = address_of(step_back)
+        table[TABLE.follow] = address_of(follow)
+        table[TABLE.look_back] = address_of(look_back)
         table[TABLE.start_back] = address_of(start_back)
-        table[TABLE.smoothed_cov] = address_of(smoothed_cov)
         return table
 
     keys = [entry.key for entry in used.values()]
@@ -160,10 +157,9 @@ def read_system(table, dt, theta, n_theta, inputs, n_rows):
         observe=slots[TABLE.observe], log_density=slots[TABLE.log_density],
         step_moments=slots[TABLE.step_moments],
         propagate_guided=slots[TABLE.propagate_guided],
-        linearized_step=slots[TABLE.linearized_step],
         observation_information=slots[TABLE.observation_information],
-        forecast_cov=slots[TABLE.forecast_cov], step_back=slots[TABLE.step_back],
-        start_back=slots[TABLE.start_back], smoothed_cov=slots[TABLE.smoothed_cov],
+        follow=slots[TABLE.follow], look_back=slots[TABLE.look_back],
+        start_back=slots[TABLE.start_back],
     )  # fmt: skip
 
 
@@ -207,9 +203,22 @@ def propagate_guided(system, k, t, z, width, X, gains):
 
 
 @njit_internal
-def linearized_step(system, k, t, noise, X, out):
-    """Write the next state of every column of X with this noise, and its Jacobians."""
-    _call(system.linearized_step, system, k, t, noise, NULL, X, out)
+def follow(system, first, last, t0, path, gains, steps, cov):
+    """Move a path by the mean noise of gains, and linearise its steps, see `guide_loops`."""
+    arguments = FollowArguments(
+        c=system.c, inputs=system.inputs, first=first, last=last, t0=t0, dt=system.dt, path=path,
+        gains=gains, steps=steps, cov=cov,
+    )  # fmt: skip
+    call_address(system.follow, arguments)
+
+
+@njit_internal
+def look_back(address, first, last, path, steps, gains, psi):
+    """Move psi back, and condition the noise on it, see `guide_loops`."""
+    arguments = LookBackArguments(
+        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi
+    )
+    call_address(address, arguments)
 
 
 @njit_internal

@@ -19,7 +19,6 @@ from pymc_statespace_filters.compiler.lowering.covariances import (
 )
 from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
 from pymc_statespace_filters.compiler.lowering.guidance import (
-    forecast_cov,
     guided_noise,
     linearize_step,
     n_gains,
@@ -58,7 +57,7 @@ class CompiledSystem:
       with this noise and its Jacobians, see `linearize_step`.
     * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
       its information.
-    * ``forecast_cov(step, cov)``, ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
+    * ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
       and ``start_back`` are the algebra of a guide, see `guidance`.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
@@ -154,11 +153,6 @@ class CompiledSystem:
         inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xutd"}}
         arguments = "c, inputs, k, t, d, X, member"
         return _vector_function("observation_information", arguments, Graph(inputs, [information]))
-
-    @cached_property
-    def forecast_cov(self) -> CompiledFunction:
-        """Covariance of the next state."""
-        return _vector_function("forecast_cov", "step, cov", forecast_cov(self.n, self.m))
 
     @cached_property
     def smoothed_cov(self) -> CompiledFunction:

@@ -6,7 +6,13 @@ from typing import Any
 
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.lowering.guidance import n_gains, step_size
+from pymc_statespace_filters.compiler.lowering.guidance import n_gains
+from pymc_statespace_filters.compiler.lowering.guide_loops import (
+    FOLLOW_ARGUMENTS,
+    LOOK_BACK_ARGUMENTS,
+    follow_loop,
+    look_back_loop,
+)
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
 
@@ -22,24 +28,11 @@ MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
 PREPARE_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "c": F64_PTR}
 
 
-GUIDE_ARGUMENTS = {
-    "forecast_cov": {"step": F64_PTR, "cov": F64_PTR},
-    "smoothed_cov": {"step": F64_PTR, "gains": F64_PTR, "cov": F64_PTR},
-    "step_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
-    "start_back": {"step": F64_PTR, "path": F64_PTR, "psi": F64_PTR, "out": F64_PTR},
-}
-"""Arguments of the functions of a guide; ``cov`` and ``psi`` are replaced by their new values."""
-
-
 @lru_cache(maxsize=2048)
 def entry_point(system: Any, name: str) -> EntryPoint:
     """A function of a compiled system by its name, not compiled yet."""
-    if name in GUIDE_ARGUMENTS:
-        function = getattr(system, name)
-        m = system.n if name == "start_back" else system.m
-        key = key_of(repr((name, system.n, m)), function.key)
-        of_addresses = _of_guide(function.function, name, system.n, m)
-        return EntryPoint(of_addresses, GUIDE_ARGUMENTS[name], name, key)
+    if name in ("follow", "look_back", "start_back"):
+        return _of_guide(system, name)
     sizes = (system.n, system.m, system.p, system.r, system.n_inputs, system.n_constants)
     function = getattr(system, name)
     arguments = PREPARE_ARGUMENTS if name == "prepare" else MEMBER_ARGUMENTS
@@ -86,12 +79,6 @@ def _with_addresses(
         gains, rows = carray(out, (size,)), carray(inputs, (k + 1, n_inputs))
         function(carray(c, (n_constants,)), rows, k, t, gains, Z, members)
 
-    def linearized_step(c, inputs, k, t, z, width, X, out, n_members):
-        points, noise = carray(X, (n, n_members)), carray(z, (m,))
-        results = carray(out, (n + n * n + n * m, n_members))
-        rows = carray(inputs, (k + 1, n_inputs))
-        function(carray(c, (n_constants,)), rows, k, t, noise, points, results)
-
     def observation_information(c, inputs, k, t, z, width, X, out, n_members):
         member, d, rows = carray(X, (n, 1)), carray(z, (p,)), carray(inputs, (k + 1, n_inputs))
         values = function(carray(c, (n_constants,)), rows, k, t, d, member, 0)
@@ -101,35 +88,20 @@ def _with_addresses(
 
     calls = (
         prepare, initialise, propagate, observe, log_density, step_moments, propagate_guided,
-        linearized_step, observation_information,
+        observation_information,
     )  # fmt: skip
     return {call.__name__: call for call in calls}[name]
 
 
-def _of_guide(function: Any, name: str, n: int, m: int) -> Callable:
-    """A function of the algebra of a guide."""
-    n_step, n_cov = step_size(n, m), n * (n + 1) // 2
-    n_psi, n_out = n + n_cov, 1 + n_gains(n, m)
-
-    def forecast_cov(step, cov):
-        P = carray(cov, (n_cov,))
-        values = function(carray(step, (n_step,)), P)
-        for i in range(n_cov):
-            P[i] = values[i]
-
-    def smoothed_cov(step, gains, cov):
-        P, of_noise = carray(cov, (n_cov,)), carray(gains, (n_out - 1,))
-        values = function(carray(step, (n_step,)), of_noise, P)
-        for i in range(n_cov):
-            P[i] = values[i]
-
-    def step_back(step, path, psi, out):
-        ahead, gains = carray(psi, (n_psi,)), carray(out, (n_out,))
-        values = function(carray(step, (n_step,)), carray(path, (2 * n,)), ahead)
-        for i in range(n_psi):
-            ahead[i] = values[i]
-        for i in range(n_out):
-            gains[i] = values[n_psi + i]
-
-    calls = {"forecast_cov": forecast_cov, "smoothed_cov": smoothed_cov}
-    return calls.get(name, step_back)
+def _of_guide(system: Any, name: str) -> EntryPoint:
+    """A loop of a guide."""
+    n, m = system.n, system.n if name == "start_back" else system.m
+    if name == "follow":
+        step, smooth = system.linearized_step, system.smoothed_cov
+        sizes = (n, m, system.n_inputs, system.n_constants)
+        loop = follow_loop(step.function, smooth.function, *sizes)
+        key = key_of(repr((name, sizes)), step.key, smooth.key)
+        return EntryPoint(loop, FOLLOW_ARGUMENTS, name, key)
+    back = getattr(system, "start_back" if name == "start_back" else "step_back")
+    key = key_of(repr((name, n, m)), back.key)
+    return EntryPoint(look_back_loop(back.function, n, m), LOOK_BACK_ARGUMENTS, name, key)

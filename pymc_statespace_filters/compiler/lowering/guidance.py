@@ -56,14 +56,6 @@ def step_size(n: int, m: int) -> int:
     return n + n * n + n * m + m
 
 
-def forecast_cov(n: int, m: int) -> Graph:
-    """A P A^T + B B^T from a linearised step and the lower triangle of P."""
-    step, cov = _vector("step", step_size(n, m)), _vector("cov", n * (n + 1) // 2)
-    _, A, B, _ = _parts(step, n, m)
-    forecast = A @ _symmetric(cov, n) @ A.T + B @ B.T
-    return Graph({"step": step, "cov": cov}, [forecast[np.tril_indices(n)]])
-
-
 def smoothed_cov(n: int, m: int) -> Graph:
     """Covariance of the next state given the record, from that of the state and its gains."""
     step, gains = _vector("step", step_size(n, m)), _vector("gains", n_gains(n, m))

@@ -23,14 +23,11 @@ Other sources: backward information filter, Mider, Schauer and van der Meulen (2
 bridges, Whitaker, Golightly, Boys and Sherlock (2017).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.compiler.numerics.small_cholesky import semidefinite_cholesky
 from pymc_statespace_filters.filters.ensemble.information import (
     mean_information,
     new_information,
@@ -38,7 +35,7 @@ from pymc_statespace_filters.filters.ensemble.information import (
     update_work,
 )
 from pymc_statespace_filters.filters.outcomes import is_missing
-from pymc_statespace_filters.filters.system_table import linearized_step
+from pymc_statespace_filters.filters.system_table import follow, look_back
 
 _MOST_ITERATIONS = 6
 _SETTLED = 1e-3  # square of the move of the path, over the variance of the state
@@ -70,31 +67,6 @@ class Guide(NamedTuple):
     cov: np.ndarray
 
 
-class _Points(NamedTuple):
-    """Points x +- sqrt(scale) L e_a around a state, with the covariance L L^T.
-
-    ``scale`` is 3, with which means of polynomials of the fifth degree in one state are exact, or
-    the number of states, if larger, with which no weight is negative.
-    """
-
-    root: np.ndarray
-    floor: np.ndarray
-    active: np.ndarray
-    X: np.ndarray
-    results: np.ndarray
-    scale: float
-
-
-@njit_internal
-def _points(n, m):
-    n_points = 2 * n + 1
-    return _Points(
-        root=np.empty((n, n)), floor=np.zeros(n), active=np.empty(n, np.bool_),
-        X=np.empty((n, n_points)), results=np.empty((n + n * n + n * m, n_points)),
-        scale=float(max(3, n)),
-    )  # fmt: skip
-
-
 @njit_internal
 def make_guide(system, record):
     """Compute the guide of a record; one that changes nothing if the equations cannot be followed.
@@ -109,12 +81,11 @@ def make_guide(system, record):
         start=np.zeros(1 + n + n * n + n_cov), psi=np.zeros((J, n + n_cov)),
         cov=np.zeros((J, n_cov)),
     )  # fmt: skip
-    points = _points(n, m)
     for most_iterations in (_MOST_ITERATIONS, 0):
-        _filter(system, record, guide, points)
+        _filter(system, record, guide)
         _look_back(system, record, guide)
         for _ in range(most_iterations):
-            moved = _follow(system, record, guide, points)
+            moved = _follow(system, record, guide)
             _look_back(system, record, guide)
             if moved < _SETTLED:
                 break
@@ -137,65 +108,23 @@ def _initial(system):
 
 
 @njit_internal
-def _move_path(system, record, guide, k, cov, points):
-    """Linearise step k around the path, with the mean noise of its gains, and move the path."""
-    n, m = system.n, system.m
-    x, gains, step = guide.path[k], guide.gains[k], guide.steps[k]
-    n_means = n + n * n + n * m
-    for r in range(m):
-        q = gains[1 + r]
-        for a in range(n):
-            q -= gains[1 + m + r * n + a] * x[a]
-        step[n_means + r] = q
-    _place(x, cov, points)
-    t, noise = record.t0 + k * system.dt, step[n_means:]
-    linearized_step(system, k, t, noise.ctypes.data, points.X, points.results.ctypes.data)
-    weight = 0.5 / points.scale
-    for i in range(n_means):
-        total = 0.0
-        for point in range(1, 2 * n + 1):
-            total += points.results[i, point]
-        step[i] = weight * total + (1.0 - n / points.scale) * points.results[i, 0]
-    for a in range(n):
-        guide.path[k + 1, a] = step[a]
-
-
-@njit_internal
-def _place(x, cov, points):
-    """Place the points around x; at x itself if there is no root of the covariance."""
-    n, root, X, place = x.size, points.root, points.X, 0
-    for a in range(n):
-        for b in range(a + 1):
-            root[a, b] = root[b, a] = cov[place]
-            place += 1
-    if not semidefinite_cholesky(root, points.floor, points.active):
-        root[:] = 0.0
-    reach = math.sqrt(points.scale)
-    for a in range(n):
-        X[a, 0] = x[a]
-        for b in range(n):
-            X[a, 1 + b] = x[a] + reach * root[a, b]
-            X[a, 1 + n + b] = x[a] - reach * root[a, b]
-
-
-@njit_internal
-def _filter(system, record, guide, points):
+def _filter(system, record, guide):
     """Take as path the means of a Kalman filter with iterated updates."""
     n = system.n
     mean, root = _initial(system)
     cov, update, here = np.empty(n * (n + 1) // 2), update_work(n), new_information(n)
-    guide.gains[:] = 0.0
+    for k in range(guide.gains.shape[0]):
+        _leave_unguided(guide.gains[k], n, system.m)
     copy_into(guide.path[0], mean)
     _cov_of(root, cov)
-    k = np.int64(0)
+    first = np.int64(0)
     for j in range(record.steps.size):
-        while k < record.steps[j]:
-            _move_path(system, record, guide, k, cov, points)
-            call_address(system.forecast_cov, (guide.steps[k], cov))
-            k += 1
+        last = record.steps[j]
+        follow(system, first, last, record.t0, guide.path, guide.gains, guide.steps, cov)
         if not is_missing(record.observed, j):
-            newton_update(system, record, j, guide.path[k], cov, update, here)
+            newton_update(system, record, j, guide.path[last], cov, update, here)
         copy_into(guide.cov[j], cov)
+        first = last
 
 
 @njit_internal
@@ -211,25 +140,24 @@ def _cov_of(root, cov):
 
 
 @njit_internal
-def _follow(system, record, guide, points):
+def _follow(system, record, guide):
     """Replace the path by the one along which the guide's mean noise leads; how far it moved."""
-    n, T = system.n, guide.steps.shape[0]
-    cov, last, moved, j = np.empty(n * (n + 1) // 2), np.empty(n), 0.0, 0
+    n = system.n
+    cov, last_state, moved = np.empty(n * (n + 1) // 2), np.empty(n), 0.0
     _guided_start(system, guide, cov)
-    for k in range(T + 1):
-        if k > 0:
-            copy_into(last, guide.path[k])
-            _move_path(system, record, guide, np.int64(k - 1), cov, points)
-            call_address(system.smoothed_cov, (guide.steps[k-1], guide.gains[k-1, 1:], cov))
-        if j < record.steps.size and record.steps[j] == k:
-            copy_into(guide.cov[j], cov)
-            place = 0
-            for a in range(n):
-                change = guide.path[k, a] - last[a]
-                if k > 0 and cov[place + a] > 0.0:
-                    moved = max(moved, change * change / cov[place + a])
-                place += a + 1
-            j += 1
+    first = np.int64(0)
+    for j in range(record.steps.size):
+        last = record.steps[j]
+        copy_into(last_state, guide.path[last])
+        follow(system, first, last, record.t0, guide.path, guide.gains, guide.steps, cov)
+        copy_into(guide.cov[j], cov)
+        place = 0
+        for a in range(n):
+            move = guide.path[last, a] - last_state[a]
+            if cov[place + a] > 0.0:
+                moved = max(moved, move * move / cov[place + a])
+            place += a + 1
+        first = last
     return moved
 
 
@@ -254,30 +182,22 @@ def _guided_start(system, guide, cov):
 @njit_internal
 def _look_back(system, record, guide):
     """Compute psi, the gains and the start from the end of the record back to step 0."""
-    n, m, T = system.n, system.m, guide.steps.shape[0]
+    n = system.n
     psi, here = np.zeros(n + n * (n + 1) // 2), new_information(n)
-    j = record.steps.size - 1
-    for k in range(T, -1, -1):
-        if k < T:
-            call_address(
-                system.step_back, (guide.steps[k], guide.path[k], psi, guide.gains[k])
-            )
-            if not np.isfinite(guide.gains[k, 0]):
-                psi[:] = 0.0
-                _leave_unguided(guide.gains[k], n, m)
-        if j >= 0 and record.steps[j] == k:
-            copy_into(guide.psi[j], psi)
-            if not is_missing(record.observed, j):
-                _add_observation(system, record, j, guide.path[k], guide.cov[j], here, psi)
-            j -= 1
+    address = system.look_back
+    for j in range(record.steps.size - 1, -1, -1):
+        last, first = record.steps[j], record.steps[j - 1] if j > 0 else np.int64(0)
+        copy_into(guide.psi[j], psi)
+        if not is_missing(record.observed, j):
+            _add_observation(system, record, j, guide.path[last], guide.cov[j], here, psi)
+        look_back(address, first, last, guide.path, guide.steps, guide.gains, psi)
     mean, root = _initial(system)
-    first, path = np.zeros(n + 2 * n * n + n), np.zeros(2 * n)
-    copy_into(first[:n], mean)
-    copy_into(first[n + n * n : n + 2 * n * n], root.reshape(n * n))
-    copy_into(path[n:], guide.path[0])
-    call_address(system.start_back, (first, path, psi, guide.start))
-    if not np.isfinite(guide.start[0]):
-        _leave_unguided(guide.start, n, n)
+    start, path = np.zeros(n + 2 * n * n + n), np.zeros((2, n))
+    copy_into(start[:n], mean)
+    copy_into(start[n + n * n : n + 2 * n * n], root.reshape(n * n))
+    copy_into(path[1], guide.path[0])
+    zero, one = np.int64(0), np.int64(1)
+    look_back(system.start_back, zero, one, path, start, guide.start, psi)
 
 
 @njit_internal

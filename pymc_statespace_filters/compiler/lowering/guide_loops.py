@@ -1,0 +1,120 @@
+"""Loops of a guide over the steps between two observations, for n states and m noises.
+
+Sizes are constants of the machine code, so that the inner loops are unrolled and small vectors stay
+in registers: a step takes some 20 ns where calls of general code take ten times as long.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import carray, types
+
+from pymc_statespace_filters.compiler.lowering.guidance import n_gains, step_size
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, arguments_class
+
+FOLLOW_ARGUMENTS = {
+    "c": F64_PTR, "inputs": F64_PTR, "first": types.intp, "last": types.intp, "t0": types.float64,
+    "dt": types.float64, "path": F64_PTR, "gains": F64_PTR, "steps": F64_PTR, "cov": F64_PTR,
+}  # fmt: skip
+
+FollowArguments = arguments_class("FollowArguments", FOLLOW_ARGUMENTS, __name__)
+
+LOOK_BACK_ARGUMENTS = {
+    "first": types.intp, "last": types.intp, "path": F64_PTR, "steps": F64_PTR, "gains": F64_PTR,
+    "psi": F64_PTR,
+}  # fmt: skip
+
+LookBackArguments = arguments_class("LookBackArguments", LOOK_BACK_ARGUMENTS, __name__)
+
+
+def follow_loop(
+    linearize: Any, smooth: Any, n: int, m: int, n_inputs: int, n_constants: int
+) -> Callable:
+    """Follow the gains from step ``first`` to ``last`` and linearise every step on the way.
+
+    The linearised step is a mean over the points x and x +- sqrt(scale) L e_a, L L^T the covariance
+    around the path. With a scale of 3 means of polynomials of the fifth degree in one state are
+    exact; more than three states need a larger one, with which no weight is negative.
+    """
+    n_means, n_cov, n_points = n + n * n + n * m, n * (n + 1) // 2, 2 * n + 1
+    n_step, n_row = step_size(n, m), 1 + n_gains(n, m)
+    scale = float(max(3, n))
+    reach, weight, at_centre = math.sqrt(scale), 0.5 / scale, 1.0 - n / scale
+
+    def follow(c, inputs, first, last, t0, dt, path, gains, steps, cov):
+        constants, rows = carray(c, (n_constants,)), carray(inputs, (last, n_inputs))
+        E, P = carray(path, (last + 1, n)), carray(cov, (n_cov,))
+        all_gains, all_steps = carray(gains, (last, n_row)), carray(steps, (last, n_step))
+        root, X, results = np.zeros((n, n)), np.empty((n, n_points)), np.empty((n_means, n_points))
+        for k in range(first, last):
+            gain, step = all_gains[k], all_steps[k]
+            for r in range(m):
+                q = gain[1 + r]
+                for a in range(n):
+                    q -= gain[1 + m + r * n + a] * E[k, a]
+                step[n_means + r] = q
+            place = 0
+            for a in range(n):
+                for b in range(a + 1):
+                    value = P[place]
+                    for i in range(b):
+                        value -= root[a, i] * root[b, i]
+                    if a == b:
+                        root[a, a] = math.sqrt(value) if value > 1e-12 * P[place] else 0.0
+                    else:
+                        root[a, b] = value / root[b, b] if root[b, b] > 0.0 else 0.0
+                    place += 1
+            for a in range(n):
+                X[a, 0] = E[k, a]
+                for b in range(n):
+                    X[a, 1 + b] = E[k, a] + reach * root[a, b]
+                    X[a, 1 + n + b] = E[k, a] - reach * root[a, b]
+            linearize(constants, rows, k, t0 + k * dt, step[n_means:], X, results)
+            for i in range(n_means):
+                total = 0.0
+                for point in range(1, n_points):
+                    total += results[i, point]
+                step[i] = weight * total
+                if at_centre != 0.0:
+                    step[i] += at_centre * results[i, 0]
+            for a in range(n):
+                E[k + 1, a] = step[a]
+            values = smooth(step, gain[1:], P)
+            for i in range(n_cov):
+                P[i] = values[i]
+
+    return follow
+
+
+def look_back_loop(step_back: Any, n: int, m: int) -> Callable:
+    """Move psi from step ``last`` back to ``first`` and condition the noise on the way.
+
+    If psi is not finite, it is forgotten and the step stays unguided.
+    """
+    n_psi, n_gain = n + n * (n + 1) // 2, n_gains(n, m)
+    n_step, n_row = step_size(n, m), 1 + n_gain
+
+    def look_back(first, last, path, steps, gains, psi):
+        E, ahead = carray(path, ((last + 1) * n,)), carray(psi, (n_psi,))
+        all_gains, all_steps = carray(gains, (last, n_row)), carray(steps, (last, n_step))
+        for k in range(last - 1, first - 1, -1):
+            values = step_back(all_steps[k], E[k * n : (k + 2) * n], ahead)
+            gain, finite = all_gains[k], True
+            for i in range(n_psi):
+                ahead[i] = values[i]
+                finite &= np.isfinite(values[i])
+            for i in range(n_row):
+                gain[i] = values[n_psi + i]
+            if not (finite and np.isfinite(gain[0])):
+                for i in range(n_psi):
+                    ahead[i] = 0.0
+                for i in range(n_row):
+                    gain[i] = 0.0
+                place = 1 + m + m * n
+                for r in range(m):
+                    gain[place] = 1.0
+                    place += m - r
+
+    return look_back
