@@ -43,6 +43,7 @@ FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "settings": F64_PTR,  # number of members, the five `NoiseSizes`, then the filter's settings
     "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
     "seed": types.int64, "normals": F64_PTR, "n_normals": types.intp,  # stored normals, if any
+    "order": types.intp,  # address of the function that sorts particles, 0 if none does
     "callback": types.intp, "integers": types.intp, "reals": types.intp,  # see `callbacks`
     "rank": types.intp, "n_ranks": types.intp, "exchange": types.intp,  # see `partition`
     "terms": F64_PTR, "health": F64_PTR,
@@ -101,7 +102,7 @@ class _NoResampling(NamedTuple):
 
 
 @njit_internal
-def no_resampler(settings, n, local):
+def no_resampler(settings, order, n, local):
     """Workspace of a filter that does not resample."""
     return _NoResampling(np.empty(0, np.int64))
 
@@ -138,7 +139,7 @@ def ensemble_filter(
     n_settings : int
         How many settings, as numbers, the filter has besides the number of members.
     resampler, resample : njit functions, optional
-        ``(settings, n, local) -> workspace`` with an array ``ancestors``, and
+        ``(settings, order, n, local) -> workspace`` with an array ``ancestors``, and
         ``(workspace, noise, j, k, n_effective, members, local) -> whether members were resampled``.
 
     Returns
@@ -150,7 +151,7 @@ def ensemble_filter(
 
     def run(
         table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
-        seed, normals, n_normals, callback, integers, reals, rank, n_ranks, exchange,
+        seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
         terms, health,
     ):  # fmt: skip
         given = carray(settings, (_N_LEADING + n_settings,))
@@ -161,7 +162,7 @@ def ensemble_filter(
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
         noise = _noise(seed, carray(normals, (n_normals,)), given, at, local)
         work = workspace(system, local, given[_N_LEADING:])
-        resampling = resampler(given[_N_LEADING:], system.n, local)
+        resampling = resampler(given[_N_LEADING:], order, system.n, local)
         members, width = _members(system.n, system.p, local), local.width
         to = (callback, integers, reals)
         state[0], state[1], state[2] = n_members, NONE, -1
