@@ -98,7 +98,7 @@ def simulator(system: StateSpaceModel) -> CompiledFunction:
         initialise(c, rng.standard_normal((n, 1)), x)
         j = 0
         for k in range(n_steps + 1):
-            states[k] = x[:, 0]
+            copy_into(states[k], x[:, 0])
             if j < steps.size and steps[j] == k:
                 observe(rng, c, inputs, k, t0 + k * dt, x, observations[j])
                 j += 1

@@ -185,7 +185,7 @@ def _emit_forecast(callback, j, k, particles, nothing, ancestors):
 
 def _run(
     table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
-    seed, normals, n_normals, callback, integers, reals, rank, n_ranks, exchange,
+    seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
     terms, health,
 ):  # fmt: skip
     given = carray(settings, (N_LEADING + 2,))
@@ -196,7 +196,8 @@ def _run(
     record = Record(at, carray(observed, (n_observations, system.p)), t0)
     out, state = carray(terms, (n_observations,)), carray(health, (3,))
     noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
-    resampling = resampler(given[N_LEADING], int(given[N_LEADING + 1]), system.n, local)
+    scheme = int(given[N_LEADING + 1])
+    resampling = resampler(given[N_LEADING], scheme, order, system.n, local)
     particles, guide = _particles(system.n, system.p, local), make_guide(system, record)
     members, to = particles.members, (callback, integers, reals)
     state[0], state[1], state[2] = n_members, NONE, -1

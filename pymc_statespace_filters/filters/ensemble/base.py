@@ -7,7 +7,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
 from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, padded
 from pymc_statespace_filters.errors import ModelError
@@ -72,6 +72,10 @@ class EnsembleFilterBase:
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""
         return 0
+
+    def ordering(self) -> EntryPoint | None:
+        """Return the function that sorts members, if the filter sorts them."""
+        return None
 
     def algorithm(self, system: System) -> "EnsembleFilterBase":
         """Return the filter that treats this system: itself, unless it reduces to another."""
@@ -192,6 +196,9 @@ class EnsembleFilterBase:
     def evaluation(self, system: System) -> CompiledFunction:
         """Bind the filter's entry point to one system."""
         self.entry.compile()
+        order = "" if (ordering := self.ordering()) is None else ordering.symbol
+        if ordering is not None:
+            ordering.compile()
         table = system_table(system, self.functions())
         evaluate, make_table, dt = self.entry.external, table.make, system.dt
         sizes = self.noise_sizes(system)
@@ -211,9 +218,9 @@ class EnsembleFilterBase:
                 inputs=inputs.ctypes.data, n_rows=inputs.shape[0], settings=settings.ctypes.data,
                 steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
                 t0=t0, seed=seed, normals=normals.ctypes.data, n_normals=normals.size,
-                callback=callback[0], integers=callback[1], reals=callback[2], rank=layout[0],
-                n_ranks=layout[1], exchange=layout[2], terms=terms.ctypes.data,
-                health=health.ctypes.data,
+                order=address_of(order), callback=callback[0], integers=callback[1],
+                reals=callback[2], rank=layout[0], n_ranks=layout[1], exchange=layout[2],
+                terms=terms.ctypes.data, health=health.ctypes.data,
             )  # fmt: skip
             evaluate(*arguments)
             keep_alive(table)
@@ -221,5 +228,5 @@ class EnsembleFilterBase:
             return terms, health
 
         return CompiledFunction(
-            run, key_of(f"{self!r} {settings.tolist()}", table.key, self.entry.key)
+            run, key_of(f"{self!r} {settings.tolist()} {order}", table.key, self.entry.key)
         )

@@ -13,8 +13,17 @@ two and 8 in more, finer than the distances between particles; those in one cell
 from typing import NamedTuple
 
 import numpy as np
+from numba import carray, types
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    I64_PTR,
+    EntryPoint,
+    arguments_class,
+    call_address,
+)
+from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal, njit_reassoc
 
 MOST_STATES = 8  # of 8 bits each: a key is one 64-bit integer
 
@@ -164,3 +173,42 @@ def _sort(n_bits, work):
         keys, moved_keys = moved_keys, keys
         order, moved_order = moved_order, order
     return order
+
+
+_ARGUMENTS = {
+    "particles": F64_PTR, "n": types.intp, "n_particles": types.intp, "x_mean": F64_PTR,
+    "spread": F64_PTR, "cells": I64_PTR, "keys": I64_PTR, "moved_keys": I64_PTR, "order": I64_PTR,
+    "moved_order": I64_PTR, "counts": I64_PTR,
+}  # fmt: skip
+
+_Arguments = arguments_class("_Arguments", _ARGUMENTS, __name__)
+
+
+def _order(
+    particles, n, n_particles, x_mean, spread, cells, keys, moved_keys, order, moved_order, counts
+):
+    N = (n_particles,)
+    rows = carray(particles, (1 + n, n_particles))
+    work = OrderWork(
+        carray(x_mean, (n,)), carray(spread, (n,)), carray(cells, (n, n_particles)),
+        carray(keys, N), carray(moved_keys, N), carray(order, N), carray(moved_order, N),
+        carray(counts, (_DIGITS,)),
+    )  # fmt: skip
+    copy_into(work.order, order_particles(rows[0], rows[1:], work))
+
+
+ORDER_PARTICLES = EntryPoint(_order, _ARGUMENTS, "order_particles", digest("order_particles"))
+"""`order_particles`, compiled only for filters that sort."""
+
+
+@njit_internal
+def order_at(address, particles, work):
+    """Call `ORDER_PARTICLES` at its address; ``particles`` (1 + n, N) are weights and states."""
+    n, n_particles = np.int64(particles.shape[0] - 1), np.int64(particles.shape[1])
+    arguments = _Arguments(
+        particles=particles, n=n, n_particles=n_particles, x_mean=work.x_mean, spread=work.spread,
+        cells=work.cells, keys=work.keys, moved_keys=work.moved_keys, order=work.order,
+        moved_order=work.moved_order, counts=work.counts,
+    )  # fmt: skip
+    call_address(address, arguments)
+    return work.order

@@ -16,6 +16,7 @@ from pymc_statespace_filters.compiler.numerics.small_cholesky import (
 )
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.reductions import (
+    FIRST_ROW,
     allgather_sums,
     sum_members,
     sum_products,
@@ -93,20 +94,22 @@ def forecast_means(members, log_terms, terms, has_terms, local, moments, is_norm
     ``has_terms`` tells whether to sum ``log_terms`` too.
     """
     n, p = moments.P_xd.shape
-    sum_values(members.alive, local, 0)
-    sum_spread(members.w, local, 1)
-    sum_members(members.w, members.X, local, 2)
-    sum_members(members.w, members.D, local, 2 + n)
+    of_alive, of_spread, of_x = FIRST_ROW, FIRST_ROW + 1, FIRST_ROW + 2
+    of_d, of_terms = of_x + n, of_x + n + p
+    sum_values(members.alive, local, of_alive)
+    sum_spread(members.w, local, of_spread)
+    sum_members(members.w, members.X, local, of_x)
+    sum_members(members.w, members.D, local, of_d)
     if has_terms:
-        weigh(log_terms, terms, local, 2 + n + p)
-    allgather_sums(local, 2 + n + p + 3 * has_terms)
-    n_alive, spread = total(local, 0), total(local, 1)
+        weigh(log_terms, terms, local, of_terms)
+    allgather_sums(local, of_terms + 3 * has_terms)
+    n_alive, spread = total(local, of_alive), total(local, of_spread)
     weight = 1.0 if is_normalised else n_alive
     for a in range(n):
-        moments.x_mean[a] = total(local, 2 + a) / weight
+        moments.x_mean[a] = total(local, of_x + a) / weight
     for b in range(p):
-        moments.d_mean[b] = total(local, 2 + n + b) / weight
-    log_sum, n_effective = total_weight(local, 2 + n + p) if has_terms else (0.0, 0.0)
+        moments.d_mean[b] = total(local, of_d + b) / weight
+    log_sum, n_effective = total_weight(local, of_terms) if has_terms else (0.0, 0.0)
     return Forecast(n_alive, spread, log_sum, n_effective)
 
 
@@ -120,7 +123,7 @@ def forecast_covariances(members, d, divisor, local, moments):
     """
     w, X, D, P_xd, P_dd = members.w, members.X, members.D, moments.P_xd, moments.P_dd
     n, p = P_xd.shape
-    sum_products(w, X, moments.x_mean, D, moments.d_mean, local, 0)
+    sum_products(w, X, moments.x_mean, D, moments.d_mean, local, FIRST_ROW)
     sum_products(w, D, moments.d_mean, D, moments.d_mean, local, n * p)
     allgather_sums(local, (n + p) * p)
     for b in range(p):

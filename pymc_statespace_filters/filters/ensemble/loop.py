@@ -43,6 +43,7 @@ FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "settings": F64_PTR,  # number of members, the five `NoiseSizes`, then the filter's settings
     "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
     "seed": types.int64, "normals": F64_PTR, "n_normals": types.intp,  # stored normals, if any
+    "order": types.intp,  # address of the function that sorts particles, 0 if none does
     "callback": types.intp, "integers": types.intp, "reals": types.intp,  # see `callbacks`
     "rank": types.intp, "n_ranks": types.intp, "exchange": types.intp,  # see `partition`
     "terms": F64_PTR, "health": F64_PTR,
@@ -103,7 +104,7 @@ class _NoResampling(NamedTuple):
 
 
 @njit_internal
-def no_resampler(settings, n, local):
+def no_resampler(settings, order, n, local):
     """Workspace of a filter that does not resample."""
     return _NoResampling(np.empty(0, np.int64))
 
@@ -140,7 +141,7 @@ def ensemble_filter(
     n_settings : int
         How many settings, as numbers, the filter has besides the number of members.
     resampler, resample : njit functions, optional
-        ``(settings, n, local) -> workspace`` with an array ``ancestors``, and
+        ``(settings, order, n, local) -> workspace`` with an array ``ancestors``, and
         ``(workspace, noise, j, k, n_effective, members, local) -> whether members were resampled``.
 
     Returns
@@ -152,7 +153,7 @@ def ensemble_filter(
 
     def run(
         table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
-        seed, normals, n_normals, callback, integers, reals, rank, n_ranks, exchange,
+        seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
         terms, health,
     ):  # fmt: skip
         given = carray(settings, (N_LEADING + n_settings,))
@@ -163,7 +164,7 @@ def ensemble_filter(
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
         noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
         work = workspace(system, local, given[N_LEADING:])
-        resampling = resampler(given[N_LEADING:], system.n, local)
+        resampling = resampler(given[N_LEADING:], order, system.n, local)
         members = new_members(np.empty((system.n, local.size)), system.p, local)
         width = local.width
         to = (callback, integers, reals)

@@ -9,6 +9,7 @@ from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, ancestral_smoother
 from pymc_statespace_filters.filters.ensemble.backward_simulation import backward_simulation
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
+from pymc_statespace_filters.filters.ensemble.hilbert_sort import ORDER_PARTICLES
 from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
 from pymc_statespace_filters.filters.ensemble.noise import resampling_normals
 from pymc_statespace_filters.filters.ensemble.resampling import (
@@ -26,8 +27,8 @@ _N_SETTINGS = 2  # threshold of resampling, number of its scheme
 
 
 @njit_internal
-def _resampler(settings, n, local):
-    return resampler(settings[0], int(settings[1]), n, local)
+def _resampler(settings, order, n, local):
+    return resampler(settings[0], int(settings[1]), order, n, local)
 
 
 @njit_internal
@@ -87,6 +88,10 @@ class ParticleFilter(EnsembleFilterBase):
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""
         return n_normals(self.resampling, self.n_particles)
+
+    def ordering(self) -> EntryPoint | None:
+        """Return the function that sorts particles, if the scheme does."""
+        return ORDER_PARTICLES if self.resampling == "sorted" else None
 
     def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
         """Compile backward simulation, or where a step has no density the ancestral smoother."""

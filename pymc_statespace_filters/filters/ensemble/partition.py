@@ -13,7 +13,7 @@ from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 
-MEMBERS, BLOCKS = BLOCK, 1
+MEMBERS, BLOCKS = np.int64(BLOCK), np.int64(1)
 """Columns of a block: an array has a column for each member, or one for each block.
 
 With one column a block, an array may also be any list whose columns are dealt out evenly.
@@ -49,4 +49,4 @@ def allgather(layout, array, per_block):
     """Fill the columns of a contiguous array (rows, columns) that are not our own."""
     if layout.exchange != 0:
         rows, columns = np.int64(array.shape[0]), np.int64(array.shape[1])
-        call_address(layout.exchange, (array, rows, columns, np.int64(per_block)))
+        call_address(layout.exchange, (array, rows, columns, per_block))

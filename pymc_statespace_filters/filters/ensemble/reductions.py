@@ -28,6 +28,9 @@ from pymc_statespace_filters.filters.ensemble.partition import (
 HALVES = (32, 16, 8, 4, 2, 1)
 """The halves of a block, then of its first half, and so on."""
 
+FIRST_ROW = np.int64(0)
+"""The first row of sums; numba would compile a function once more for a literal 0."""
+
 
 class LocalPartition(NamedTuple):
     """The members of this rank among those of all ranks, and scratch of sums over members.
@@ -180,15 +183,15 @@ def sum_products(w, X, x_mean, Y, y_mean, local, row):
 @inline_always
 def count(flags, local):
     """How many flags of all members are set."""
-    sum_values(flags, local, 0)
-    allgather_sums(local, 1)
-    return total(local, 0)
+    sum_values(flags, local, FIRST_ROW)
+    allgather_sums(local, FIRST_ROW + 1)
+    return total(local, FIRST_ROW)
 
 
 @njit_internal
 def weighted_mean(w, X, total_weight, local, out):
     """Mean of each row of X; ``total_weight`` is the sum of w. Zero weights may have NaN."""
-    sum_members(w, X, local, 0)
+    sum_members(w, X, local, FIRST_ROW)
     allgather_sums(local, X.shape[0])
     for a in range(out.size):
         out[a] = total(local, a) / total_weight
@@ -199,7 +202,7 @@ def weighted_mean(w, X, total_weight, local, out):
 def weighted_cov(w, X, x_mean, Y, y_mean, divisor, local, out):
     """Covariances sum_i w_i (X_ai - mean) (Y_bi - mean) / divisor; zero weights as above."""
     n, p = out.shape
-    sum_products(w, X, x_mean, Y, y_mean, local, 0)
+    sum_products(w, X, x_mean, Y, y_mean, local, FIRST_ROW)
     allgather_sums(local, n * p)
     for a in range(n):
         for b in range(p):

@@ -22,7 +22,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
     MOST_STATES,
     OrderWork,
-    order_particles,
+    order_at,
     order_workspace,
 )
 from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
@@ -53,19 +53,20 @@ def multinomial(z, points):
 
 POINTS = {"systematic": systematic, "multinomial": multinomial, "sorted": systematic}
 SCHEMES = tuple(POINTS)
-_MULTINOMIAL, _SORTED = SCHEMES.index("multinomial"), SCHEMES.index("sorted")
+_MULTINOMIAL = SCHEMES.index("multinomial")
 
 
 class Resampling(NamedTuple):
     """When and how to resample, and scratch.
 
+    ``order`` is the address of the entry point that sorts particles, 0 if they are not sorted.
     ``all_particles`` (1 + n, N) holds weights and states of the particles of all ranks,
     ``cumulative`` the cumulative weights at the end of each block.
     """
 
     threshold: float
     multinomial: bool
-    in_order: bool
+    order: int
     always: bool
     points: np.ndarray
     ancestors: np.ndarray
@@ -76,12 +77,12 @@ class Resampling(NamedTuple):
 
 
 @njit_internal
-def resampler(fraction, scheme, n_states, local):
+def resampler(fraction, scheme, order, n_states, local):
     """Settings and scratch: resample below ``fraction`` of the particles, by scheme number."""
-    N, in_order = local.n_members, scheme == _SORTED
-    n_ordered = N if in_order else 0
+    N = local.n_members
+    n_ordered = N if order != 0 else 0
     return Resampling(
-        fraction * N, scheme == _MULTINOMIAL, in_order, fraction == 1.0,
+        fraction * N, scheme == _MULTINOMIAL, order, fraction == 1.0,
         np.empty(N + 1), np.empty(local.size, np.int64),
         np.empty((1 + n_states, N)), np.empty(local.sums.shape[1]),
         order_workspace(n_states, n_ordered), np.empty(n_ordered),
@@ -111,11 +112,12 @@ def resample(resampling, z, w, X, local):
         multinomial(z, points)
     else:
         systematic(z, points)
-    gather_particles(w, X, local, resampling.all_particles)
-    w_all, X_all = resampling.all_particles[0], resampling.all_particles[1:]
+    particles = resampling.all_particles
+    gather_particles(w, X, local, particles)
+    w_all, X_all = particles[0], particles[1:]
     local_points = points[local.first :]
-    if resampling.in_order:
-        order = order_particles(w_all, X_all, resampling.order_work)
+    if resampling.order != 0:
+        order = order_at(resampling.order, particles, resampling.order_work)
         w_ordered = resampling.w_ordered
         choose_in_order(w_all, order, local_points, w_ordered, resampling.cumulative, ancestors)
     else:

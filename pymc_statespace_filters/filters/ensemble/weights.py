@@ -12,6 +12,7 @@ from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reas
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK
 from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
 from pymc_statespace_filters.filters.ensemble.reductions import (
+    FIRST_ROW,
     HALVES,
     allgather_sums,
     sum_squares,
@@ -140,13 +141,13 @@ def normalise_weights(log_w, w, local):
     """
     log_total, n_effective = log_sum(log_w, w, local)
     if log_total > -np.inf:
-        normalise_local(log_total, log_w, w, local, 0)
+        normalise_local(log_total, log_w, w, local, FIRST_ROW)
     return log_total, n_effective
 
 
 @njit_internal
 def log_sum(log_w, scratch, local):
     """Log of the sum of the weights of all members, and their effective number."""
-    weigh(log_w, scratch, local, 0)
-    allgather_sums(local, 3)
-    return total_weight(local, 0)
+    weigh(log_w, scratch, local, FIRST_ROW)
+    allgather_sums(local, FIRST_ROW + 3)
+    return total_weight(local, FIRST_ROW)

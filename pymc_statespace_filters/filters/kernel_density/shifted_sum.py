@@ -141,7 +141,7 @@ def _sum_tails(layout, sources, targets, n_dims, works):
     complete_points(layout, sources, n_dims)
     complete_points(layout, targets, n_dims)
     logs, y, v = targets.rows[0], sources.rows[1:], targets.rows[1:]
-    n_missed = 0
+    n_missed = np.int64(0)  # for a literal 0 numba would compile `_sum_shifted` once more
     for i in range(targets.size):
         if not logs[i] > _LOG_FLOOR:
             missed[n_missed] = i

@@ -1,5 +1,6 @@
 """Entries: called by name and by address, and compiled once."""
 
+import gc
 from functools import partial
 from types import FunctionType
 
@@ -112,3 +113,23 @@ def test_code_is_kept_for_its_module():
         moved = FunctionType(function.__code__, {"__name__": module})
         keys.append(CACHED_SRC_FUNCTIONS[cached_on_disk(njit(moved), "key").py_func])
     assert keys[0] != keys[1]
+
+
+def test_garbage_collection_pauses_during_a_compilation_and_is_left_as_it_was(monkeypatch):
+    during = []
+
+    class Compilation(entries.CFunc):
+        def compile(self):
+            during.append(gc.isenabled())
+            super().compile()
+
+    monkeypatch.setattr(entries, "CFunc", Compilation)
+    EntryPoint(scale, ARGUMENTS, "scale", None).compile()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        EntryPoint(scale, ARGUMENTS, "scale", None).compile()
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+    assert during == [False, False]
