@@ -53,6 +53,9 @@ from pymc_statespace_filters.filters.system_table import (
 )
 
 
+_NUMBER_BYTES = 8
+
+
 class _Particles(NamedTuple):
     """Members, with what guided moves add to them.
 
@@ -161,11 +164,16 @@ def _resample(guide, j, k, log_total, resampling, z, particles, local):
 
 
 @njit_internal
-def _move(system, guide, record, k, z, particles, local):
-    """Move the particles from step k to k + 1."""
-    t, gains = record.t0 + k * system.dt, guide.gains[k, 1:].ctypes.data
-    propagate_guided(system, k, t, z, local.width, particles.members.X, gains)
-    particles.log_det[0] += guide.gains[k, 0]
+def _move(system, guide, record, noise, first, last, particles, local):
+    """Move the particles from one step to another."""
+    X, gains, log_det = particles.members.X, guide.gains, 0.0
+    row = np.int64(gains.ctypes.data) + _NUMBER_BYTES * (first * gains.shape[1] + 1)
+    for k in range(first, last):
+        t, z = record.t0 + k * system.dt, process_normals(noise, k)
+        propagate_guided(system, k, t, z, local.width, X, row)
+        row += _NUMBER_BYTES * gains.shape[1]
+        log_det += gains[k, 0]
+    particles.log_det[0] += log_det
 
 
 @njit_internal
@@ -207,8 +215,9 @@ def _run(
     _emit_forecast(to, -1, k, particles, nothing, ancestors)
     for j in range(n_observations):
         while k < at[j]:
-            _move(system, guide, record, k, process_normals(noise, k), particles, local)
-            k += 1
+            until = at[j] if callback == 0 else k + 1
+            _move(system, guide, record, noise, k, until, particles, local)
+            k = until
             _emit_forecast(to, j, k, particles, nothing, ancestors)
         if is_missing(record.observed, j):
             out[j] = 0.0

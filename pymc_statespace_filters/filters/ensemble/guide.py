@@ -37,8 +37,8 @@ from pymc_statespace_filters.filters.ensemble.information import (
 from pymc_statespace_filters.filters.outcomes import is_missing
 from pymc_statespace_filters.filters.system_table import follow, look_back
 
-_MOST_ITERATIONS = 6
-_SETTLED = 1e-3  # square of the move of the path, over the variance of the state
+_MOST_ITERATIONS = 8
+_SETTLED = 0.01  # square of the move of the path, over the variance of the state
 
 
 class Record(NamedTuple):

@@ -15,18 +15,29 @@ _N_SWEEPS = 30  # of Jacobi rotations; a few suffice
 
 
 class Information(NamedTuple):
-    """``row`` (1 + n + n^2) holds log p(d | x), its score and its information matrix."""
+    """``row`` (1 + n + n^2) holds log p(d | x), its score and its information matrix.
+
+    The others are scratch: sums over points, a point, and the root of a covariance.
+    """
 
     row: np.ndarray
     score: np.ndarray
     matrix: np.ndarray
+    total: np.ndarray
+    point: np.ndarray
+    root: np.ndarray
+    floor: np.ndarray
+    active: np.ndarray
 
 
 @njit_internal
 def new_information(n):
     """Room for the information of one observation."""
     row = np.zeros(1 + n + n * n)
-    return Information(row, row[1 : 1 + n], row[1 + n :].reshape(n, n))
+    return Information(
+        row=row, score=row[1 : 1 + n], matrix=row[1 + n :].reshape(n, n), total=np.empty(row.size),
+        point=np.empty(n), root=np.empty((n, n)), floor=np.zeros(n), active=np.empty(n, np.bool_),
+    )  # fmt: skip
 
 
 @njit_internal
@@ -38,11 +49,10 @@ def information_at(system, record, j, x, out):
     """
     k, d = record.steps[j], record.observed[j]
     t = record.t0 + k * system.dt
-    observation_information(
-        system, k, t, d.ctypes.data, x.reshape(x.size, 1), out.row.ctypes.data
-    )
-    if not np.isfinite(out.row).all():
-        return False
+    observation_information(system, k, t, d.ctypes.data, x.reshape(x.size, 1), out.row.ctypes.data)
+    for i in range(out.row.size):
+        if not np.isfinite(out.row[i]):
+            return False
     if not system.has_gaussian_observation:
         _drop_negative(out.matrix)
     return True
@@ -55,33 +65,34 @@ def mean_information(system, record, j, x, cov, out):
     The mean over 2 n + 1 points is a better quadratic form than that at x where the log-density is
     skewed. That of Gaussian noise is taken at x.
     """
+    if system.has_gaussian_observation or not _take_root(cov, out):
+        return information_at(system, record, j, x, out)
+    n, scale = x.size, max(3.0, float(x.size))
     if not information_at(system, record, j, x, out):
         return False
-    if system.has_gaussian_observation:
-        return True
-    n = x.size
-    spread, floor, active = np.empty((n, n)), np.zeros(n), np.empty(n, np.bool_)
-    place = 0
-    for a in range(n):
-        for b in range(a + 1):
-            spread[a, b] = spread[b, a] = cov[place]
-            place += 1
-    if not semidefinite_cholesky(spread, floor, active):
-        return True
-    total, point, scale = out.row.copy(), x.copy(), max(3.0, n)
-    weight = 1.0 - n / scale
-    for i in range(total.size):
-        total[i] *= weight
+    for i in range(out.total.size):
+        out.total[i] = (1.0 - n / scale) * out.row[i]
     for a in range(n):
         for sign in (-1.0, 1.0):
             for b in range(n):
-                point[b] = x[b] + sign * math.sqrt(scale) * spread[b, a]
-            if not information_at(system, record, j, point, out):
+                out.point[b] = x[b] + sign * math.sqrt(scale) * out.root[b, a]
+            if not information_at(system, record, j, out.point, out):
                 return information_at(system, record, j, x, out)
-            for i in range(total.size):
-                total[i] += 0.5 / scale * out.row[i]
-    copy_into(out.row, total)
+            for i in range(out.total.size):
+                out.total[i] += 0.5 / scale * out.row[i]
+    copy_into(out.row, out.total)
     return True
+
+
+@njit_internal
+def _take_root(cov, out):
+    """Write the root of a covariance, given by its lower triangle."""
+    place = 0
+    for a in range(out.root.shape[0]):
+        for b in range(a + 1):
+            out.root[a, b] = out.root[b, a] = cov[place]
+            place += 1
+    return semidefinite_cholesky(out.root, out.floor, out.active)
 
 
 @njit_internal
