@@ -79,6 +79,30 @@ class System(Protocol):
         """Function (c, inputs, k, t, X, M): mean and variance of the next state, one state."""
 
     @property
+    def propagate_guided(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, gains, Z, X) that moves every member by guided noise."""
+
+    @property
+    def linearized_step(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, noise, X, out): the next states and their Jacobians."""
+
+    @property
+    def observation_information(self) -> CompiledFunction:
+        """Function (c, inputs, k, t, d, X, member) -> log p(d | x), score and information."""
+
+    @property
+    def smoothed_cov(self) -> CompiledFunction:
+        """Function (step, gains, cov) -> covariance of the next state given the record."""
+
+    @property
+    def step_back(self) -> CompiledFunction:
+        """Function (step, path, psi) -> psi before the step, and the gains of its noise."""
+
+    @property
+    def start_back(self) -> CompiledFunction:
+        """The same for the normals of the state at step 0."""
+
+    @property
     def is_linear(self) -> bool:
         """Whether the system is known to be linear."""
 

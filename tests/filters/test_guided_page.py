@@ -1,0 +1,168 @@
+"""GuidedPF: what every ensemble filter promises, and its behaviour at the edges."""
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from tests.filters.truth_systems import (
+    DOUBLE_WELL_SYSTEM,
+    double_well_parameters,
+    linear_system,
+)
+from tests.ranks import on_ranks
+from tests.references.records import (
+    BROAD_DOUBLE_WELL,
+    OSCILLATOR,
+    PRECISE_DOUBLE_WELL,
+    broad_double_well,
+    double_well_with_surprises,
+    oscillator_with_gaps,
+)
+
+WELL = double_well_parameters(BROAD_DOUBLE_WELL)
+
+
+def well_record(n=8):
+    record = broad_double_well()
+    return {"observed": record.observed[:n].copy(), "steps": record.steps[:n]}
+
+
+def log_likelihood(filter, record, given=WELL, seed=0):
+    return psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, given, **record, seed=seed)
+
+
+@pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
+def test_is_the_same_to_the_bit_on_any_number_of_ranks(resampling):
+    filter = psf.GuidedPF(300, resample_below=0.9, resampling=resampling)
+    run = filter.compile_distributed(compile_system(DOUBLE_WELL_SYSTEM)).function
+    record = well_record()
+    theta = np.array([WELL[name] for name in DOUBLE_WELL_SYSTEM.parameters])
+    arguments = (theta, record["steps"], record["observed"][:, None], np.zeros((0, 0)), 0.0, 3)
+    (alone,) = on_ranks(1, lambda ours: run(*arguments, ours.rank, ours.size, ours.exchange))
+    for n_ranks in (2, 3, 4):
+        for terms, health in on_ranks(
+            n_ranks, lambda ours: run(*arguments, ours.rank, ours.size, ours.exchange)
+        ):
+            assert np.array_equal(terms, alone[0])
+            assert np.array_equal(health, alone[1])
+    by_seed = log_likelihood(filter, record, seed=3)
+    assert np.array_equal(by_seed, alone[0])
+
+
+def test_stored_normals_give_what_their_seed_gives_and_small_moves_little():
+    """Correlated pseudo-marginal chains rest on the second statement."""
+    filter = psf.GuidedPF(100, resampling="sorted", resample_below=1.0)
+    record = well_record()
+    theta = np.array([WELL[name] for name in DOUBLE_WELL_SYSTEM.parameters])
+    observed, no_inputs = record["observed"][:, None], np.zeros((0, 0))
+    normals = evaluator(StoredNoise(DOUBLE_WELL_SYSTEM, filter))
+    evaluate = evaluator(LogLikelihoodOfNoise(DOUBLE_WELL_SYSTEM, filter))
+
+    def estimate(z):
+        return evaluate(theta, record["steps"], observed, no_inputs, 0.0, z)[0]
+
+    (stored,) = normals(record["steps"], 3)
+    assert np.array_equal(estimate(stored), log_likelihood(filter, record, seed=3))
+    moved, other = [], []
+    for seed in range(4, 24):
+        (fresh,) = normals(record["steps"], seed)
+        there = estimate(0.999 * stored + np.sqrt(1.0 - 0.999**2) * fresh)
+        moved.append(there.sum() - estimate(stored).sum())
+        other.append(estimate(fresh).sum() - estimate(stored).sum())
+    assert np.std(moved) < 0.3 * np.std(other)
+
+
+def test_a_wholly_missing_row_is_as_if_it_were_not_there():
+    filter, record = psf.GuidedPF(50), well_record()
+    record["observed"][[2, 5]] = np.nan
+    seen = ~np.isnan(record["observed"])
+    terms = log_likelihood(filter, record)
+    without = log_likelihood(filter, {name: value[seen] for name, value in record.items()})
+    assert terms[~seen].tolist() == [0.0, 0.0]
+    assert terms[seen] == pytest.approx(without, abs=1e-10)
+
+
+def test_nothing_observed_moves_particles_by_their_own_noise():
+    record = well_record(4)
+    record["observed"][:] = np.nan
+    assert log_likelihood(psf.GuidedPF(50), record).tolist() == [0.0] * 4
+    runs = [
+        psf.run_filter(DOUBLE_WELL_SYSTEM, filter, WELL, **record, seed=5)
+        for filter in (psf.GuidedPF(50), psf.BootstrapPF(50))
+    ]
+    assert np.allclose(runs[0]["particles"], runs[1]["particles"], atol=1e-12)
+    assert np.allclose(runs[0]["weights"], 1 / 50)
+
+
+def test_equations_that_explode_leave_the_particles_unguided():
+    """Starts far out overflow within a few steps; others stay in a well and have weight."""
+    record = {"observed": np.array([1.0, 1.1]), "steps": np.array([20, 40])}
+    wild = WELL | {"alpha": 4.0, "beta": -4.0, "sigma": 0.6, "noise_var": 0.1}
+    wild |= {"initial_mean": 0.0, "initial_var": 144.0}
+    terms = log_likelihood(psf.GuidedPF(200), record, wild, seed=np.arange(20)).sum(axis=1)
+    assert np.isfinite(terms).all()
+    exact = log_likelihood(psf.BootstrapPF(200_000), record, wild).sum()
+    assert np.log(np.exp(terms).mean()) == pytest.approx(exact, abs=1.0)
+    lost = wild | {"initial_mean": 1e3, "initial_var": 0.5}
+    with pytest.warns(psf.FilterWarning, match="infinite or NaN"):
+        assert log_likelihood(psf.GuidedPF(50), record, lost).tolist() == [-np.inf, -np.inf]
+
+
+def test_carried_states_are_taken_from_the_reference():
+    """A carried switch picks one of two linear systems; it is known, so the estimate is exact."""
+
+    def transition(x, q):
+        return [pm.math.switch(x[1] > 0, 0.9, 0.2) * x[0] + q[0], x[1]]
+
+    switched = psf.StateSpaceModel(
+        transition=transition, process_noise=[[0.2]], observation=lambda x: [x[0]],
+        observation_noise=[[0.05]], initial_mean=[0.0, 1.0], initial_cov=np.diag([1.0, 0.0]),
+        states=["x", "on"], carried=["on"],
+    )  # fmt: skip
+    plain = psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + q[0]], process_noise=[[0.2]],
+        observation=lambda x: [x[0]], observation_noise=[[0.05]], initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )  # fmt: skip
+    record = {"observed": np.array([0.3, 2.5, 0.1]), "steps": np.array([0, 2, 5])}
+    exact = psf.log_likelihood(plain, psf.EKF(), {}, **record).sum()
+    terms = psf.log_likelihood(switched, psf.GuidedPF(10), {}, **record, seed=np.arange(3))
+    assert terms.sum(axis=1) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("what", ["filtered", "smoothed"])
+def test_states_of_a_linear_system_are_those_of_the_kalman_smoother(what):
+    steps, observed = oscillator_with_gaps()
+    with pm.Model():
+        pm.Normal("unused")
+        psf.StateSpace("d", linear_system(OSCILLATOR), psf.EKF(), steps=steps, observed=observed)
+        idata = psf.sample_dram(2, tune=2, chains=1, random_seed=1, progressbar=False,
+                                compute_convergence_checks=False)  # fmt: skip
+        function = psf.filtered_states if what == "filtered" else psf.smoothed_states
+        exact, guided = (
+            function(idata, filter=filter, extend_inferencedata=False, random_seed=2)
+            for filter in (psf.EKF(), psf.GuidedPF(4000))
+        )
+    (group,) = exact.children
+    scale = exact[group]["d_sd"].values
+    assert np.abs(exact[group]["d_mean"] - guided[group]["d_mean"]).max() < 0.25 * scale.max()
+    assert np.allclose(guided[group]["d_sd"], scale, rtol=0.25)
+
+
+def test_does_not_warn_where_it_is_right():
+    """The weights are uneven by design; those given the whole record count."""
+    record = double_well_with_surprises()
+    given = double_well_parameters(PRECISE_DOUBLE_WELL)
+    with pytest.warns(psf.FilterWarning):
+        log_likelihood(psf.BootstrapPF(500), record._asdict(), given)
+    log_likelihood(psf.GuidedPF(500), record._asdict(), given)
+
+
+@pytest.mark.parametrize("n_particles", [1, 2.5, "10"])
+def test_wrong_numbers_of_particles_are_refused(n_particles):
+    with pytest.raises(psf.ModelError, match="n_particles must be an integer"):
+        psf.GuidedPF(n_particles)
