@@ -33,6 +33,10 @@ from pytensor.tensor.subtensor import (
 )
 
 from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant, plain
+from pymc_statespace_filters.compiler.codegen.semidefinite import (
+    SemidefiniteCholesky,
+    unrolled_root,
+)
 
 
 class NotUnrollableError(Exception):
@@ -290,6 +294,7 @@ _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
     ((CAReduce,), _reduce),
     ((Dot,), _dot),
     ((Cholesky,), _cholesky),
+    ((SemidefiniteCholesky,), unrolled_root),
     ((SolveTriangular,), _solve_triangular),
     ((Blockwise,), _blockwise),
     ((Subtensor, AdvancedSubtensor), _subtensor),
