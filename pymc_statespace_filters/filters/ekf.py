@@ -1,6 +1,7 @@
 """The extended Kalman filter, thesis Eqs. 4.3-4.14: the equations as linear around the mean."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
@@ -60,6 +61,8 @@ class EKF(GaussianFilterBase):
 @dataclass(frozen=True)
 class Tangent:
     """Linearisation at the mean of the state, by exact Jacobians."""
+
+    has_short_rows: ClassVar[bool] = True
 
     def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
         """The state itself."""

@@ -159,8 +159,10 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     a, b = arguments
     out = np.empty((a.shape[0], b.shape[1]), dtype=object)
+    is_square = a.shape == b.T.shape and all(x is y for x, y in zip(a.flat, b.T.flat, strict=True))
     for i, j in np.ndindex(out.shape):
-        out[i, j] = _inner(arena, a[i, :], b[:, j])
+        mirrored = is_square and j < i  # of a matrix with its own transpose
+        out[i, j] = out[j, i] if mirrored else _inner(arena, a[i, :], b[:, j])
     return [out]
 
 

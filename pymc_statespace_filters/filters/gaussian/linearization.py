@@ -7,7 +7,7 @@ the same for all.
 
 from collections.abc import Mapping
 from functools import reduce
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import pytensor.tensor as pt
@@ -87,7 +87,12 @@ class Seen(NamedTuple):
 
 
 class Linearization(Protocol):
-    """How a filter linearises a system: an immutable, hashable object."""
+    """How a filter linearises a system: an immutable, hashable object.
+
+    ``has_short_rows`` says whether a row of the Jacobian of a prediction takes few operations.
+    """
+
+    has_short_rows: ClassVar[bool]
 
     def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
         """The Gaussian state in the coordinates of this linearisation."""

@@ -17,6 +17,7 @@ the mean of its covariance given x.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -24,7 +25,7 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
-from pymc_statespace_filters.compiler.lowering.symbols import transition_moments
+from pymc_statespace_filters.compiler.lowering.symbols import symbols_of, transition_moments
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.gaussian.linearization import GaussianState, Linear, Symbols
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -45,6 +46,8 @@ class SigmaPoints:
     alpha: float = 1.0
     beta: float = 0.0
     kappa: float | None = None
+
+    has_short_rows: ClassVar[bool] = False
 
     def squared_distance(self, n: int) -> float:
         """c^2 for n states: the points are c standard deviations from the mean."""
@@ -83,7 +86,7 @@ class SigmaPoints:
 def at_points(of: Callable, system: StateSpaceModel, values: Symbols) -> Moments:
     """Mean and covariance of an equation as a function of x, traced once."""
     names = ("theta", "x", "u", "t")
-    symbols = {name: values[name] for name in names}
+    symbols = {name: symbols_of(system)[name] for name in names}
     graph = FrozenFunctionGraph.from_io(list(symbols.values()), list(of(system, symbols)))
 
     def moments(x: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
