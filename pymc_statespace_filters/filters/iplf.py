@@ -153,22 +153,18 @@ class PosteriorLinearization(SigmaPoints):
 
         The sum is that of importance weights, and exact where p(d | x) is Gaussian in x.
         """
-        n = system.n
-        square = self.squared_distance(n)
-        (centre, root), distance = posterior.of_state(state), np.sqrt(square)
-        directions = pt.eye(n) - posterior.jac.T @ posterior.left
-
-        def log_term(weight: float, xi: TensorVariable, x: TensorVariable) -> TensorVariable:
-            return np.log(weight) + _log_p(system, {**values, "x": x}) - 0.5 * pt.sum(xi**2)
-
-        terms = [log_term(1.0 - n / square, posterior.mean, centre)] if n < square else []
-        for i in range(n):
-            for step in (distance, -distance):
-                xi, x = posterior.mean + step * directions[:, i], centre + step * root[:, i]
-                terms.append(log_term(0.5 / square, xi, x) + 0.5 * square)
-        stacked = pt.stack(terms)
-        largest = disconnected_grad(pt.max(stacked))
-        return largest + pt.log(pt.sum(pt.exp(stacked - largest))) + posterior.log_det
+        n, square = system.n, self.squared_distance(system.n)
+        xi = self.points(posterior.mean, pt.eye(n) - posterior.jac.T @ posterior.left)
+        (log_p,) = at_points(_log_p, system, values, ("u", "t", "d"))(
+            self.points(*posterior.of_state(state))
+        )
+        weights, squares = np.full(2 * n + 1, 0.5 / square), np.full(2 * n + 1, square)
+        weights[0], squares[0] = 1.0 - n / square, 0.0
+        first = 0 if weights[0] > 0.0 else 1
+        terms = log_p - 0.5 * pt.sum(xi**2, axis=1)
+        terms = terms[first:] + (np.log(weights[first:]) + 0.5 * squares[first:])
+        largest = disconnected_grad(pt.max(terms))
+        return largest + pt.log(pt.sum(pt.exp(terms - largest))) + posterior.log_det
 
 
 def _posterior(observation: Seen) -> _Posterior:
@@ -194,13 +190,13 @@ def _posterior(observation: Seen) -> _Posterior:
     )
 
 
-def _log_p(system: StateSpaceModel, values: Symbols) -> TensorVariable:
+def _log_p(system: StateSpaceModel, values: Symbols) -> list[TensorVariable]:
     """log p(d | x). A missing datum of distributions is replaced: its gradient would be NaN."""
     if system.gaussian_observation:
-        return observation_log_density(system, values)
+        return [observation_log_density(system, values)]
     missing = pt.isnan(values["d"])
     there = observation_log_density(system, {**values, "d": pt.switch(missing, 1.0, values["d"])})
-    return pt.switch(pt.any(missing), 0.0, there)
+    return [pt.switch(pt.any(missing), 0.0, there)]
 
 
 def _datum(system: StateSpaceModel, d: TensorVariable) -> TensorVariable:

@@ -76,8 +76,8 @@ def test_means_and_variances_are_those_of_scipy():
         on_unused_input="ignore",
     )(*(np.full(v.type.shape, 0.7) for v in symbols.values()))
     laws = [law for _, law in TABLE.values()]
-    np.testing.assert_allclose(mean, [law.mean() for law in laws], rtol=1e-12)
-    np.testing.assert_allclose(cov, np.diag([law.var() for law in laws]), rtol=1e-12)
+    np.testing.assert_allclose(mean, [law.mean() for law in laws], rtol=1e-7)
+    np.testing.assert_allclose(cov, np.diag([law.var() for law in laws]), rtol=1e-7)
 
 
 def test_normal_distributions_are_gaussian_noise():

@@ -292,7 +292,7 @@ def test_wrong_settings_are_named(make, message):
 
 
 def test_systems_too_large_to_be_written_out_run_on_arrays():
-    """Fourteen coupled states, half of them known at the start; a gradient is that of the EKF."""
+    """Fourteen coupled states, half of them known at the start."""
     n, steps = 14, np.array([0, 2, 3])
     A = 0.85 * np.eye(n) + 0.05 * np.roll(np.eye(n), 1, axis=1)
     B, C, start = 0.3 * np.eye(n)[:, ::2], np.eye(n)[::5], np.diag(np.arange(n) % 2.0)

@@ -15,13 +15,14 @@ of its own, without cancellation, and a singular P needs no inverse. Noise of th
 the mean of its covariance given x.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
@@ -30,7 +31,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.gaussian.linearization import GaussianState, Linear, Symbols
 from pymc_statespace_filters.system.model import StateSpaceModel
 
-Moments = Callable[[TensorVariable], tuple[TensorVariable, TensorVariable]]
+AtPoints = Callable[[TensorVariable], list[TensorVariable]]
+
+MAX_ROWS = 13  # of six states
 
 
 def check_kappa(kappa: float | None, n: int) -> None:
@@ -54,24 +57,25 @@ class SigmaPoints:
         kappa = max(3.0 - n, 0.0) if self.kappa is None else self.kappa
         return self.alpha**2 * (n + kappa)
 
-    def regress(self, moments: Moments, centre: TensorVariable, root: TensorVariable) -> Linear:
+    def points(self, centre: TensorVariable, root: TensorVariable) -> TensorVariable:
+        """Rows centre, centre + c l_i, centre - c l_i of a matrix (2 n + 1, n)."""
+        steps = np.sqrt(self.squared_distance(centre.type.shape[0])) * root.T
+        return pt.concatenate([centre[None, :], centre[None, :] + steps, centre[None, :] - steps])
+
+    def regress(self, moments: AtPoints, centre: TensorVariable, root: TensorVariable) -> Linear:
         """The line for y over N(centre, root root'); ``moments`` are those of y given x."""
         n = centre.type.shape[0]
         square = self.squared_distance(n)
-        y, cov = moments(centre)
-        slopes, bends, mean_cov = [], [], cov
-        for i in range(n):
-            step = np.sqrt(square) * root[:, i]
-            (plus, plus_cov), (minus, minus_cov) = moments(centre + step), moments(centre - step)
-            slopes.append((plus - minus) / (2.0 * np.sqrt(square)))
-            bends.append(0.5 * ((plus - y) + (minus - y)))
-            mean_cov += ((plus_cov - cov) + (minus_cov - cov)) / (2.0 * square)
-        bend = pt.stack(bends, axis=1)
+        y, cov = moments(self.points(centre, root))
+        plus, minus = y[1 : n + 1] - y[0], y[n + 1 :] - y[0]
+        bend = (0.5 * (plus + minus)).T
         shift = pt.sum(bend, axis=1) / square
         spread = bend - shift[:, None]
         of_centre = 2.0 - n / square - self.alpha**2 + self.beta
         remainder = spread @ spread.T / square + of_centre * pt.outer(shift, shift)
-        return Linear(y + shift, pt.stack(slopes, axis=1), mean_cov + remainder)
+        mean_cov = cov[0] + pt.sum(cov[1:] - cov[0], axis=0) / (2.0 * square)
+        jac = ((y[1 : n + 1] - y[n + 1 :]) / (2.0 * np.sqrt(square))).T
+        return Linear(y[0] + shift, jac, mean_cov + remainder)
 
     def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
         """The state by a root of its covariance, which may be singular."""
@@ -83,14 +87,30 @@ class SigmaPoints:
         return self.regress(moments, state.mean, state.root)
 
 
-def at_points(of: Callable, system: StateSpaceModel, values: Symbols) -> Moments:
-    """Mean and covariance of an equation as a function of x, traced once."""
-    names = ("theta", "x", "u", "t")
-    symbols = {name: symbols_of(system)[name] for name in names}
-    graph = FrozenFunctionGraph.from_io(list(symbols.values()), list(of(system, symbols)))
+def at_points(
+    of: Callable, system: StateSpaceModel, values: Symbols, names: Sequence[str] = ("u", "t")
+) -> AtPoints:
+    """What ``of(system, symbols)`` returns as a function of rows x; it is called once.
 
-    def moments(x: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
-        mean, cov = graph.bind([x if name == "x" else values[name] for name in names])
-        return mean, cov
+    A few rows are written one after the other, which leaves scalar code everything that it can
+    simplify. Many would be too much to compile, and are evaluated as one array.
+    """
+    symbols = {name: symbols_of(system)[name] for name in ("x", "theta", *names)}
+    traced = FrozenFunctionGraph.from_io(list(symbols.values()), list(of(system, symbols)))
+    others = [values[name] for name in list(symbols)[1:]]
 
-    return moments
+    def outputs(X: TensorVariable) -> list[TensorVariable]:
+        n_rows = X.type.shape[0]
+        if n_rows <= MAX_ROWS:
+            rows = [traced.bind([X[i], *others]) for i in range(n_rows)]
+            return [pt.stack(column) for column in zip(*rows, strict=True)]
+        x = symbols["x"].type("x")
+        found = traced.bind([x, *others])
+        stacked = vectorize_graph(found, {x: X})
+        return [
+            # What does not depend on x has no rows yet.
+            pt.specify_shape(rows + pt.zeros((n_rows, *one.type.shape)), (n_rows, *one.type.shape))
+            for one, rows in zip(found, stacked, strict=True)
+        ]
+
+    return outputs
