@@ -93,6 +93,7 @@ def _distributions(
 ) -> list[TensorVariable]:
     """The random variables that the user's function returned, one per observable."""
     graph = system.equations.observation_draw
+    assert graph is not None
     generators = [variable.type() for variable in graph.inputs[len(SYMBOLS) :]]
     given = symbols_of(system) | dict(symbols)
     (draw,) = graph.bind([*(given[name] for name in SYMBOLS), *generators])

@@ -94,6 +94,8 @@ class Linearization(Protocol):
 
     has_short_rows: ClassVar[bool]
 
+    def __hash__(self) -> int: ...
+
     def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
         """The Gaussian state in the coordinates of this linearisation."""
 
