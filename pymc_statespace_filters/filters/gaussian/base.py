@@ -97,8 +97,8 @@ class GaussianFilterBase:
         if not system.gaussian_observation:
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise; "
-                f"observation_dist works with IPLF, and both observation_dist and observation_logp "
-                f"with BootstrapPF, PFEnKF and, for one state, GridFilter"
+                f"observation_dist works with IPLF, and observation_dist and observation_logp work "
+                f"with the particle filters BootstrapPF and PFEnKF and, for one state, GridFilter"
             )
 
     def _check_not_carried(self, system: System) -> None:
