@@ -28,7 +28,7 @@ from .evidence import (
     marginal_modes,
     prior_sensitivity,
 )
-from .filters import EKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
+from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
 from .plots import (
     plot_average,
     plot_evidence,
@@ -50,6 +50,8 @@ from .system.record import nearest_steps
 __all__ = [
     "DRAM",
     "EKF",
+    "IPLF",
+    "UKF",
     "BootstrapPF",
     "CheckpointWarning",
     "DataMismatchError",

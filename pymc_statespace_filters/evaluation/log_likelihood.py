@@ -37,7 +37,7 @@ def log_likelihood(
     Parameters
     ----------
     system : StateSpaceModel
-    filter : EKF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
     params : mapping
         Parameter values by name; arrays broadcast to a shape S (a declared parameter's own shape
         comes last).

@@ -34,7 +34,7 @@ def run_filter(
     Parameters
     ----------
     system : StateSpaceModel
-    filter : EKF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
     params : mapping
         A value for every parameter.
     observed, steps, times, inputs, t0

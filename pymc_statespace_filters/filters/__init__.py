@@ -13,6 +13,7 @@ from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.guided_pf import GuidedPF
+from pymc_statespace_filters.filters.iplf import IPLF
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from pymc_statespace_filters.filters.protocol import (
     BatchFilter,
@@ -23,9 +24,12 @@ from pymc_statespace_filters.filters.protocol import (
     StatesFilter,
     System,
 )
+from pymc_statespace_filters.filters.ukf import UKF
 
 __all__ = [
     "EKF",
+    "IPLF",
+    "UKF",
     "BatchFilter",
     "BootstrapPF",
     "CompiledFunction",

@@ -35,7 +35,7 @@ class StateSpace(Continuous):
         Name of the variable.
     system : StateSpaceModel
         The equations.
-    filter : EKF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
         The filter that computes the likelihood.
     params : mapping, optional
         Parameters by name, numbers or expressions. A parameter not named here is the variable of

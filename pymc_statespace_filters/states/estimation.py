@@ -37,7 +37,7 @@ def filtered_states(
         The model of the draws; by default that of the ``with`` block.
     var_name : str, optional
         Name of a StateSpace variable; all of them by default.
-    filter : EKF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter, optional
+    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter, optional
         A filter to use instead of that of the variable.
     at : {"observations", "steps"}
         Times of the states: those of the observations, or every step from 0 to the last

@@ -33,6 +33,10 @@ from pytensor.tensor.subtensor import (
 )
 
 from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant, plain
+from pymc_statespace_filters.compiler.codegen.semidefinite import (
+    SemidefiniteCholesky,
+    unrolled_root,
+)
 
 
 class NotUnrollableError(Exception):
@@ -155,8 +159,10 @@ def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     a, b = arguments
     out = np.empty((a.shape[0], b.shape[1]), dtype=object)
+    is_square = a.shape == b.T.shape and all(x is y for x, y in zip(a.flat, b.T.flat, strict=True))
     for i, j in np.ndindex(out.shape):
-        out[i, j] = _inner(arena, a[i, :], b[:, j])
+        mirrored = is_square and j < i  # of a matrix with its own transpose
+        out[i, j] = out[j, i] if mirrored else _inner(arena, a[i, :], b[:, j])
     return [out]
 
 
@@ -290,6 +296,7 @@ _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
     ((CAReduce,), _reduce),
     ((Dot,), _dot),
     ((Cholesky,), _cholesky),
+    ((SemidefiniteCholesky,), unrolled_root),
     ((SolveTriangular,), _solve_triangular),
     ((Blockwise,), _blockwise),
     ((Subtensor, AdvancedSubtensor), _subtensor),

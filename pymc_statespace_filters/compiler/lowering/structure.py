@@ -19,6 +19,7 @@ from pymc_statespace_filters.compiler.lowering.symbols import (
     jacobian_of,
     process_noise_cov,
     symbols_of,
+    transition_moments,
 )
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -79,10 +80,7 @@ def has_smooth_transition(system: StateSpaceModel) -> bool:
 
 def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:
     """(g(x, 0), G Q G^T) of a system of one state with additive noise."""
-    q = pt.zeros((system.m,))
-    mean = call(system.equations.transition, system, {**symbols, "q": q})
-    gain = jacobian_of(mean, q)
-    cov = process_noise_cov(system, symbols, gain)
+    mean, cov = transition_moments(system, symbols)
     return pt.specify_shape(pt.concatenate([mean, cov.ravel()]), (2,))
 
 

@@ -49,6 +49,15 @@ def process_noise_cov(
     return gain @ call(system.equations.process_noise, system, symbols) @ gain.T
 
 
+def transition_moments(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> tuple[TensorVariable, TensorVariable]:
+    """g(x, 0) and G Q G^T, the noise linearised at zero; exact where it is additive given x."""
+    q = pt.zeros((system.m,))
+    mean = call(system.equations.transition, system, {**symbols, "q": q})
+    return mean, process_noise_cov(system, symbols, jacobian_of(mean, q))
+
+
 def observation_moments(
     system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
 ) -> tuple[TensorVariable, TensorVariable]:

@@ -1,1 +1,1 @@
-"""Recursion, derivative, batch evaluation and smoother of the extended Kalman filter."""
+"""Linearisation, recursion, derivative, batch evaluation and smoother of Gaussian filters."""

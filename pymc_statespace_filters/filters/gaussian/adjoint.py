@@ -77,12 +77,16 @@ def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
     ``n_explicit`` elements of the cotangent the row of the Jacobian is computed explicitly: the
     processor does so ahead of time, and the cotangent then takes one multiplication. The other
     elements are propagated through the equations, with fewer operations in all. The numbers of
-    explicit elements were chosen by measurement.
+    explicit elements were chosen by measurement; a linearisation that evaluates the equations at
+    many points has none, because each row is as long as a propagation.
     """
     theta, s = (recursion.predict.graph.inputs[name] for name in ("theta", "s"))
     s_bar, c_bar = s.type("s_bar"), theta.type("c_bar")
     term_bar = pt.tensor("term_bar", shape=(), dtype="float64")
     n, size = recursion.system.n, recursion.size
+    of_predict, of_update = size if n == 1 else n, size + 1 if n <= 2 else 0
+    if not recursion.linearization.has_short_rows:
+        of_predict = of_update = 0
 
     def vjp(part: VectorFunction, wrt: list, cotangents: dict, n_explicit: int) -> VectorFunction:
         values = list(cotangents.values())
@@ -101,8 +105,8 @@ def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
         "parameters": recursion.parts()["parameters"],
         "zeros": VectorFunction("c", Graph({"theta": theta}, zeros), (False, False)),
         "start_vjp": vjp(recursion.start, [theta], state, 0),
-        "predict_vjp": vjp(recursion.predict, [s, theta], state, size if n == 1 else n),
-        "update_vjp": vjp(recursion.update, [s, theta], state_and_term, size + 1 if n <= 2 else 0),
+        "predict_vjp": vjp(recursion.predict, [s, theta], state, of_predict),
+        "update_vjp": vjp(recursion.update, [s, theta], state_and_term, of_update),
     }
 
 

@@ -23,8 +23,10 @@ smoothed means. Of the simulated path only the filter's error e = x - m is neede
 and the path drawn is m + e - P l*, where l* is the adjoint l of the innovations y - y+. Without the
 backward pass, m + e is a draw from N(m, P), obtained without a square root of P.
 
-F, B and H are Jacobians at the filter's means. For linear systems the result is exact; otherwise it
-is the extended smoother, and the path is a draw from the system linearised around those means.
+F, B and H are those of the filter's linearisation: Jacobians at its means, or regressions over its
+states, where B q is drawn from the covariance of the step's noise, with what the regression leaves.
+For linear systems the result is exact; otherwise it is the extended smoother or the one by sigma
+points, and the path is a draw from the linearised system.
 """
 
 from collections.abc import Sequence
@@ -35,11 +37,10 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
 from pymc_statespace_filters.filters.gaussian.linearization import (
-    Innovation,
     Symbols,
-    innovation_moments,
-    linearize_transition,
+    innovation_of,
     pack,
     unpack,
 )
@@ -50,8 +51,8 @@ class BrysonFrazier:
     """The functions of the smoother of a Gaussian filter.
 
     The vector ``s`` is the filter's, followed by the simulated error (n,); the adjoint ``s_bar`` is
-    l, the lower triangle of L, and l*. A column of ``Z`` holds the noise of one step: q, then
-    standard normals for v.
+    l, the lower triangle of L, and l*. A column of ``Z`` holds the noise of one step: q if
+    ``draws_q``, standard normals for each state otherwise, then standard normals for v.
     """
 
     def __init__(self, recursion: GaussianFilterFunctions) -> None:
@@ -63,7 +64,17 @@ class BrysonFrazier:
         vector = {"dtype": "float64", "shape": (self.size,)}
         self._whole, self._adjoint = pt.tensor("s", **vector), pt.tensor("s_bar", **vector)
         self._error = pt.tensor("error", dtype="float64", shape=(system.n,))
-        self._z = pt.tensor("z", dtype="float64", shape=(system.m + system.p,))
+        state = recursion.linearization.state(*self._moments())
+        self._step = recursion.linearization.transition(system, self._symbols, state)
+        self._seen = recursion.linearization.observation(system, self._symbols, state)
+        self._state_jac, self._observation_jac = map(
+            state.by_state, (self._step.jac, self._seen.jac)
+        )
+        self._innovation = innovation_of(state, self._seen)
+        self._update_jac = pt.eye(system.n) - self._innovation.gain @ self._observation_jac
+        self.draws_q = self._step.noise_jac is not None
+        self.n_noises = system.m if self.draws_q else system.n
+        self._z = pt.tensor("z", dtype="float64", shape=(self.n_noises + system.p,))
 
     def forwards(self) -> dict[str, VectorFunction]:
         """The filter together with a simulated error of it.
@@ -139,43 +150,41 @@ class BrysonFrazier:
         return *unpack(self._adjoint[:size], self.recursion.system.n), self._adjoint[size:]
 
     def _predicted_error(self) -> TensorVariable:
-        system, (mean, _) = self.recursion.system, self._moments()
-        transition = linearize_transition(system, self._symbols, mean)
-        error = transition.state_jac @ self._error
-        return error + transition.noise_jac @ self._z[: system.m] if system.m else error
+        error, noise = self._state_jac @ self._error, self._z[: self.n_noises]
+        if self._step.noise_cov is None:
+            return error
+        noise_jac = self._step.noise_jac
+        return (
+            error + (noise_jac if self.draws_q else semidefinite_root(self._step.noise_cov)) @ noise
+        )
 
-    def _innovation(self) -> tuple[Innovation, TensorVariable]:
-        """The linearised observation, and the innovation y+ of the simulated record.
+    def _simulated(self) -> TensorVariable:
+        """The innovation y+ of the simulated record.
 
-        For a missing component y+ is pure noise, which the gain and H multiply by zero.
+        For a missing component it is pure noise, which the gain and H multiply by zero.
         """
-        system = self.recursion.system
-        innovation = innovation_moments(system, self._symbols, *self._moments())
-        noise = cholesky(innovation.noise_cov, lower=True) @ self._z[system.m :]
-        return innovation, innovation.observation_jac @ self._error + noise
+        noise = cholesky(self._seen.noise_cov, lower=True) @ self._z[self.n_noises :]
+        return self._observation_jac @ self._error + noise
 
     def _updated_error(self) -> TensorVariable:
-        innovation, simulated = self._innovation()
-        return self._error - innovation.gain @ simulated
+        return self._error - self._innovation.gain @ self._simulated()
 
     def _predict_adjoint(self) -> TensorVariable:
         vector, matrix, drawn = self._adjoints()
-        mean, _ = self._moments()
-        back = linearize_transition(self.recursion.system, self._symbols, mean).state_jac.T
+        back = self._state_jac.T
         return pt.concatenate([pack(back @ vector, back @ matrix @ back.T), back @ drawn])
 
     def _update_adjoint(self) -> TensorVariable:
         vector, matrix, drawn = self._adjoints()
-        innovation, simulated = self._innovation()
-        back = innovation.update_jac.T
+        back, residual = self._update_jac.T, self._seen.residual
 
         def whitened(rows: TensorVariable, b_ndim: int) -> TensorVariable:
             """S^-1/2 times rows."""
-            return solve_triangular(innovation.chol, rows, lower=True, b_ndim=b_ndim)
+            return solve_triangular(self._innovation.chol, rows, lower=True, b_ndim=b_ndim)
 
-        half = whitened(innovation.observation_jac, 2)  # H' S^-1 y = (S^-1/2 H)' (S^-1/2 y)
-        vector = back @ vector - half.T @ whitened(innovation.residual, 1)
-        drawn = back @ drawn - half.T @ whitened(innovation.residual - simulated, 1)
+        half = whitened(self._observation_jac, 2)  # H' S^-1 y = (S^-1/2 H)' (S^-1/2 y)
+        vector = back @ vector - half.T @ whitened(residual, 1)
+        drawn = back @ drawn - half.T @ whitened(residual - self._simulated(), 1)
         return pt.concatenate([pack(vector, back @ matrix @ back.T + half.T @ half), drawn])
 
     def _smoothed(self) -> list[TensorVariable]:

@@ -1,19 +1,22 @@
-"""Graphs of a system linearised around the mean of a Gaussian state.
+"""What a Gaussian filter is made of: a linearisation of its system, and Kalman's algebra on it.
 
-Used by the extended Kalman filter and its smoother. The state of the filter is one vector: the
-mean, then the lower triangle of the covariance.
+The state of the filter is one vector: the mean, then the lower triangle of the covariance. Filters
+differ in how they linearise a function of a Gaussian state; prediction, update and smoother are
+the same for all.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from functools import reduce
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.gaussian import without_missing
-from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, observation_moments
+from pymc_statespace_filters.compiler.codegen.semidefinite import regular_factor
+from pymc_statespace_filters.compiler.lowering.gaussian import log_normal, without_missing
+from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 Symbols = Mapping[str, TensorVariable]
@@ -38,54 +41,136 @@ def unpack(s: TensorVariable, n: int) -> tuple[TensorVariable, TensorVariable]:
     return s[:n], s[n:][position]
 
 
-class LinearizedTransition(NamedTuple):
-    """One linearised step: x' = mean + A (x - previous mean) + B q (Eq. 4.9)."""
+class GaussianState(NamedTuple):
+    """The state as x = mean + root xi with xi ~ N(0, cov); a matrix that is None is the identity.
+
+    Jacobians of a filter are derivatives by xi. The EKF has xi = x - mean; sigma points need a
+    root of the covariance, and xi is white.
+    """
 
     mean: TensorVariable
-    state_jac: TensorVariable
-    noise_jac: TensorVariable
+    root: TensorVariable | None
+    cov: TensorVariable | None
+
+    def by_state(self, jac: TensorVariable) -> TensorVariable:
+        """The derivative by x for that by xi; in directions without spread any would do."""
+        if self.root is None:
+            return jac
+        return solve_triangular(regular_factor(self.root).T, jac.T, lower=False, b_ndim=2).T
 
 
-class Innovation(NamedTuple):
-    """One linearised observation: residual = C (x - mean) + e, e ~ N(0, noise_cov).
+class Linear(NamedTuple):
+    """A linearised function: y = mean + jac xi + noise, noise ~ N(0, noise_cov).
 
-    ``chol`` is the lower factor of ``innovation_cov``, ``gain`` the Kalman gain K and
-    ``update_jac`` is I - K C. Rows of C are zero for missing components.
+    ``noise_cov`` includes what the line does not describe, and is None without noise. Where
+    ``noise_jac`` is given, the noise is noise_jac q with the process noise q of the system.
+    """
+
+    mean: TensorVariable
+    jac: TensorVariable
+    noise_cov: TensorVariable | None
+    noise_jac: TensorVariable | None = None
+
+
+class Seen(NamedTuple):
+    """A linearised observation: residual = jac xi + e, e ~ N(0, noise_cov).
+
+    Missing components have zero residuals and rows of ``jac``, and independent unit noise. ``term``
+    is log p(d_j | d_1 .. d_{j-1}), None where it is the density of the residual.
     """
 
     residual: TensorVariable
     observed: TensorVariable
-    observation_jac: TensorVariable
+    jac: TensorVariable
     noise_cov: TensorVariable
+    term: TensorVariable | None = None
+
+
+class Linearization(Protocol):
+    """How a filter linearises a system: an immutable, hashable object.
+
+    ``has_short_rows`` says whether a row of the Jacobian of a prediction takes few operations.
+    """
+
+    has_short_rows: ClassVar[bool]
+
+    def __hash__(self) -> int: ...
+
+    def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
+        """The Gaussian state in the coordinates of this linearisation."""
+
+    def transition(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Linear:
+        """The next state."""
+
+    def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
+        """The observation ``values["d"]``."""
+
+
+class Innovation(NamedTuple):
+    """Kalman's gain K for a linearised observation.
+
+    ``chol`` is the lower factor of the covariance of the residual, ``innovation_cov``;
+    ``update`` = root - K jac maps xi to the error that the update leaves.
+    """
+
     innovation_cov: TensorVariable
     chol: TensorVariable
     gain: TensorVariable
-    update_jac: TensorVariable
+    update: TensorVariable
 
 
-def linearize_transition(
-    system: StateSpaceModel, values: Symbols, mean: TensorVariable
-) -> LinearizedTransition:
-    """Eqs. 4.8-4.10, at the mean before the step."""
-    q = pt.zeros((system.m,))
-    forecast = call(system.equations.transition, system, {**values, "x": mean, "q": q})
-    return LinearizedTransition(forecast, jacobian_of(forecast, mean), jacobian_of(forecast, q))
+def seen(datum: TensorVariable, linear: Linear) -> Seen:
+    """Compare a linearised observation with the datum, NaN where missing."""
+    residual, noise_cov, observed = without_missing(datum, linear.mean, linear.noise_cov)
+    return Seen(residual, observed, linear.jac * observed[:, None], noise_cov)
 
 
-def innovation_moments(
-    system: StateSpaceModel, values: Symbols, mean: TensorVariable, cov: TensorVariable
-) -> Innovation:
-    """Eqs. 4.3-4.7, at the mean of the forecast."""
-    expected, noise_cov = observation_moments(system, {**values, "x": mean})
-    observation_jac = jacobian_of(expected, mean)
-    residual, noise_cov, observed = without_missing(values["d"], expected, noise_cov)
-    observation_jac = observation_jac * observed[:, None]
-    innovation_cov = observation_jac @ cov @ observation_jac.T + noise_cov
+def innovation_of(state: GaussianState, observation: Seen) -> Innovation:
+    """Eqs. 4.3-4.7 for the state before the observation."""
+    jac = observation.jac
+    innovation_cov = product(jac, state.cov, jac.T) + observation.noise_cov
     chol = cholesky(innovation_cov, lower=True)
     # K = P C^T S^-1 by two triangular solves.
-    half = solve_triangular(chol, observation_jac @ cov, lower=True, b_ndim=2)
+    root = None if state.root is None else state.root.T
+    half = solve_triangular(chol, product(jac, state.cov, root), lower=True, b_ndim=2)
     gain = solve_triangular(chol.T, half, lower=False, b_ndim=2).T
-    update_jac = pt.eye(system.n) - gain @ observation_jac
-    return Innovation(
-        residual, observed, observation_jac, noise_cov, innovation_cov, chol, gain, update_jac
-    )
+    root = pt.eye(state.mean.type.shape[0]) if state.root is None else state.root
+    return Innovation(innovation_cov, chol, gain, root - gain @ jac)
+
+
+def start(system: StateSpaceModel, values: Symbols) -> TensorVariable:
+    """The state of the filter at step 0."""
+    mean = call(system.equations.initial_mean, system, values)
+    return pack(mean, call(system.equations.initial_cov, system, values))
+
+
+def predict(
+    linearization: Linearization, system: StateSpaceModel, values: Symbols
+) -> TensorVariable:
+    """Eqs. 4.8-4.11: one step from the state ``values["s"]``."""
+    state = linearization.state(*unpack(values["s"], system.n))
+    step = linearization.transition(system, values, state)
+    forecast_cov = product(step.jac, state.cov, step.jac.T)
+    if step.noise_cov is not None:
+        forecast_cov += step.noise_cov
+    return pack(step.mean, forecast_cov)
+
+
+def update(
+    linearization: Linearization, system: StateSpaceModel, values: Symbols
+) -> tuple[TensorVariable, TensorVariable]:
+    """Eqs. 4.3-4.7 and 4.14: the analysis, and log p(d_j | d_1 .. d_{j-1})."""
+    state = linearization.state(*unpack(values["s"], system.n))
+    observation = linearization.observation(system, values, state)
+    innovation = innovation_of(state, observation)
+    gain, left = innovation.gain, innovation.update
+    analysis_cov = product(left, state.cov, left.T) + gain @ observation.noise_cov @ gain.T
+    term = observation.term
+    if term is None:
+        term = log_normal(observation.residual, innovation.innovation_cov, observation.observed)
+    return pack(state.mean + gain @ observation.residual, analysis_cov), term
+
+
+def product(*matrices: TensorVariable | None) -> TensorVariable:
+    """The matrix product; None is the identity."""
+    return reduce(lambda a, b: a @ b, [matrix for matrix in matrices if matrix is not None])

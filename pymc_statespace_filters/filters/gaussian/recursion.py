@@ -19,6 +19,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
 from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.filters.gaussian.linearization import Linearization
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -38,6 +39,7 @@ class GaussianFilterFunctions:
     """
 
     system: StateSpaceModel
+    linearization: Linearization
     start: VectorFunction
     predict: VectorFunction
     update: VectorFunction

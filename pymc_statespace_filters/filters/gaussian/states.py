@@ -37,7 +37,6 @@ from pymc_statespace_filters.filters.outcomes import (
     NONE,
     is_missing,
 )
-from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Counters of the random stream `STATES`: the steps of the record (one column each), the start.
 _ALONG, _AT_START = 0, 1
@@ -55,7 +54,7 @@ class ForwardPass:
 def forward_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
     """The forward pass of a filter with a simulated error of it."""
     smoother = BrysonFrazier(recursion)
-    return ForwardPass(smoother, _noise(recursion.system), _forwards(smoother))
+    return ForwardPass(smoother, _noise(smoother), _forwards(smoother))
 
 
 def compile_states(forward: ForwardPass, moment: str) -> CompiledFunction:
@@ -224,14 +223,15 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
     return CompiledFunction(jit(read), key)
 
 
-def _noise(system: StateSpaceModel) -> CompiledFunction:
-    """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (m + p, steps).
+def _noise(smoother: BrysonFrazier) -> CompiledFunction:
+    """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (noises + p, steps).
 
-    The first m rows of Z have the covariance of q. The covariances may be singular; that they are
-    covariances at theta has been checked.
+    If the smoother draws q, the first m rows of Z have its covariance. The covariances may be
+    singular; that they are covariances at theta has been checked.
     """
-    equations, n, m = system.equations, system.n, system.m
-    is_white = equations.process_noise is None
+    system, m = smoother.recursion.system, smoother.n_noises
+    equations, n = system.equations, system.n
+    is_white = equations.process_noise is None or not smoother.draws_q
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
     covs = [call(equations.initial_cov, system, {"theta": theta})]
     if not is_white:
@@ -253,7 +253,7 @@ def _noise(system: StateSpaceModel) -> CompiledFunction:
             apply_covariance(values, n * n, m, Z)
         return X, Z
 
-    key = key_of(f"noise of states {n} {m} {n_rows}", flat.key, FILL_NORMALS.key)
+    key = key_of(f"noise of states {n} {m} {n_rows} {is_white}", flat.key, FILL_NORMALS.key)
     return CompiledFunction(jit(noise), key)
 
 

@@ -1,0 +1,141 @@
+"""What all Gaussian filters share: everything but their linearisation and the systems they take."""
+
+from functools import lru_cache
+from typing import ClassVar
+
+import pytensor.tensor as pt
+
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    Graph,
+    VectorFunction,
+)
+from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_pullback
+from pymc_statespace_filters.filters.gaussian.batch import compile_batch
+from pymc_statespace_filters.filters.gaussian.linearization import (
+    Linearization,
+    predict,
+    start,
+    state_size,
+    update,
+)
+from pymc_statespace_filters.filters.gaussian.recursion import (
+    GaussianFilterFunctions,
+    compile_taped,
+    compile_value,
+)
+from pymc_statespace_filters.filters.gaussian.states import (
+    ForwardPass,
+    compile_run,
+    compile_states,
+    forward_pass,
+)
+from pymc_statespace_filters.filters.protocol import (
+    GradientFunction,
+    LogLikelihoodFunction,
+    RunFunction,
+    StatesFunction,
+    System,
+)
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+
+class GaussianFilterBase:
+    """Compiles a filter from its ``linearization``."""
+
+    noisy: ClassVar[bool] = False
+    has_gradient: ClassVar[bool] = True
+
+    @property
+    def linearization(self) -> Linearization:
+        """How the filter linearises a system."""
+        raise NotImplementedError
+
+    def is_exact_for(self, system: System) -> bool:
+        """Whether the system is linear; False too where that cannot be decided."""
+        return system.is_linear
+
+    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+        """Compile the log-likelihood."""
+        return compile_value(self._functions(system))
+
+    def compile_batch(self, system: System) -> CompiledFunction:
+        """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
+        return compile_batch(self._functions(system))
+
+    def compile_taped(self, system: System) -> CompiledFunction:
+        """Compile the forward pass, with a third result: the tape."""
+        return compile_taped(self._functions(system))
+
+    def compile_pullback(self, system: System) -> CompiledFunction:
+        """Compile the backward pass along the tape."""
+        return compile_pullback(self._functions(system))
+
+    def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
+        """Compile both passes as one function."""
+        return compile_gradient(self._functions(system))
+
+    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+        """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+        return compile_states(_forward_pass(self.linearization, system.model), moment)
+
+    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+        """Compile one run with all that it computes."""
+        return compile_run(self._functions(system))
+
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
+        return "modified Bryson-Frazier"
+
+    def _functions(self, system: System) -> GaussianFilterFunctions:
+        return _functions(self.linearization, system.model)
+
+    def _check_gaussian(self, system: System) -> None:
+        """Raise if the observation is not a function with Gaussian noise."""
+        if not system.gaussian_observation:
+            raise ModelError(
+                f"{type(self).__name__} needs an observation function with Gaussian noise; "
+                f"observation_dist works with IPLF, and observation_dist and observation_logp work "
+                f"with the particle filters BootstrapPF and PFEnKF and, for one state, GridFilter"
+            )
+
+    def _check_not_carried(self, system: System) -> None:
+        """Raise if a state is carried."""
+        if system.carried:
+            raise ModelError(
+                f"{type(self).__name__} cannot treat the carried states {list(system.carried)}, "
+                f"which no Kalman update may move; use EnKF, BootstrapPF or PFEnKF"
+            )
+
+
+def _functions(linearization: Linearization, system: StateSpaceModel) -> GaussianFilterFunctions:
+    """The three functions of the filter, each of theta and the state of the filter ``s``."""
+    s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
+    values = symbols_of(system) | {"s": s}
+
+    def function(arguments: str, inputs: str, outputs: list, *scalar: bool):
+        graph = Graph({i: values[i] for i in inputs.split()}, outputs)
+        return VectorFunction(arguments, graph, scalar)
+
+    analysis, term = update(linearization, system, values)
+    forecast = predict(linearization, system, values)
+    return GaussianFilterFunctions(
+        system,
+        linearization,
+        function("c", "theta", [start(system, values)], False),
+        function("c, inputs, k, t, s", "theta u t s", [forecast], False),
+        function(
+            "c, inputs, k, t, d, s",
+            "theta u t d s",
+            [analysis, pt.atleast_1d(term)],
+            False,
+            True,
+        ),
+    )
+
+
+@lru_cache(maxsize=256)
+def _forward_pass(linearization: Linearization, system: StateSpaceModel) -> ForwardPass:
+    return forward_pass(_functions(linearization, system))

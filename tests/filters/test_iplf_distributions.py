@@ -1,0 +1,202 @@
+"""IPLF with observations that have a distribution: against exact results and the grid filter."""
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.conditional_moments import (
+    MOMENTS,
+    conditional_moments,
+)
+from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
+
+
+def observed_by(*distributions):
+    """One state, which is observed by distributions of it."""
+    return psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + q[0]],
+        process_noise=[[0.2]],
+        observation_dist=lambda x: [f(x[0]) for f in distributions],
+        initial_mean=[0.3],
+        initial_cov=[[0.8]],
+    )
+
+
+TABLE = {
+    "Bernoulli": (lambda x: pm.Bernoulli.dist(logit_p=x), stats.bernoulli(1 / (1 + np.exp(-0.7)))),
+    "BetaBinomial": (
+        lambda x: pm.BetaBinomial.dist(n=9, alpha=x, beta=2.0),
+        stats.betabinom(9, 0.7, 2.0),
+    ),
+    "Beta": (lambda x: pm.Beta.dist(alpha=x, beta=2.0), stats.beta(0.7, 2.0)),
+    "Binomial": (lambda x: pm.Binomial.dist(n=9, p=x), stats.binom(9, 0.7)),
+    "Exponential": (lambda x: pm.Exponential.dist(lam=x), stats.expon(scale=1 / 0.7)),
+    "Gamma": (lambda x: pm.Gamma.dist(alpha=2.0, beta=x), stats.gamma(2.0, scale=1 / 0.7)),
+    "Geometric": (lambda x: pm.Geometric.dist(p=x), stats.geom(0.7)),
+    "InvGamma": (
+        lambda x: pm.InverseGamma.dist(alpha=3.0, beta=x),
+        stats.invgamma(3.0, scale=0.7),
+    ),
+    "Laplace": (lambda x: pm.Laplace.dist(mu=x, b=2.0), stats.laplace(0.7, 2.0)),
+    "LogNormal": (
+        lambda x: pm.LogNormal.dist(mu=x, sigma=0.4),
+        stats.lognorm(0.4, scale=np.exp(0.7)),
+    ),
+    "Logistic": (lambda x: pm.Logistic.dist(mu=x, s=2.0), stats.logistic(0.7, 2.0)),
+    "NegBinomial": (
+        lambda x: pm.NegativeBinomial.dist(mu=x, alpha=3.0),
+        stats.nbinom(3.0, 3.0 / 3.7),
+    ),
+    "Normal": (lambda x: pm.Normal.dist(mu=x, sigma=2.0), stats.norm(0.7, 2.0)),
+    "Poisson": (lambda x: pm.Poisson.dist(mu=x), stats.poisson(0.7)),
+    "StudentT": (
+        lambda x: pm.StudentT.dist(nu=5.0, mu=x, sigma=2.0),
+        stats.t(5.0, loc=0.7, scale=2.0),
+    ),
+}
+
+
+def test_every_distribution_of_the_table_is_tested():
+    assert sorted(TABLE) == sorted(kind.__name__.removesuffix("RV") for kind in MOMENTS)
+
+
+def test_means_and_variances_are_those_of_scipy():
+    system = observed_by(*(distribution for distribution, _ in TABLE.values()))
+    symbols = symbols_of(system)
+    mean, cov = pytensor.function(
+        list(symbols.values()),
+        conditional_moments(system, symbols),
+        mode="FAST_COMPILE",
+        on_unused_input="ignore",
+    )(*(np.full(v.type.shape, 0.7) for v in symbols.values()))
+    laws = [law for _, law in TABLE.values()]
+    np.testing.assert_allclose(mean, [law.mean() for law in laws], rtol=1e-7)
+    np.testing.assert_allclose(cov, np.diag([law.var() for law in laws]), rtol=1e-7)
+
+
+def test_normal_distributions_are_gaussian_noise():
+    """Exact, and a partly missing row counts as missing."""
+    by_distribution = observed_by(
+        lambda x: pm.Normal.dist(mu=x, sigma=0.5), lambda x: pm.Normal.dist(mu=2.0 * x, sigma=1.5)
+    )
+    by_function = psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + q[0]],
+        process_noise=[[0.2]],
+        observation=lambda x: [x[0], 2.0 * x[0]],
+        observation_noise=np.diag([0.5**2, 1.5**2]),
+        initial_mean=[0.3],
+        initial_cov=[[0.8]],
+    )
+    observed = np.array([[0.1, 0.4], [0.9, np.nan], [1.2, 1.6]])
+    found = psf.log_likelihood(by_distribution, psf.IPLF(), {}, observed, steps=[0, 2, 3])
+    observed[1] = np.nan
+    exact = psf.log_likelihood(by_function, psf.EKF(), {}, observed, steps=[0, 2, 3])
+    np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-15)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_the_likelihood_of_a_count_is_close_to_its_integral(count):
+    system = observed_by(lambda x: pm.Poisson.dist(mu=pt.exp(1.0 + x)))
+    found = psf.log_likelihood(system, psf.IPLF(), {}, [count], steps=[0])
+
+    def density(x):
+        return stats.poisson.pmf(count, np.exp(1.0 + x)) * stats.norm.pdf(x, 0.3, 0.8**0.5)
+
+    exact = np.log(quad(density, -8.0, 8.0, epsabs=1e-13)[0])
+    np.testing.assert_allclose(found, exact, rtol=0.0, atol=0.02)
+
+
+COUNTS = psf.StateSpaceModel(
+    transition=psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.7]], dt=0.1),
+    observation_dist=lambda x, c: [
+        pm.Poisson.dist(mu=pt.exp(c + x[0])),
+        pm.NegativeBinomial.dist(mu=pt.exp(x[0]), alpha=c + 2.0),
+    ],
+    initial_mean=[0.0],
+    initial_cov=[[0.5]],
+)
+
+
+def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_missing_rows():
+    observed = np.array([[4.0, 2.0], [3.0, np.nan], [1.0, 0.0], [6.0, 1.0]])
+    record = (np.array([0, 5, 10, 20]), observed, np.zeros((0, 0)), 0.0, 0)
+    system, theta = compile_system(COUNTS), np.array([0.5, 1.0])
+    value = psf.IPLF().compile(system).function
+    found = psf.IPLF().compile_gradient(system).function(theta, *record, np.ones(4))
+    weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+    for i, h in enumerate([2e-3, 4e-3]):
+        moves = theta + np.arange(-4, 5)[:, None] * h * np.eye(2)[i]
+        slope = weights @ [value(move, *record)[0].sum() for move in moves] / h
+        np.testing.assert_allclose(found[i], slope, rtol=1e-8)
+    assert value(theta, *record)[0][1] == pytest.approx(0.0, abs=1e-14)
+
+
+COUNTER = psf.StateSpaceModel(
+    transition=psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.7]], dt=0.1),
+    observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
+    initial_mean=[0.0],
+    initial_cov=[[0.5]],
+)
+STEPS = np.arange(0, 300, 5)
+A, C = np.meshgrid(np.linspace(0.02, 3.0, 40), np.linspace(-0.7, 2.3, 25), indexing="ij")
+
+
+@pytest.fixture(scope="module")
+def counts():
+    """Sixty counts of mean 3, and mean and sd of the exact posterior of a and c."""
+    truth = {"a": 0.5, "c": 1.0}
+    record = psf.simulate(COUNTER, truth, steps=STEPS, random_seed=1)["observations"].values
+    terms = psf.log_likelihood(COUNTER, psf.GridFilter(), {"a": A, "c": C}, record, steps=STEPS)
+    density = terms.sum(axis=-1) - 0.5 * A**2 - 0.5 * (C / 2.0) ** 2
+    weights = np.exp(density - density.max())
+    weights /= weights.sum()
+    mean = np.array([(weights * v).sum() for v in (A, C)])
+    square = np.array([(weights * v**2).sum() for v in (A, C)])
+    return record, mean, np.sqrt(square - mean**2)
+
+
+def test_nuts_samples_the_posterior_of_counts(counts):
+    """Means within a tenth of a posterior sd; the sampling error of 1600 draws is a third of it."""
+    record, mean, sd = counts
+    with pm.Model():
+        pm.HalfNormal("a", 1.0)
+        pm.Normal("c", 0.0, 2.0)
+        psf.StateSpace("d", COUNTER, psf.IPLF(), steps=STEPS, observed=record)
+        idata = pm.sample(
+            800, tune=500, chains=2, cores=1, random_seed=4, progressbar=False,
+            compute_convergence_checks=False,
+        )  # fmt: skip
+    draws = np.array([idata.posterior[name].values.ravel() for name in ("a", "c")])
+    assert (np.abs(draws.mean(axis=1) - mean) < 0.1 * sd).all(), (draws.mean(axis=1), mean, sd)
+    np.testing.assert_allclose(draws.std(axis=1), sd, rtol=0.15)
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()])
+def test_filters_of_gaussian_noise_name_the_one_for_distributions(filter):
+    with pytest.raises(
+        psf.ModelError, match="observation_dist works with IPLF, and observation_dist"
+    ):
+        psf.log_likelihood(COUNTER, filter, {"a": 1.0, "c": 1.0}, [3], steps=[0])
+
+
+def test_a_density_without_moments_is_refused():
+    system = psf.StateSpaceModel(
+        transition=lambda x: [x[0]],
+        observation_logp=lambda d, x: -((d[0] - x[0]) ** 2),
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    with pytest.raises(psf.ModelError, match="which observation_logp does not give"):
+        psf.log_likelihood(system, psf.IPLF(), {}, [3.0], steps=[0])
+
+
+def test_distributions_outside_the_table_are_named():
+    system = observed_by(lambda x: pm.Cauchy.dist(alpha=x, beta=1.0))
+    with pytest.raises(psf.ModelError, match=r"which it knows for Bernoulli, .*; got cauchy"):
+        psf.log_likelihood(system, psf.IPLF(), {}, [3.0], steps=[0])

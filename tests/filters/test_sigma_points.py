@@ -1,0 +1,313 @@
+"""UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
+
+import numpy as np
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.testing import kalman_log_likelihood
+from tests.filters.test_ekf_states import (
+    FORCE,
+    GAMMA,
+    LINEAR,
+    NOISE_JAC,
+    NONLINEAR,
+    OBSERVED,
+    ROWS,
+    STEPS,
+    SYSTEM,
+    T0,
+    States,
+    assert_drawn_from,
+    exact,
+    process_cov,
+)
+from tests.filters.test_truth_ekf import MULTIVARIATE, gappy_record
+from tests.filters.truth_systems import linear_system
+from tests.ops.test_batch import BENT, BENT_RECORD, bent_points
+from tests.references.records import OSCILLATOR
+
+RECORD = (STEPS, OBSERVED, FORCE, T0, 0)
+FILTERS = [psf.UKF(), psf.IPLF(n_iterations=2)]
+BOTH = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
+
+
+def theta_of(params):
+    return np.array([params[name] for name in SYSTEM.parameters])
+
+
+@BOTH
+@pytest.mark.parametrize("reference", [OSCILLATOR, MULTIVARIATE], ids=["oscillator", "singular"])
+def test_linear_systems_are_exact(filter, reference):
+    steps, observed = gappy_record(len(reference.C), first_step=2)
+    terms = psf.log_likelihood(linear_system(reference), filter, {}, observed, steps=steps)
+    truth = kalman_log_likelihood(*reference.kalman_arguments(), steps=steps, observed=observed)
+    np.testing.assert_allclose(terms, truth, rtol=1e-9, atol=0.0)
+
+
+@pytest.fixture(scope="module")
+def states():
+    """The function (filter, moment, params, draw_seed) -> States; each is compiled once."""
+    compiled = {}
+
+    def run(filter, moment, params, draw_seed=0):
+        if (filter, moment) not in compiled:
+            function = filter.compile_states(compile_system(SYSTEM), moment).function
+            compiled[filter, moment] = function
+        return States(*compiled[filter, moment](theta_of(params), *RECORD, ROWS, draw_seed))
+
+    return run
+
+
+@BOTH
+@LINEAR
+@pytest.mark.parametrize("moment", ["filtered", "smoothed"])
+def test_states_of_a_linear_system_are_exact(states, filter, moment, params):
+    """With inputs, time, missing components and rows, and noise inside the observation."""
+    found, truth = states(filter, moment, params), exact(moment, params)
+    np.testing.assert_allclose(found.mean, truth.mean, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.sd**2, truth.sd**2, rtol=0.0, atol=1e-9)
+
+
+@BOTH
+@LINEAR
+def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, params):
+    """By those parameters that keep the system linear, and are not at their lower boundary."""
+    system, bar = compile_system(SYSTEM), np.linspace(-1.0, 2.0, len(STEPS))
+    exact = psf.EKF().compile_gradient(system).function(theta_of(params), *RECORD, bar)
+    found = filter.compile_gradient(system).function(theta_of(params), *RECORD, bar)
+    names = [n for n in SYSTEM.parameters if n not in ("cubic", "bend")]
+    names = [n for n in names if params[n] != 0.0]
+    at = [SYSTEM.parameters.index(n) for n in names]
+    np.testing.assert_allclose(found[at], exact[at], rtol=1e-9)
+
+
+@LINEAR
+def test_smoothed_draws_are_paths_of_the_joint_law(states, params):
+    """Two tests that each fail a right one once in 1e4, twice."""
+    rows = [0, 1, 5, 7, 10, 13]
+    paths = [states(psf.UKF(), "smoothed", params, i).drawn[rows] for i in range(4000)]
+    truth = exact("smoothed", params, rows=rows)
+    cov = truth.cov.reshape(12, 12)
+    assert_drawn_from(np.reshape(paths, (4000, 12)), truth.mean.ravel(), cov, 1e-4)
+
+
+def see(x, b, push):
+    return [x[0] + b * x[0] ** 2, 0.5 * x[0] + x[1] + push]
+
+
+def move(x, k, stiff, push):
+    force = push - k * x[0] - stiff * x[0] ** 3 - 0.4 * x[1]
+    return [x[0] + SYSTEM.dt * x[1], x[1] + SYSTEM.dt * force]
+
+
+def spread(function, mean, cov, *others):
+    """Textbook unscented transform for two states, kappa = 1: mean, covariance and Cov(x, y)."""
+    root = np.linalg.cholesky(cov)
+    points = [mean, *(mean + np.sqrt(3.0) * root.T), *(mean - np.sqrt(3.0) * root.T)]
+    w = np.array([1.0, 0.5, 0.5, 0.5, 0.5]) / 3.0
+    y = np.array([function(point, *others) for point in points])
+    dx, dy = points - mean, y - w @ y
+    return w @ y, dy.T @ (w[:, None] * dy), dx.T @ (w[:, None] * dy)
+
+
+def unscented_smoother(params):
+    """Terms, filtered and smoothed moments by the textbook (Sarkka, 2008), regular noise."""
+    k, cubic, bend, c = (params[name] for name in ("k", "cubic", "bend", "c"))
+    R, dt = NOISE_JAC @ GAMMA @ NOISE_JAC.T, SYSTEM.dt
+    m, P = np.array([0.5, -0.1]), params["spread"] * np.array([[1.0, 0.5], [0.5, 1.0]])
+    terms, analyses, forecasts = [], [], []
+    for step in ROWS:
+        u, wave = FORCE[step, 0], np.cos(T0 + dt * step)
+        if step in STEPS and not np.isnan(d := OBSERVED[list(STEPS).index(step)]).all():
+            b, seen = bend * (1.0 + 0.5 * u), ~np.isnan(d)
+            mean, cov, cross = spread(see, m, P, b, c * u)
+            S, gap = (cov + R)[np.ix_(seen, seen)], (d - mean)[seen]
+            gain = cross[:, seen] @ np.linalg.inv(S)
+            m, P = m + gain @ gap, P - gain @ S @ gain.T
+            terms.append(-0.5 * (gap @ np.linalg.solve(S, gap)))
+            terms[-1] -= 0.5 * np.log(np.linalg.det(2.0 * np.pi * S))
+        analyses.append((m, P))
+        stiff = cubic * (1.0 + 0.5 * wave + 0.3 * u)
+
+        m, P, cross = spread(move, m, P, k, stiff, u + 0.3 * wave)
+        P = P + process_cov(params)
+        forecasts.append((m, P, cross))
+    smoothed = [analyses[-1]]
+    for (m, P), (mf, Pf, cross) in zip(analyses[-2::-1], forecasts[-2::-1], strict=True):
+        gain = cross @ np.linalg.inv(Pf)
+        ms, Ps = smoothed[0]
+        smoothed.insert(0, (m + gain @ (ms - mf), P + gain @ (Ps - Pf) @ gain.T))
+    return np.array(terms), analyses, smoothed
+
+
+def test_ukf_is_the_unscented_filter_and_smoother_of_the_textbook(states):
+    terms, filtered, smoothed = unscented_smoother(NONLINEAR)
+    value = psf.UKF().compile(compile_system(SYSTEM)).function(theta_of(NONLINEAR), *RECORD)[0]
+    np.testing.assert_allclose(value[value != 0.0], terms, rtol=1e-10)
+    for moment, truth in [("filtered", filtered), ("smoothed", smoothed)]:
+        found = states(psf.UKF(), moment, NONLINEAR)
+        np.testing.assert_allclose(found.mean, [m for m, _ in truth], rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(found.sd**2, [P.diagonal() for _, P in truth], atol=1e-10)
+
+
+def test_one_iteration_of_iplf_is_the_update_of_ukf():
+    """For the state; the likelihood is another approximation of the same integral."""
+    record = {"observed": OBSERVED, "steps": STEPS, "inputs": FORCE, "t0": T0}
+    ukf, iplf = (
+        psf.run_filter(SYSTEM, filter, NONLINEAR, **record)
+        for filter in (psf.UKF(), psf.IPLF(n_iterations=1))
+    )
+    for name in ("mean", "cov"):
+        np.testing.assert_allclose(iplf[name], ukf[name], rtol=1e-10, atol=1e-12)
+
+
+SQUARE = psf.StateSpaceModel(
+    transition=lambda x: [x[0]],
+    observation=lambda x: [x[0] ** 2],
+    observation_noise=lambda r: [[r]],
+    initial_mean=lambda m: [m],
+    initial_cov=lambda p: [[p]],
+)
+
+
+def test_ukf_knows_mean_and_variance_of_a_square():
+    m, p, r, d = 0.7, 0.6, 0.2, 1.9
+    run = psf.run_filter(SQUARE, psf.UKF(), {"m": m, "p": p, "r": r}, [d], steps=[0])
+    mean, variance = m**2 + p, 4.0 * m**2 * p + 2.0 * p**2 + r
+    term = -0.5 * (d - mean) ** 2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
+    np.testing.assert_allclose(run["log_likelihood"], [term], rtol=1e-13)
+    gain = 2.0 * m * p / variance
+    np.testing.assert_allclose(run["mean"].values.item(), m + gain * (d - mean), rtol=1e-13)
+    np.testing.assert_allclose(run["cov"].values.item(), p - gain * 2.0 * m * p, rtol=1e-12)
+
+
+def test_the_scaling_is_that_of_wan_and_van_der_merwe():
+    """Mean and variance of a cube for weights that are not the default's, written out."""
+    alpha, beta, kappa, m, p, r, d = 0.6, 2.0, 0.5, 0.7, 0.6, 0.2, 1.9
+    cube = psf.StateSpaceModel(
+        transition=lambda x: [x[0]],
+        observation=lambda x: [x[0] ** 3],
+        observation_noise=[[r]],
+        initial_mean=[m],
+        initial_cov=[[p]],
+    )
+    scale = alpha**2 * (1.0 + kappa)
+    y = (m + np.sqrt(scale * p) * np.array([0.0, 1.0, -1.0])) ** 3
+    w = np.array([1.0 - 1.0 / scale, 0.5 / scale, 0.5 / scale])
+    mean = w @ y
+    w[0] += 1.0 - alpha**2 + beta
+    variance = w @ (y - mean) ** 2 + r
+    term = -0.5 * (d - mean) ** 2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
+    scaled = psf.UKF(alpha=alpha, beta=beta, kappa=kappa)
+    np.testing.assert_allclose(psf.log_likelihood(cube, scaled, {}, [d], steps=[0]), term)
+
+
+@BOTH
+def test_a_batch_is_its_points(filter):
+    steps, observed, inputs, t0, _ = BENT_RECORD
+    points, system = bent_points(11), compile_system(BENT)
+    terms, health = filter.compile_batch(system).function(
+        points, steps, observed, inputs, float(t0), 0
+    )
+    alone = filter.compile(system).function
+    for i, point in enumerate(points):
+        one = alone(point, steps, observed, inputs, float(t0), 0)
+        np.testing.assert_allclose(terms[i], one[0], rtol=1e-10)
+        np.testing.assert_array_equal(health[i], one[1])
+
+
+NINTH_ORDER = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+
+
+def differences(value, theta, step=4e-3):
+    """Gradient by central differences of eighth order."""
+    h = step * np.maximum(np.abs(theta), 0.1)
+    moves = np.arange(-4, 5)[:, None, None] * np.diag(h)
+    values = [[value(theta + move) for move in of_step] for of_step in moves]
+    return NINTH_ORDER @ np.array(values) / h
+
+
+@BOTH
+@pytest.mark.parametrize("params", [NONLINEAR, NONLINEAR | {"shake": 1e-2}])
+def test_the_gradient_is_that_of_the_likelihood(filter, params):
+    system = compile_system(SYSTEM)
+    value = filter.compile(system).function
+    gradient = filter.compile_gradient(system).function
+    found = gradient(theta_of(params), *RECORD, np.ones(len(STEPS)))
+    slopes = differences(lambda theta: value(theta, *RECORD)[0].sum(), theta_of(params))
+    np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+
+
+KNOWN_START = psf.StateSpaceModel(
+    transition=psf.EulerMaruyama(
+        lambda x, k, c: [x[1], -k * x[0] - x[0] ** 3 - c * x[1]], lambda s: [[0.0], [s]], dt=0.1
+    ),
+    observation=lambda x, b: [x[0] + b * x[0] ** 2],
+    observation_noise=lambda r: [[r]],
+    initial_mean=[0.5, 0.0],
+    initial_cov=[[0.0, 0.0], [0.0, 0.0]],
+)
+
+
+@BOTH
+def test_the_gradient_is_exact_with_a_known_start_and_noise_on_the_velocity(filter):
+    record = (np.array([0, 2, 7]), np.array([[0.4], [0.7], [0.1]]), np.zeros((0, 0)), 0.0, 0)
+    system, theta = compile_system(KNOWN_START), np.array([1.3, 0.4, 0.7, 0.2, 0.1])
+    value = filter.compile(system).function
+    found = filter.compile_gradient(system).function(theta, *record, np.ones(3))
+    slopes = differences(lambda at: value(at, *record)[0].sum(), theta)
+    np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+
+
+@BOTH
+def test_impossible_settings_and_systems_are_refused(filter):
+    name = type(filter).__name__
+    memory = psf.StateSpaceModel(
+        lambda x: [x[0]], lambda x: [x[0]], observation_noise=[[1.0]], initial_mean=[0.0],
+        initial_cov=[[1.0]], states=["branch"], carried=["branch"],
+    )  # fmt: skip
+    with pytest.raises(psf.ModelError, match=rf"{name} cannot treat the carried states"):
+        psf.log_likelihood(memory, filter, {}, [0.3], steps=[0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: psf.UKF(alpha=0.0), "alpha must be a positive number, got 0.0"),
+        (lambda: psf.UKF(beta=np.nan), "beta must be a finite number, got nan"),
+        (lambda: psf.UKF(kappa="3"), "kappa must be a finite number, got '3'"),
+        (
+            lambda: psf.UKF(kappa=-1.0).check(compile_system(SQUARE)),
+            "kappa must be above -1 for 1 states, got -1.0",
+        ),
+        (lambda: psf.IPLF(n_iterations=0), "n_iterations must be an integer of at least 1, got 0"),
+    ],
+)
+def test_wrong_settings_are_named(make, message):
+    with pytest.raises(psf.ModelError) as caught:
+        make()
+    assert str(caught.value) == message
+
+
+def test_systems_too_large_to_be_written_out_run_on_arrays():
+    """Fourteen coupled states, half of them known at the start."""
+    n, steps = 14, np.array([0, 2, 3])
+    A = 0.85 * np.eye(n) + 0.05 * np.roll(np.eye(n), 1, axis=1)
+    B, C, start = 0.3 * np.eye(n)[:, ::2], np.eye(n)[::5], np.diag(np.arange(n) % 2.0)
+    ring = psf.StateSpaceModel(
+        transition=lambda x, q, a: a * (pt.as_tensor(A) @ x) + B @ q,
+        process_noise=np.eye(n // 2),
+        observation=lambda x: C @ x,
+        observation_noise=0.2 * np.eye(3),
+        initial_mean=np.ones(n),
+        initial_cov=start,
+    )
+    observed = np.random.default_rng(20).normal(size=(3, 3))
+    observed[1, 1] = np.nan
+    found = psf.log_likelihood(ring, psf.UKF(), {"a": 0.9}, observed, steps=steps)
+    truth = kalman_log_likelihood(
+        0.9 * A, B @ B.T, C, 0.2 * np.eye(3), np.ones(n), start, steps=steps, observed=observed
+    )
+    np.testing.assert_allclose(found, truth, rtol=1e-9)
