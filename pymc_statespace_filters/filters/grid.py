@@ -119,7 +119,7 @@ class GridFilter:
         if system.n != 1:
             raise ModelError(
                 f"GridFilter treats systems of one state, got {system.n} states "
-                f"{list(system.states)}; use BootstrapPF, or EKF where the state stays Gaussian"
+                f"{list(system.states)}; use GuidedPF, or EKF where the state stays Gaussian"
             )
         if system.carried:
             raise ModelError(

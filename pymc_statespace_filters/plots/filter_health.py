@@ -90,8 +90,8 @@ def plot_filter_health(
     -------
     arviz_plots.PlotCollection
         Visuals ``expected`` and ``seen`` of the variables ``residual``, ``autocorrelation``,
-        ``pit`` and ``inputs`` along ``observable``; ``clipped`` of ``residual``; ``band_90``, ``band_50``, ``median`` and ``collapsed`` of
-        ``effective``.
+        ``pit`` and ``inputs`` along ``observable``; ``clipped`` of ``residual``; ``band_90``,
+        ``band_50``, ``median`` and ``collapsed`` of ``effective``.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def _input_correlations(
     found = results[f"{name}_input_correlation"]
     found = found.rename(input_lag="past", **{str(found.dims[-1]): "observable"})
     n_inputs = found.sizes["input"]
-    place = np.abs(found).fillna(0.0).argmax("input")
+    place = abs(found).fillna(0.0).argmax("input")
     largest = found.isel(input=place).drop_vars("input")
     bound = norm.isf((1 - PROB ** (1 / n_inputs)) / 2) * residual.count("time") ** -0.5
     bounds = bound.expand_dims(past=largest["past"]).to_dataset(name="inputs")

@@ -137,14 +137,13 @@ def _observations(system, k, t, low, spacing, n):
 
 @njit_internal
 def _variance_of_cell(h, i, noise_variance):
-    """The variance of h over the cell of a point; zero where the noise is wider than the cell.
+    """The variance of h over the cell of a point, for cells much wider than the noise, else zero.
 
-    There the sum over points is exact without it. Where the noise is narrower, the sum would be a
-    staircase.
+    There the sum over points would be a staircase. Elsewhere it converges without.
     """
     first, last = max(i - 1, 0), min(i + 1, h.size - 1)
     width = (h[last] - h[first]) / max(last - first, 1)
-    return width * width / 12.0 if width * width > noise_variance else 0.0
+    return width * width / 12.0 if width * width > 4.0 * noise_variance else 0.0
 
 
 @njit_internal
