@@ -39,11 +39,11 @@ def test_bootstrap_filter_falls_far_below_the_truth_and_warns_once():
     assert (elsewhere > -20.0).all()
 
     # The warning tells of the seed whose particles were the fewest.
-    said = re.search(r"these are (\d+) of 1000 terms, j = (.*), together (.*) nats below", message)
+    said = re.search(r"these are (\d+) of 1000 terms, j = (.*), together (\S+) nats", message)
     n_few, listed = int(said[1]), [int(j) for j in said[2].removesuffix(", ..").split(", ")]
     assert len(listed) == min(n_few, 8)
     assert set(SURPRISES) <= set(listed)
-    below = float(re.search(r"the log-likelihood is (.*) nats below", message)[1])
+    below = float(re.search(r"the log-likelihood is (\S+) nats below", message)[1])
     worst = np.flatnonzero(np.abs(error.sum(axis=-1) + below) < 0.06)
     assert worst.size == 1
     if n_few == len(listed):
