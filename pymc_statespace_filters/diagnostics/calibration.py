@@ -1,5 +1,7 @@
 """Calibration of predictions: PIT values, residuals, coverage, and tests of both."""
 
+from typing import Any
+
 import numpy as np
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
@@ -24,10 +26,9 @@ def pit_of(observed: Array, predicted: Array, rng: np.random.Generator) -> Array
     return np.where(np.isnan(observed) | (n_draws == 0), np.nan, pit)
 
 
-def residual_of(pit: Array, n_draws: int) -> Array:
-    """Standard normal quantiles of PIT values, limited to the resolution of the draws."""
-    furthest = 0.5 / n_draws
-    return norm.ppf(np.clip(pit, furthest, 1 - furthest))
+def residual_limit(n_draws: Any) -> Any:
+    """The largest residual that so many draws of a prediction can tell."""
+    return norm.isf(0.5 / n_draws)
 
 
 def coverage_of(pit: Array, prob: float) -> Array:

@@ -9,18 +9,36 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.diagnostics.calibration import (
     coverage_of,
-    pit_of,
-    residual_of,
     uniformity_of,
     whiteness_of,
 )
+from pymc_statespace_filters.diagnostics.innovations import (
+    autocorrelation_of,
+    input_correlation_of,
+    inputs_before,
+    lags_of,
+    standardised,
+)
+from pymc_statespace_filters.diagnostics.predictions import (
+    Calibration,
+    calibration_by_rank,
+    calibration_of,
+    laws_of,
+)
 from pymc_statespace_filters.diagnostics.truncated_data import observed_values
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
+from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
 from pymc_statespace_filters.states.groups import add_group
-from pymc_statespace_filters.states.variable import States, VariableAtDraws, select_variables
+from pymc_statespace_filters.states.variable import (
+    States,
+    TermHealthAtDraws,
+    VariableAtDraws,
+    select_variables,
+)
 from pymc_statespace_filters.system.checks import check_random_seed
 
 Array = NDArray[np.float64]
@@ -69,19 +87,32 @@ def filter_diagnostics(
 
         * ``d_predicted`` (chain, draw, d_time, observable): a simulated observation of a state
           drawn given the earlier observations; NaN after a failure of the filter.
-        * ``d_n_effective`` (chain, draw, d_time): the effective number of particles or members in
-          the update by each observation, infinite for a deterministic filter.
-        * ``d_pit`` (d_time, observable): the fraction of predictions not above the observation,
-          with ties broken at random so that counts are uniform too; NaN where the observation is
-          missing.
+        * ``d_n_effective`` (chain, draw, d_time): the effective number of particles or members
+          whose mean is the likelihood term of each observation; infinite for a deterministic
+          filter, NaN where the observation is missing.
+        * ``d_pit`` (d_time, observable): the probability of a prediction below the observation;
+          NaN where the observation is missing. It is computed from the filter's own law of the
+          prediction if that is known (Gaussian filters, `GridFilter`), else from the observation
+          noise around the drawn states; for other noise it is the fraction of predictions not above
+          the observation, with ties broken at random so that counts are uniform too.
         * ``d_residual`` (d_time, observable): the standard normal quantile of ``d_pit``.
+        * ``d_clipped`` (d_time, observable): whether the residual is cut off, as the draws cannot
+          tell how far out the observation is: it is at least so far.
+        * ``d_innovation`` (d_time, observable), ``d_innovation_cov`` (d_time, observable,
+          observable_bis): the observation minus the mean of its prediction, and the covariance of
+          the prediction.
+        * ``d_autocorrelation`` (lag, observable): of the innovations, each divided by its standard
+          deviation. For a right model within 1.96 / sqrt(J) for 19 of 20 lags.
+        * ``d_input_correlation`` (input_lag, input, observable), if the system has inputs: of these
+          innovations with the input during the last step before the observation (lag 0), or before
+          the observation so many earlier.
         * ``d_coverage`` (interval, observable): the fraction of observations within the central
           50 % and 90 % prediction intervals.
         * ``d_uniformity``, ``d_whiteness`` (observable): p-values of tests that ``d_pit`` is
           uniform (the test of ArviZ's PIT plots), and that ``d_residual`` has no autocorrelation
           (Ljung-Box, up to lag 10, missing ones dropped).
         * ``d_failed``, ``d_collapsed``: the fraction of draws at which the filter failed, and at
-          which the effective number of particles fell below 3 at some observation.
+          which fewer than 3 effective particles decided some term.
 
         `plot_filter_health` plots the group. ArviZ plots the PIT alone by
         ``az.plot_ecdf_pit(idata, var_names="d_pit", group="filter_diagnostics",
@@ -92,6 +123,11 @@ def filter_diagnostics(
     ModelError
         If draws, model and settings are inconsistent, or the system defines the density of
         observations but no distribution to simulate them from.
+
+    Warns
+    -----
+    FilterWarning
+        If the filter failed, or its particles collapsed, at some draws.
 
     References
     ----------
@@ -129,13 +165,19 @@ def filter_diagnostics(
     for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
         before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
-        after = before
-        if variable.filter.noisy:
-            after = at_draws.states("filtered", at_draws.steps, rng, progressbar=progressbar)
+        health = _term_health(at_draws, before, rng, progressbar)
         predicted = _simulate_observations(at_draws, before.drawn, rng)
         observed = observed_values(model, variable.name)
-        part = _results_by_draw(variable, draws, at_draws, predicted, after)
-        parts.append(part.merge(_results_by_time(variable, observed, predicted, rng)))
+        laws = laws_of(at_draws, observed, before)
+        if laws is None:
+            calibration = calibration_by_rank(predicted, observed, rng)
+        else:
+            calibration = calibration_of(laws, observed)
+        part = _results_by_draw(variable, draws, at_draws, predicted, health)
+        part = part.merge(_results_by_time(variable, calibration))
+        parts.append(part.merge(_innovations(at_draws, observed, calibration)))
+        arguments_of = at_draws.arguments_of(health.seeds)
+        warn_about(variable.system, variable.filter, health.health, arguments_of)
     attrs = {"predictions": PREDICTION_NOTE}
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
@@ -156,20 +198,33 @@ def _simulate_observations(
     return simulated
 
 
+def _term_health(
+    at_draws: VariableAtDraws, before: States, rng: np.random.Generator, progressbar: bool
+) -> TermHealthAtDraws:
+    """Effective numbers behind the terms; of the filtered states if the filter does not tell."""
+    filter = at_draws.variable.filter
+    if isinstance(filter, HealthFilter):
+        return at_draws.term_health(rng, progressbar=progressbar)
+    states = before
+    if filter.noisy:
+        states = at_draws.states("filtered", at_draws.steps, rng, progressbar=progressbar)
+    return TermHealthAtDraws(states.n_effective, states.health, states.seeds)
+
+
 def _results_by_draw(
     variable: StateSpaceVariable,
     draws: PosteriorDraws,
     at_draws: VariableAtDraws,
     predicted: Array,
-    after: States,
+    health: TermHealthAtDraws,
 ) -> xr.Dataset:
     """Predictions and effective sample sizes of every draw; fractions of failed draws."""
     name, (time, observable) = variable.name, variable.dims
-    smallest = np.fmin.reduce(after.n_effective, axis=1, initial=np.inf)
+    smallest = np.fmin.reduce(health.n_effective, axis=1, initial=np.inf)
     found = draws.dataset(
         {
             f"{name}_predicted": ((time, observable), predicted),
-            f"{name}_n_effective": ((time,), after.n_effective),
+            f"{name}_n_effective": ((time,), health.n_effective),
         },
         {
             time: at_draws.times(at_draws.steps),
@@ -177,18 +232,15 @@ def _results_by_draw(
         },
     )
     found[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
-    found[f"{name}_failed"] = np.mean(after.health[:, 1] != 0)
+    found[f"{name}_failed"] = np.mean(health.health[:, 1] != 0)
     found[f"{name}_collapsed"] = np.mean(smallest < COLLAPSED)
     return found
 
 
-def _results_by_time(
-    variable: StateSpaceVariable, observed: Array, predicted: Array, rng: np.random.Generator
-) -> xr.Dataset:
+def _results_by_time(variable: StateSpaceVariable, calibration: Calibration) -> xr.Dataset:
     """PIT values and residuals of the observations, their coverage and tests."""
     name, dims = variable.name, variable.dims
-    pit = pit_of(observed, predicted, rng)
-    residual = residual_of(pit, len(predicted))
+    pit, residual = calibration.pit, calibration.residual
     coverage = np.array([coverage_of(pit, prob) for prob in PROBS])
     uniformity = [uniformity_of(column) for column in pit.T]
     whiteness = [whiteness_of(column) for column in residual.T]
@@ -196,9 +248,41 @@ def _results_by_time(
         {
             f"{name}_pit": (dims, pit),
             f"{name}_residual": (dims, residual),
+            f"{name}_clipped": (dims, calibration.clipped),
             f"{name}_coverage": (("interval", dims[1]), coverage),
             f"{name}_uniformity": (dims[1:], uniformity),
             f"{name}_whiteness": (dims[1:], whiteness),
         },
         coords={"interval": list(PROBS)},
     )
+
+
+def _innovations(
+    at_draws: VariableAtDraws, observed: Array, calibration: Calibration
+) -> xr.Dataset:
+    """Innovations, their covariance, and what they correlate with."""
+    variable = at_draws.variable
+    name, (time, observable), system = variable.name, variable.dims, variable.system
+    innovation, bis = observed - calibration.mean, f"{observable}_bis"
+    z, lags = standardised(innovation, calibration.cov), lags_of(len(observed))
+    found = xr.Dataset(
+        {
+            f"{name}_innovation": ((time, observable), innovation),
+            f"{name}_innovation_cov": ((time, observable, bis), calibration.cov),
+            f"{name}_autocorrelation": (("lag", observable), autocorrelation_of(z, lags)),
+        },
+        coords={"lag": lags, bis: list(system.observables)},
+    )
+    if not system.n_inputs:
+        return found
+    # The mean over the draws, where inputs depend on them.
+    inputs = inputs_before(at_draws.inputs().mean(axis=0), at_draws.steps)
+    past = np.insert(lags, 0, 0)
+    return found.assign(
+        {
+            f"{name}_input_correlation": (
+                ("input_lag", "input", observable),
+                input_correlation_of(z, inputs, past),
+            )
+        }
+    ).assign_coords(input_lag=past, input=list(system.inputs))

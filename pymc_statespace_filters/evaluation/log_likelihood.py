@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
@@ -109,7 +109,8 @@ def log_likelihood(
             _check_agreement(ranks, filter, (points, *record, seeds))
         terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
         if ranks.rank == 0:
-            warn_about(filter, health)
+            flat = seeds.ravel()
+            warn_about(system, filter, health, lambda i: (points[i], *record, flat[i]))
     return terms.reshape(*shape, record.steps.size)
 
 

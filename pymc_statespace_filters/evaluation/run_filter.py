@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.states import FilterRun
@@ -104,7 +104,7 @@ def run_filter(
     rows = rows_at(at, record.steps)
     evaluate = evaluator(FilterRun(system, filter))
     terms, health, *states = evaluate(theta, *record, noise, rows)
-    warn_about(filter, health[None])
+    warn_about(system, filter, health[None], lambda i: (theta, *record, noise))
     dataset = _dataset(system, *states).assign(log_likelihood=("obs_time", terms))
     seen = {"time": rows, "obs_time": record.steps}
     times_of = {name: record.t0 + at_steps * system.dt for name, at_steps in seen.items()}

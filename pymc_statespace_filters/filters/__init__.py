@@ -9,7 +9,7 @@ from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.enkf import EnKF
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
-from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
+from pymc_statespace_filters.filters.ensemble.loop import Outcome, ensemble_filter, failed
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.guided_pf import GuidedPF
@@ -20,6 +20,8 @@ from pymc_statespace_filters.filters.protocol import (
     DifferentiableFilter,
     EnsembleFilter,
     Filter,
+    HealthFilter,
+    PredictionFilter,
     RunFilter,
     StatesFilter,
     System,
@@ -40,11 +42,15 @@ __all__ = [
     "Filter",
     "GridFilter",
     "GuidedPF",
+    "HealthFilter",
+    "Outcome",
     "PFEnKF",
     "ParticleFilter",
+    "PredictionFilter",
     "RunFilter",
     "StatesFilter",
     "System",
     "ensemble_filter",
+    "failed",
     "particle_filter",
 ]

@@ -8,6 +8,7 @@ import numpy as np
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
+from pymc_statespace_filters.filters.ensemble.loop import Outcome, failed
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.ensemble.reductions import count
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
@@ -35,9 +36,8 @@ def update(system, j, k, t, d, noise, members, local, work):
     # Increment of the log-likelihood and effective number (Eq. 4.43)
     increment, n_effective = normalise_weights(log_w, w, local)
     if increment == -np.inf:
-        failure = NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS
-        return -np.inf, 0.0, failure
-    return increment, n_effective, NONE
+        return failed(NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS)
+    return Outcome(increment, n_effective, n_effective, NONE)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from pymc_statespace_filters.filters.ensemble.kalman_update import (
     mark_finite,
     moments_workspace,
 )
-from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
+from pymc_statespace_filters.filters.ensemble.loop import Outcome, ensemble_filter, failed
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
@@ -74,20 +74,20 @@ def update(system, j, k, t, d, noise, members, local, work):
     forecast = forecast_means(members, log_terms, terms, work.is_ensemble, local, moments, False)
     n_alive = forecast.n_alive
     if n_alive == 0.0:
-        return -np.inf, 0.0, NO_FINITE_MEMBER
+        return failed(NO_FINITE_MEMBER)
     if not forecast_covariances(members, d, n_alive - 1.0, local, moments):
-        return -np.inf, n_alive, COVARIANCE_NOT_POSITIVE
+        return failed(COVARIANCE_NOT_POSITIVE, n_alive)
 
     # Increment of the log-likelihood, and how many members carry it (Eq. 4.43)
     increment, n_effective = forecast.log_sum, forecast.n_effective  # Eq. 4.26
     if not work.is_ensemble:
         increment, n_effective = _gaussian_likelihood(d, work), n_alive
     if not np.isfinite(increment):
-        return -np.inf, 0.0, ZERO_WEIGHTS
+        return failed(ZERO_WEIGHTS)
 
     # Analysis (Eqs. 4.20-4.21)
     kalman_update(d, D, alive, system.free, moments, X)
-    return increment, n_effective, NONE
+    return Outcome(increment, n_effective, n_alive, NONE)
 
 
 @njit_internal

@@ -38,10 +38,12 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     first_grid,
     next_grid,
 )
+from pymc_statespace_filters.filters.point_mass.predictions import predictions_function
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
 from pymc_statespace_filters.filters.point_mass.states import run_function, states_function
 from pymc_statespace_filters.filters.protocol import (
     LogLikelihoodFunction,
+    PredictionsFunction,
     RunFunction,
     StatesFunction,
     System,
@@ -117,7 +119,7 @@ class GridFilter:
         if system.n != 1:
             raise ModelError(
                 f"GridFilter treats systems of one state, got {system.n} states "
-                f"{list(system.states)}; use BootstrapPF, or EKF where the state stays Gaussian"
+                f"{list(system.states)}; use GuidedPF, or EKF where the state stays Gaussian"
             )
         if system.carried:
             raise ModelError(
@@ -171,6 +173,10 @@ class GridFilter:
         The draws of one ``draw_seed`` are independent; if smoothed, they are a path.
         """
         return states_function(system, self.tolerance, moment)
+
+    def compile_predictions(self, system: System) -> CompiledFunction[PredictionsFunction]:
+        """Compile the law of every observation given those before it."""
+        return predictions_function(system, self.tolerance)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""

@@ -198,21 +198,22 @@ def _emit_forecast(callback, j, k, particles, nothing, ancestors):
 def _run(
     table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
     seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
-    terms, health,
+    terms, n_effective, health,
 ):  # fmt: skip
     given = carray(settings, (N_LEADING + 2,))
     system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    n_members = int(given[0])
-    local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums(system))
+    layout = RankLayout(rank, n_ranks, exchange)
+    local = local_partition(layout, int(given[0]), n_sums(system))
     at = carray(steps, (n_observations,))
     record = Record(at, carray(observed, (n_observations, system.p)), t0)
     out, state = carray(terms, (n_observations,)), carray(health, (3,))
+    numbers = carray(n_effective, (n_observations,))
     noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
     scheme = int(given[N_LEADING + 1])
     resampling = resampler(given[N_LEADING], scheme, order, system.n, local)
     particles, guide = _particles(system.n, system.p, local), make_guide(system, record)
     members, to = particles.members, (callback, integers, reals)
-    state[0], state[1], state[2] = n_members, NONE, -1
+    state[0], state[1], state[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
     _start(system, guide, initial_rows(noise), particles, local)
@@ -230,13 +231,13 @@ def _run(
         d = record.observed[j]
         increment, failure = _update(system, j, k, t0 + k * dt, d, particles, local)
         if failure != NONE:
-            state[0], state[1], state[2] = 0.0, failure, j
+            state[0], state[1], state[2], numbers[j] = 0.0, failure, j, 0.0
             break
         out[j] = increment
-        log_total, n_effective = _look_ahead(guide, j, k, particles, local)
-        state[0] = min(state[0], n_effective)
+        log_total, numbers[j] = _look_ahead(guide, j, k, particles, local)
+        state[0] = min(state[0], numbers[j])
         emit(to, UPDATED, j, k, members, d, ancestors)
-        if resampling.always or n_effective < resampling.threshold:
+        if resampling.always or numbers[j] < resampling.threshold:
             z = resampling_normals(noise, j, k)
             _resample(guide, j, k, log_total, resampling, z, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)

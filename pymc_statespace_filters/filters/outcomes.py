@@ -1,15 +1,10 @@
 """Outcomes of an evaluation: rows that are missing, and failure codes with their descriptions."""
 
-import warnings
-from collections import Counter
-from typing import Any
-
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always
-from pymc_statespace_filters.errors import FilterWarning
 
-# Fewer effective particles than this, and one of them decides the estimate.
+# Fewer effective particles than this behind a term, and one of them decides it.
 COLLAPSED = 3.0
 
 NONE = 0
@@ -39,28 +34,3 @@ def is_missing(observed, j):
         if not np.isnan(observed[j, i]):
             return False
     return True
-
-
-def warn_about(filter: Any, health: np.ndarray, *, stacklevel: int = 3) -> None:
-    """Warn once of failures and collapse in some evaluations, given their health (n, 3)."""
-    failed = health[:, 1] != 0
-    if failed.any():
-        reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
-        listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
-        warnings.warn(
-            f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
-            FilterWarning,
-            stacklevel=stacklevel,
-        )
-    collapsed = ~failed & (health[:, 0] < COLLAPSED)
-    if collapsed.any():
-        warnings.warn(
-            f"{filter}: at some observation fewer than {COLLAPSED:g} particles carried all the "
-            f"weight, in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
-            f"number {health[~failed, 0].min():.3g}). The log-likelihood may be tens of nats too "
-            f"low, by a different amount for every seed; more particles lessen this only slowly. "
-            f"EKF() and EnKF(n, likelihood='gaussian') do not collapse, but have a bias of their "
-            f"own where the state is not Gaussian.",
-            FilterWarning,
-            stacklevel=stacklevel,
-        )

@@ -15,6 +15,7 @@ from pymc_statespace_filters.filters.ensemble.kalman_update import (
     kalman_update,
     mark_finite,
 )
+from pymc_statespace_filters.filters.ensemble.loop import Outcome, failed
 from pymc_statespace_filters.filters.ensemble.noise import observation_normals
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
 from pymc_statespace_filters.filters.ensemble.reductions import count
@@ -52,9 +53,9 @@ def update(system, j, k, t, d, noise, members, local, work):
     mark_finite(X, members.D, alive)
     for i in range(log_w.size):
         log_w[i] = log_w[i] if alive[i] else -np.inf
-    log_alive, n_effective = normalise_weights(log_w, members.w, local)
+    log_alive, n_previous = normalise_weights(log_w, members.w, local)
     if log_alive == -np.inf:
-        return -np.inf, 0.0, NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS
+        return failed(NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS)
 
     # Predicted density of the observation: previous weights on the forecast particles
     log_density(system, k, t, d, X, members.log_p)
@@ -68,27 +69,29 @@ def update(system, j, k, t, d, noise, members, local, work):
     as_printed = likelihood == _AS_PRINTED
     if not (
         _propose(d, members, forecast.spread, system.free, local, scratch.moments)
-        and reweight(system, k, t, d, members, forecast, n_effective, local, scratch, as_printed)
+        and reweight(system, k, t, d, members, forecast, n_previous, local, scratch, as_printed)
     ):
         copy_members(members.X_f, X)
         log_density(system, k, t, d, X, members.log_p)
         for i in range(log_w.size):
             log_w[i] += members.log_p[i]
-    log_printed = 0.0
+    log_printed, n_printed = 0.0, 0.0
     if as_printed:
-        log_printed, _ = log_sum(_log_weighted_density(members, scratch), scratch.w_equal, local)
-    log_total, n_effective = normalise_weights(log_w, members.w, local)  # Eqs. 4.37, 4.43
+        log_printed, n_printed = log_sum(
+            _log_weighted_density(members, scratch), scratch.w_equal, local
+        )
+    log_total, n_weighted = normalise_weights(log_w, members.w, local)  # Eqs. 4.37, 4.43
 
-    # Increment of the log-likelihood
-    if likelihood == _PREDICTIVE:
-        increment = log_alive + forecast.log_sum  # Eq. 4.42 without its double count
-    elif likelihood == _WEIGHTS:
-        increment = log_alive + log_total  # of the mean unnormalised weight: importance sampling
-    else:
-        increment = log_printed - log_total  # Eq. 4.42 as printed
+    # Increment of the log-likelihood, the log of a mean, and the effective number of its weights
+    if likelihood == _PREDICTIVE:  # Eq. 4.42 without its double count
+        increment, n_effective = log_alive + forecast.log_sum, forecast.n_effective
+    elif likelihood == _WEIGHTS:  # of the mean unnormalised weight: importance sampling
+        increment, n_effective = log_alive + log_total, n_weighted
+    else:  # Eq. 4.42 as printed: the ratio of two means
+        increment, n_effective = log_printed - log_total, min(n_printed, n_weighted)
     if not (np.isfinite(increment) and np.isfinite(log_total)):
-        return -np.inf, 0.0, ZERO_WEIGHTS
-    return increment, n_effective, NONE
+        return failed(ZERO_WEIGHTS)
+    return Outcome(increment, n_effective, n_weighted, NONE)
 
 
 @njit_internal

@@ -10,8 +10,8 @@ Arrays of the compiled functions: ``theta`` (k,) parameters; ``steps`` (J,) int6
 observation; ``observed`` (J, p), NaN where missing; ``inputs`` (rows, n_inputs), row k holds during
 step k; ``t0`` the time of step 0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a
 row that is wholly missing and -inf from a failing observation on, and ``health`` (3,): the smallest
-effective number of particles (inf without particles), a failure code of `filters.outcomes`, and the
-index of the failing observation or -1.
+effective number of particles behind a term (inf without particles), a failure code of
+`filters.outcomes`, and the index of the failing observation or -1.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -151,6 +151,32 @@ class DistributedLogLikelihoodFunction(Protocol):
         """Evaluate."""
 
 
+class HealthFunction(Protocol):
+    """Terms and health of one evaluation, and between them the effective number of each term.
+
+    A term is the log of a mean over members, and the number (J,) that of the weights of this mean;
+    NaN where there is no term.
+    """
+
+    def __call__(
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int
+    ) -> tuple[Array, Array, Array]:
+        """Evaluate."""
+
+
+class PredictionsFunction(Protocol):
+    """The law of every observation given those before it.
+
+    Mean (J, p), covariance (J, p, p), and the logs (J, p) of the probabilities that a component is
+    below and above what was observed. NaN for a missing component, and from a failure on.
+    """
+
+    def __call__(
+        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int
+    ) -> tuple[Array, Array, Array, Array]:
+        """Evaluate."""
+
+
 class StatesFunction(Protocol):
     """Mean, sd and a draw (R, n) of the state at ``rows``; n_effective (R,); and health.
 
@@ -238,6 +264,22 @@ class StatesFilter(Filter, Protocol):
 
 
 @runtime_checkable
+class HealthFilter(Filter, Protocol):
+    """A filter that tells how many of its members are behind every term."""
+
+    def compile_health(self, system: System) -> CompiledFunction[HealthFunction]:
+        """Compile the effective number of every term."""
+
+
+@runtime_checkable
+class PredictionFilter(Filter, Protocol):
+    """A filter that knows the law of every observation given those before it."""
+
+    def compile_predictions(self, system: System) -> CompiledFunction[PredictionsFunction]:
+        """Compile the law of every observation, for systems with additive Gaussian noise."""
+
+
+@runtime_checkable
 class BatchFilter(Filter, Protocol):
     """A filter that evaluates many parameter points side by side."""
 
@@ -250,7 +292,9 @@ class DifferentiableFilter(Filter, Protocol):
     """A filter whose likelihood has a gradient.
 
     A gradient is a forward pass, which leaves a tape, and a backward pass over it. A graph that
-    holds the likelihood too shares the forward pass.
+    holds the likelihood too shares the forward pass. The tape has a row before each prediction and
+    before each update; without rows, the filter has failed. If a row is the mean of the state and
+    the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it.
     """
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:

@@ -15,6 +15,7 @@ from arviz_stats.ecdf_utils import (
     get_pointwise_confidence_band,
     simulate_confidence_bands,
 )
+from scipy.stats import norm
 
 from pymc_statespace_filters.plots.canvas import (
     PANELS_IN_LINE,
@@ -24,7 +25,14 @@ from pymc_statespace_filters.plots.canvas import (
     interval,
     logarithmic_ticks,
 )
-from pymc_statespace_filters.plots.marks import add_legend, bars, draw_bands, points, time_label
+from pymc_statespace_filters.plots.marks import (
+    add_legend,
+    bars,
+    draw_bands,
+    legend_style,
+    points,
+    time_label,
+)
 from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
@@ -34,6 +42,8 @@ PIT_GRID = np.linspace(0, 1, 101)
 N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their ECDF
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
+CORRELATIONS = {"autocorrelation", "inputs"}  # drawn as bars over lags
+CUT = {"color": "C1"}
 LIMIT = {"color": "B1", "linestyle": "C1"}
 
 
@@ -46,18 +56,23 @@ def plot_filter_health(
 ) -> PlotCollection:
     r"""Plot diagnostics of the one-step-ahead predictions of a filter.
 
-    Three panels per observable, each with the 95 % band expected of a correct model:
+    Three or four panels per observable, each with the 95 % band expected of a correct model:
 
     * the standardised residuals of one-step-ahead prediction over time. Many residuals outside the
-      band, or long runs of one sign, show when the model is wrong;
+      band, or long runs of one sign, show when the model is wrong. A residual that is further out
+      than the draws can tell is crossed out;
     * their autocorrelation: white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
     * the empirical distribution function of the probability integral transform (PIT) minus that of
       a uniform distribution, with a simultaneous band [1]_. Predictions that are too wide go below
       and then above the band, those that are too narrow the other way round; a bias lies on one
-      side.
+      side;
+    * for a system with inputs, the correlation of the innovations with past inputs, of which that
+      furthest from zero is drawn at each lag. Outside the band the inputs act otherwise than in the
+      model.
 
-    For particle and ensemble filters, one more panel with the effective number of particles over
-    the draws. Below 3 (the dashed line) the filter has collapsed. Its title is the number of
+    For particle and ensemble filters, one more panel with the effective number of particles behind
+    each term of the log-likelihood, over the draws. Below 3 (the dashed line) the filter has
+    collapsed. Its title is the number of
     evaluations that failed while sampling.
 
     Parameters
@@ -74,9 +89,9 @@ def plot_filter_health(
     Returns
     -------
     arviz_plots.PlotCollection
-        Visuals ``expected`` and ``seen`` of the variables ``residual``, ``autocorrelation`` and
-        ``pit`` along ``observable``; ``band_90``, ``band_50``, ``median`` and ``collapsed`` of
-        ``effective``.
+        Visuals ``expected`` and ``seen`` of the variables ``residual``, ``autocorrelation``,
+        ``pit`` and ``inputs`` along ``observable``; ``clipped`` of ``residual``; ``band_90``,
+        ``band_50``, ``median`` and ``collapsed`` of ``effective``.
 
     Raises
     ------
@@ -115,15 +130,15 @@ def plot_filter_health(
         rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
         for kind in ("residual", "pit")
     )
-    seen, expected = (
-        xr.merge(parts)
-        for parts in zip(_residuals(residual), _autocorrelations(residual), _pits(pit), strict=True)
-    )
+    panels = [_residuals(residual), _autocorrelations(residual), _pits(pit)]
+    if f"{name}_input_correlation" in results:
+        panels.append(_input_correlations(results, name, residual))
+    seen, expected = (xr.merge(parts) for parts in zip(*panels, strict=True))
     effective = _log_effective(results, name)
     data = seen if effective is None else seen.assign(effective=effective)
 
     n_observables = residual.sizes["observable"]
-    n_panels = 3 * n_observables + (effective is not None)
+    n_panels = len(panels) * n_observables + (effective is not None)
     in_line = 2 if n_observables == 1 else min(n_observables, PANELS_IN_LINE)
     collection = canvas(
         data,
@@ -137,10 +152,12 @@ def plot_filter_health(
     )
     collection.map(band, "expected", data=expected, **EXPECTED)
     collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
-    lags = seen[["autocorrelation"]]
-    collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
-    collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
+    for correlation in CORRELATIONS & set(seen):
+        lags = seen[[correlation]]
+        collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
     legend = {"95 % if calibrated": {**EXPECTED, "width": 8}}
+    legend |= _mark_clipped(collection, seen[["residual"]], results.get(f"{name}_clipped"))
+    collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
     if effective is not None:
         legend |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
@@ -173,6 +190,34 @@ def _autocorrelations(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
     bound = TAIL * residual.count("time") ** -0.5
     bounds = bound.expand_dims(lag=lags["lag"]).to_dataset(name="autocorrelation")
     return lags.to_dataset(name="autocorrelation"), interval(-bounds, bounds)
+
+
+def _input_correlations(
+    results: xr.Dataset, name: str, residual: xr.DataArray
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return the correlations with the inputs, the largest at each lag, and the band of chance.
+
+    The band is that of the largest of as many correlations as there are inputs.
+    """
+    found = results[f"{name}_input_correlation"]
+    found = found.rename(input_lag="past", **{str(found.dims[-1]): "observable"})
+    n_inputs = found.sizes["input"]
+    place = abs(found).fillna(0.0).argmax("input")
+    largest = found.isel(input=place).drop_vars("input")
+    bound = norm.isf((1 - PROB ** (1 / n_inputs)) / 2) * residual.count("time") ** -0.5
+    bounds = bound.expand_dims(past=largest["past"]).to_dataset(name="inputs")
+    return largest.to_dataset(name="inputs"), interval(-bounds, bounds)
+
+
+def _mark_clipped(
+    collection: PlotCollection, residual: xr.Dataset, clipped: xr.DataArray | None
+) -> dict[str, dict[str, Any]]:
+    """Cross out every residual that is cut off; return its legend entry."""
+    if clipped is None or not clipped.any():
+        return {}
+    cut = residual.where(rename_last_dims(clipped, "time", "observable"))
+    collection.map(points, "clipped", data=cut, diameter=6, marker="C3", **CUT)
+    return {"further out": legend_style(CUT)}
 
 
 def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
@@ -242,6 +287,7 @@ def _label_panels(collection: PlotCollection, data: xr.Dataset, time: xr.DataArr
         "residual": (time_label(time), "standardised residual"),
         "autocorrelation": ("lag (observations)", "autocorrelation"),
         "pit": ("PIT", "ECDF minus uniform"),
+        "inputs": ("lag (observations)", "correlation with inputs"),
         "effective": (time_label(time), "effective number"),
     }
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}

@@ -10,6 +10,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.ops.diagnostics import TermHealth
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -65,3 +66,10 @@ def states_of(
     record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
     operation = States(variable.system, variable.filter, moment)
     return operation(variable.theta, *record, rows, draw_seed, return_list=True)
+
+
+def term_health_of(variable: StateSpaceVariable) -> Sequence[TensorVariable]:
+    """The effective number behind every term of a likelihood estimate, and health."""
+    record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
+    operation = TermHealth(variable.system, variable.filter)
+    return operation(variable.theta, *record, return_list=True)[1:]

@@ -6,7 +6,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.filters.outcomes import warn_about
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, smoothing_method
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, state_dims
@@ -193,5 +193,6 @@ def _add_states(
         if moment == "smoothed":
             part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)
-        warn_about(variable.filter, states.health, stacklevel=4)
+        arguments_of = at_draws.arguments_of(states.seeds)
+        warn_about(system, variable.filter, states.health, arguments_of, stacklevel=4)
     return add_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

@@ -9,8 +9,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.evaluation.simulate import continuation
-from pymc_statespace_filters.filters.outcomes import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, state_dims
@@ -123,7 +123,7 @@ def forecast(
                 },
             )
         )
-        warn_about(variable.filter, initial.health, stacklevel=3)
+        warn_about(system, variable.filter, initial.health, at_draws.arguments_of(initial.seeds))
     return add_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 

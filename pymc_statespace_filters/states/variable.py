@@ -1,6 +1,6 @@
 """A state-space variable at draws of the posterior: parameters, inputs, and estimated states."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
     states_of,
+    term_health_of,
     with_other_filter,
 )
 from pymc_statespace_filters.states.draws import PosteriorDraws
@@ -29,7 +30,7 @@ Array = NDArray[np.float64]
 class States(NamedTuple):
     """Mean, sd and a draw of the state (draws, R, n), and effective sample size (draws, R).
 
-    ``health`` (draws, 3) are the outcomes of the filter.
+    ``health`` (draws, 3) are the outcomes of the filter, with the noise of ``seeds`` (draws,).
     """
 
     mean: Array
@@ -37,6 +38,15 @@ class States(NamedTuple):
     drawn: Array
     n_effective: Array
     health: Array
+    seeds: NDArray[np.int64]
+
+
+class TermHealthAtDraws(NamedTuple):
+    """Effective number behind every term (draws, J), and what `States` says of it."""
+
+    n_effective: Array
+    health: Array
+    seeds: NDArray[np.int64]
 
 
 class VariableAtDraws:
@@ -85,12 +95,44 @@ class VariableAtDraws:
         """
         seed, draw_seed, row_steps = pt.lscalar("seed"), pt.lscalar("draw_seed"), pt.lvector("rows")
         graphs = states_of(self.variable._replace(seed=seed), moment, row_steps, draw_seed)
-        n_draws = int(np.prod(self._draws.shape))
-        seeds = self._draws.stored_seeds(self.variable.name) if self.variable.filter.noisy else None
-        fresh = rng.integers(np.iinfo(np.int64).max, size=(2, n_draws))
-        drawn = {seed: fresh[0] if seeds is None else seeds, draw_seed: fresh[1]}
-        results = self.evaluate(graphs, drawn, {row_steps: rows}, progressbar=progressbar)
-        return States(*results)
+        drawn = {seed: self._seeds(rng), draw_seed: self._fresh_seeds(rng)}
+        mean, sd, state, n_effective, health = self.evaluate(
+            graphs, drawn, {row_steps: rows}, progressbar=progressbar
+        )
+        return States(mean, sd, state, n_effective, health, drawn[seed])
+
+    def term_health(self, rng: np.random.Generator, *, progressbar: bool) -> TermHealthAtDraws:
+        """How many members are behind every term, with the noise of each draw's estimate."""
+        seed, seeds = pt.lscalar("seed"), self._seeds(rng)
+        graphs = term_health_of(self.variable._replace(seed=seed))
+        n_effective, health = self.evaluate(
+            graphs, {seed: seeds}, task="health", progressbar=progressbar
+        )
+        return TermHealthAtDraws(n_effective, health, seeds)
+
+    def arguments_of(self, seeds: NDArray[np.int64]) -> Callable[[int], tuple[Any, ...]]:
+        """The function of a draw's number: all inputs of a likelihood with the noise of ``seeds``.
+
+        They are evaluated when it is called.
+        """
+
+        def arguments(i: int) -> tuple[Any, ...]:
+            rows = self.inputs()
+            observed = self.variable.observed.eval(mode="FAST_COMPILE")
+            inputs = rows[i if len(rows) > 1 else 0]
+            return self.parameters()[i], self.steps, observed, inputs, self.t0, seeds[i]
+
+        return arguments
+
+    def _seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The seed of each draw's estimate; a fresh one where none is stored or read."""
+        stored = (
+            self._draws.stored_seeds(self.variable.name) if self.variable.filter.noisy else None
+        )
+        return self._fresh_seeds(rng) if stored is None else stored
+
+    def _fresh_seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        return rng.integers(np.iinfo(np.int64).max, size=int(np.prod(self._draws.shape)))
 
     def evaluate(
         self,

@@ -7,9 +7,14 @@ from scipy.stats import kstest, norm
 from pymc_statespace_filters.diagnostics.calibration import (
     coverage_of,
     pit_of,
-    residual_of,
+    residual_limit,
     uniformity_of,
     whiteness_of,
+)
+from pymc_statespace_filters.diagnostics.predictions import (
+    Laws,
+    calibration_by_rank,
+    calibration_of,
 )
 
 
@@ -37,9 +42,50 @@ def test_a_missing_datum_has_none_and_failed_draws_do_not_count():
     assert np.isnan(pit[2])
 
 
-def test_residuals_are_normal_quantiles_within_what_draws_can_tell():
-    found = residual_of(np.array([1e-9, 0.2, np.nan, 1.0]), 100)
-    np.testing.assert_allclose(found, [norm.ppf(0.005), norm.ppf(0.2), np.nan, norm.isf(0.005)])
+def test_residuals_by_rank_are_normal_quantiles_within_what_draws_can_tell():
+    draws = np.arange(100.0)[:, None, None] * np.ones((4, 1))
+    observed = np.array([[-1.0], [49.5], [np.nan], [200.0]])
+    found = calibration_by_rank(draws, observed, np.random.default_rng(7))
+    limit = residual_limit(100)
+    assert limit == norm.isf(0.005)
+    expected = np.clip(norm.ppf(found.pit), -limit, limit)
+    np.testing.assert_allclose(found.residual, expected, atol=1e-12)
+    np.testing.assert_array_equal(found.clipped, np.abs(expected) == limit)
+    assert not found.clipped[1:3].any()
+    # The innovation is not limited: 150.5 beyond the mean of the draws.
+    np.testing.assert_allclose(observed[3] - found.mean[3], 150.5)
+
+
+def test_the_mixture_over_draws_has_its_own_tails_and_moments():
+    means, sd = np.array([-1.0, 1.0, np.nan]), 0.5
+    observed = np.array([[0.3], [-4.0], [np.nan]])
+    mean = np.broadcast_to(means[:, None, None], (3, 3, 1))
+    cov = np.full((3, 3, 1, 1), sd**2)
+    z = (observed - mean) / sd
+    found = calibration_of(Laws(mean, cov, norm.logcdf(z), norm.logsf(z), True), observed)
+    pit = norm.cdf((observed[:2] - means[:2]) / sd).mean(axis=1)
+    np.testing.assert_allclose(found.pit[:2, 0], pit)
+    np.testing.assert_allclose(found.residual[:2, 0], norm.ppf(pit))
+    assert np.isnan(found.pit[2])
+    np.testing.assert_allclose(found.mean, 0.0)
+    np.testing.assert_allclose(found.cov, sd**2 + 1.0)
+    assert not found.clipped.any()
+
+
+def test_a_tail_that_one_draw_decides_is_cut_off():
+    """Precise noise around 200 drawn states: six deviations out, no draw is near."""
+    states = norm.ppf((np.arange(200) + 0.5) / 200)[:, None, None] * np.ones((3, 1))
+    observed, noise = np.array([[0.4], [6.0], [-6.0]]), 0.1
+    z = (observed - states) / noise
+    laws = Laws(
+        states, np.full((200, 3, 1, 1), noise**2), norm.logcdf(z), norm.logsf(z), known=False
+    )
+    found = calibration_of(laws, observed)
+    np.testing.assert_array_equal(found.clipped[:, 0], [False, True, True])
+    np.testing.assert_allclose(found.residual[1:, 0], residual_limit(200) * np.array([1, -1]))
+    assert found.residual[0, 0] == pytest.approx(0.4, abs=0.01)
+    sd = np.sqrt(found.cov[:, 0, 0])
+    np.testing.assert_allclose((observed - found.mean)[1:, 0] / sd[1:], [6.0, -6.0], rtol=0.02)
 
 
 def test_coverage_of_central_intervals():

@@ -106,7 +106,7 @@ def test_counts():
     steps = np.arange(150)
     seen = psf.simulate(system, {"c": 0.3}, steps=steps, random_seed=3)["observations"].values
     assert np.unique(seen).size < 12  # many ties
-    found = diagnosed(system, psf.BootstrapPF(100), seen, steps, (1, 400), c=0.3)
+    found = diagnosed(system, psf.BootstrapPF(400), seen, steps, (1, 400), c=0.3)
     assert (found["d_predicted"] % 1 == 0).all()
     assert found["d_uniformity"].item() > 1e-3
     # The share of predictions below the datum alone, or not above it, is far from uniform.
@@ -130,7 +130,8 @@ def noisy():
 
 def test_the_effective_number_is_that_of_each_draws_own_estimate(noisy):
     model, idata = noisy
-    found = psf.filter_diagnostics(idata, model, random_seed=1, extend_inferencedata=False)
+    with pytest.warns(psf.FilterWarning, match="fewer than 3 particles"):
+        found = psf.filter_diagnostics(idata, model, random_seed=1, extend_inferencedata=False)
     assert "filter_diagnostics" not in idata.children
     found = found["filter_diagnostics"]
     smallest = found["d_n_effective"].min("d_time")
@@ -152,9 +153,10 @@ def test_another_filter_fewer_draws_and_the_same_again(noisy):
 
 
 def test_failures_are_counted():
-    found = diagnosed(
-        SYSTEM, psf.BootstrapPF(20), [0.1, 0.2, 1e200, 0.3], np.arange(4), (1, 10), **TRUTH
-    )
+    with pytest.warns(psf.FilterWarning, match="in 10 of 10 evaluations"):
+        found = diagnosed(
+            SYSTEM, psf.BootstrapPF(20), [0.1, 0.2, 1e200, 0.3], np.arange(4), (1, 10), **TRUTH
+        )
     assert found["d_failed"] == 1
     for name in ("d_predicted", "d_pit", "d_residual"):
         failed = np.isnan(found[name]).any(set(found[name].dims) - {"d_time"})

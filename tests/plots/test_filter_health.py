@@ -101,6 +101,32 @@ def test_a_deterministic_filter_has_no_panel_of_particles(diagnostics):
     assert set(collection.viz["plot"].data_vars) == {"residual", "autocorrelation", "pit"}
 
 
+def test_residuals_that_are_cut_off_are_crossed_out():
+    group = of_residuals([0.3, 2.8, -2.8, -1.0])
+    clipped = np.array([[False], [True], [True], [False]])
+    group["d_clipped"] = (("d_time", "observable"), clipped)
+    tree = xr.DataTree.from_dict({"filter_diagnostics": group})
+    crosses = drawn(plot_filter_health(tree, backend="none"), "clipped", "residual")["y"]
+    np.testing.assert_array_equal(crosses["x"], [1, 2])
+    np.testing.assert_array_equal(crosses["y"], [2.8, -2.8])
+
+
+def test_the_largest_correlation_with_an_input_at_each_lag():
+    group = of_residuals(np.random.default_rng(6).normal(size=100)).assign_coords(
+        input_lag=[0, 1], input=["force", "heat"]
+    )
+    values = [[[0.1], [-0.4]], [[np.nan], [0.05]]]
+    group["d_input_correlation"] = (("input_lag", "input", "observable"), values)
+    tree = xr.DataTree.from_dict({"filter_diagnostics": group})
+    collection = plot_filter_health(tree, backend="none")
+    heights = np.reshape(drawn(collection, "seen", "inputs")["y"]["y"], (-1, 3))
+    np.testing.assert_array_equal(heights[:, 1], [-0.4, 0.05])
+    band = drawn(collection, "expected", "inputs")["y"]
+    # The larger of two standard normals is within this in 95 % of all cases.
+    np.testing.assert_allclose(2 * norm.cdf(10 * band["y_top"]) - 1, np.sqrt(0.95))
+    np.testing.assert_allclose(band["y_bottom"], -np.asarray(band["y_top"]))
+
+
 def test_names_of_axes_and_panels(diagnostics):
     axes = plot_filter_health(diagnostics).viz["figure"].item().axes
     found = [(a.get_title(), a.get_xlabel(), a.get_ylabel()) for a in axes[:7:2]]

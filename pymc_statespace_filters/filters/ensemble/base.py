@@ -24,6 +24,7 @@ from pymc_statespace_filters.filters.ensemble.summaries import run_function, sta
 from pymc_statespace_filters.filters.outcomes import OUT_OF_MEMORY
 from pymc_statespace_filters.filters.protocol import (
     DistributedLogLikelihoodFunction,
+    HealthFunction,
     LogLikelihoodFunction,
     RunFunction,
     StatesFunction,
@@ -143,9 +144,24 @@ class EnsembleFilterBase:
 
         @njit_callable
         def run(theta, steps, observed, inputs, t0, noise):
-            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK)
+            terms, _, health = evaluate(
+                theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK
+            )
+            return terms, health
 
         return CompiledFunction(run, key_of("likelihood", evaluation.key))
+
+    def compile_health(self, system: System) -> CompiledFunction[HealthFunction]:
+        """Compile the effective number behind every term of `compile`."""
+        evaluation = self.algorithm(system).evaluation(system)
+        evaluate = evaluation.function
+
+        @njit_callable
+        def run(theta, steps, observed, inputs, t0, seed):
+            noise = (seed, np.empty(0))
+            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK)
+
+        return CompiledFunction(run, key_of("health", evaluation.key))
 
     def compile_distributed(
         self, system: System
@@ -161,7 +177,10 @@ class EnsembleFilterBase:
         @njit_callable
         def run(theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange):
             noise, layout = (seed, np.empty(0)), (rank, n_ranks, exchange)
-            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, layout)
+            terms, _, health = evaluate(
+                theta, steps, observed, inputs, t0, noise, NO_CALLBACK, layout
+            )
+            return terms, health
 
         return CompiledFunction(run, key_of("distributed likelihood", evaluation.key))
 
@@ -184,7 +203,10 @@ class EnsembleFilterBase:
 
         @njit_callable
         def run(theta, steps, observed, inputs, t0, noise, callback):
-            return evaluate(theta, steps, observed, inputs, t0, noise, callback, SINGLE_RANK)
+            terms, _, health = evaluate(
+                theta, steps, observed, inputs, t0, noise, callback, SINGLE_RANK
+            )
+            return terms, health
 
         return CompiledFunction(run, key_of("with callback", evaluation.key))
 
@@ -211,6 +233,7 @@ class EnsembleFilterBase:
             if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
                 raise ModelError("normals must be those of this filter, system and steps")
             terms, health = np.full(steps.size, -np.inf), np.empty(3)
+            n_effective = np.full(steps.size, np.nan)
             health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
             table = make_table()
             arguments = FilterArguments(
@@ -220,12 +243,13 @@ class EnsembleFilterBase:
                 t0=t0, seed=seed, normals=normals.ctypes.data, n_normals=normals.size,
                 order=address_of(order), callback=callback[0], integers=callback[1],
                 reals=callback[2], rank=layout[0], n_ranks=layout[1], exchange=layout[2],
-                terms=terms.ctypes.data, health=health.ctypes.data,
+                terms=terms.ctypes.data, n_effective=n_effective.ctypes.data,
+                health=health.ctypes.data,
             )  # fmt: skip
             evaluate(*arguments)
             keep_alive(table)
             keep_alive(normals)
-            return terms, health
+            return terms, n_effective, health
 
         return CompiledFunction(
             run, key_of(f"{self!r} {settings.tolist()} {order}", table.key, self.entry.key)

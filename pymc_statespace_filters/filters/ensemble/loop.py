@@ -46,7 +46,7 @@ FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "order": types.intp,  # address of the function that sorts particles, 0 if none does
     "callback": types.intp, "integers": types.intp, "reals": types.intp,  # see `callbacks`
     "rank": types.intp, "n_ranks": types.intp, "exchange": types.intp,  # see `partition`
-    "terms": F64_PTR, "health": F64_PTR,
+    "terms": F64_PTR, "n_effective": F64_PTR, "health": F64_PTR,
 }  # fmt: skip
 
 FilterArguments = arguments_class("FilterArguments", FILTER_ARGUMENTS, __name__)
@@ -70,6 +70,27 @@ class Members(NamedTuple):
     log_w: np.ndarray
     log_p: np.ndarray
     alive: np.ndarray
+
+
+class Outcome(NamedTuple):
+    """What an update returns.
+
+    ``increment`` is log p(d_j | d_1 .. d_{j-1}), the log of a mean, and ``n_effective`` the
+    effective number of the weights of that mean: below a few, one member decides the increment.
+    ``n_weighted`` is the effective number of the weights that the update has left the members,
+    which decides whether to resample. ``failure`` is a code of `filters.outcomes`.
+    """
+
+    increment: float
+    n_effective: float
+    n_weighted: float
+    failure: int
+
+
+@inline_always
+def failed(failure, n_effective=0.0):
+    """The outcome of an update that has failed."""
+    return Outcome(-np.inf, n_effective, 0.0, failure)
 
 
 @njit_internal
@@ -110,7 +131,7 @@ def no_resampler(settings, order, n, local):
 
 
 @njit_internal
-def no_resampling(resampler, noise, j, k, n_effective, members, local):
+def no_resampling(resampler, noise, j, k, n_weighted, members, local):
     """Keep all members."""
     return False
 
@@ -134,27 +155,27 @@ def ensemble_filter(
         filter's settings. ``system`` is a `TabledSystem`, ``local`` a `LocalPartition`: which of
         all members are here.
     update : njit function
-        ``(system, j, k, t, d, noise, members, local, work) -> (increment, n_effective, failure)``.
-        Replaces the forecast members by the analysis of observation j at step k, with normalised
-        weights, and returns log p(d_j | d_1 .. d_{j-1}). What it returns, and where it branches,
-        is the same on all ranks.
+        ``(system, j, k, t, d, noise, members, local, work) -> Outcome``. Replaces the forecast
+        members by the analysis of observation j at step k, with normalised weights. What it
+        returns, and where it branches, is the same on all ranks.
     n_settings : int
         How many settings, as numbers, the filter has besides the number of members.
     resampler, resample : njit functions, optional
         ``(settings, order, n, local) -> workspace`` with an array ``ancestors``, and
-        ``(workspace, noise, j, k, n_effective, members, local) -> whether members were resampled``.
+        ``(workspace, noise, j, k, n_weighted, members, local) -> whether members were resampled``.
 
     Returns
     -------
     EntryPoint
-        Writes ``terms`` and ``health`` (see `filters.protocol`). A filter of this package is cached
+        Writes ``terms``, ``n_effective`` of every term, which stays NaN where there is none, and
+        ``health`` (see `filters.protocol`). A filter of this package is cached
         on disk; another one is compiled once per process.
     """
 
     def run(
         table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
         seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
-        terms, health,
+        terms, n_effective, health,
     ):  # fmt: skip
         given = carray(settings, (N_LEADING + n_settings,))
         system = read_system(table, dt, theta, n_theta, inputs, n_rows)
@@ -162,6 +183,7 @@ def ensemble_filter(
         local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums(system))
         at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
         out, state = carray(terms, (n_observations,)), carray(health, (3,))
+        numbers = carray(n_effective, (n_observations,))
         noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
         work = workspace(system, local, given[N_LEADING:])
         resampling = resampler(given[N_LEADING:], order, system.n, local)
@@ -181,16 +203,15 @@ def ensemble_filter(
             if is_missing(record, j):
                 out[j] = 0.0
                 continue
-            increment, n_effective, failure = update(
-                system, j, k, t0 + k * dt, record[j], noise, members, local, work
-            )
-            state[0] = min(state[0], n_effective)
-            if failure != NONE:
-                state[1], state[2] = failure, j
+            found = update(system, j, k, t0 + k * dt, record[j], noise, members, local, work)
+            numbers[j] = found.n_effective
+            state[0] = min(state[0], found.n_effective)
+            if found.failure != NONE:
+                state[1], state[2] = found.failure, j
                 break
-            out[j] = increment
+            out[j] = found.increment
             emit(to, UPDATED, j, k, members, record[j], ancestors)
-            if resample(resampling, noise, j, k, n_effective, members, local):
+            if resample(resampling, noise, j, k, found.n_weighted, members, local):
                 emit(to, RESAMPLED, j, k, members, nothing, ancestors)
         if state[1] == NONE:
             emit(to, ENDED, n_observations, k, members, nothing, ancestors)

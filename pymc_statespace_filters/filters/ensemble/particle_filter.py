@@ -32,9 +32,9 @@ def _resampler(settings, order, n, local):
 
 
 @njit_internal
-def _resample(resampling, noise, j, k, n_effective, members, local):
+def _resample(resampling, noise, j, k, n_weighted, members, local):
     z = resampling_normals(noise, j, k)
-    return resample_if_few(resampling, n_effective, z, members.log_w, members.w, members.X, local)
+    return resample_if_few(resampling, n_weighted, z, members.log_w, members.w, members.X, local)
 
 
 def particle_filter(

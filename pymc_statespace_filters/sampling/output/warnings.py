@@ -163,8 +163,10 @@ def _failure_problem(statistics: PhaseStatistics) -> str | None:
         return (
             f"In {statistics.collapsed} of {statistics.iterations} draws the particles collapsed: "
             "hardly more than one of them determined the estimated likelihood at some observation "
-            "(sample_stats n_effective). Such estimates vary by many nats, and a chain is slow to "
-            "leave an overestimate. More particles reduce this only slowly."
+            "(sample_stats n_effective; filter_diagnostics shows at which). Such estimates vary by "
+            "many nats, and a chain is slow to leave an overestimate. More particles reduce this "
+            "only slowly; use GridFilter() for one state with additive process noise, GuidedPF(n) "
+            "otherwise."
         )
     n_failed = sum(count for _, count in statistics.failures)
     if n_failed > TOLERATED_FAILURES * statistics.evaluations:

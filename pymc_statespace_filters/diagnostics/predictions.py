@@ -1,0 +1,145 @@
+"""The predictive distribution of every observation, mixed over the draws of the posterior."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp, ndtri_exp
+
+from pymc_statespace_filters.diagnostics.calibration import pit_of, residual_limit
+from pymc_statespace_filters.pymc_model.prediction_graphs import (
+    exact_predictions,
+    gaussian_predictions,
+    observations_given,
+)
+from pymc_statespace_filters.states.variable import States, VariableAtDraws
+
+Array = NDArray[np.float64]
+
+# Fewer draws than this behind the probability of a tail, and one of them decides it.
+_LEAST_DRAWS = 3.0
+_LOWEST = -700.0  # log of a probability that is still positive in floating point
+_LEAST_PIT = 1e-16  # tests of uniformity take no 0 and no 1
+_TOLERANCE = 1e-6  # in nats, of a term from the moments of its prediction
+
+
+class Laws(NamedTuple):
+    """The law of every observation at every draw: moments, and logs of its two tails.
+
+    ``mean`` and the tails are (draws, J, p), ``cov`` (draws, J, p, p); NaN where the filter failed.
+    ``known`` tells whether they are the laws of the filter. Otherwise each is that of the
+    observation of one state drawn from the prediction, and only their mixture means anything.
+    """
+
+    mean: Array
+    cov: Array
+    log_below: Array
+    log_above: Array
+    known: bool
+
+
+class Calibration(NamedTuple):
+    """PIT values, residuals, which of these are cut off, and moments of the predictions.
+
+    (J, p) all, but the covariance ``cov``, (J, p, p).
+    """
+
+    pit: Array
+    residual: Array
+    clipped: NDArray[np.bool_]
+    mean: Array
+    cov: Array
+
+
+def laws_of(at_draws: VariableAtDraws, observed: Array, before: States) -> Laws | None:
+    """The laws of the observations: the filter's if it knows them, else those given drawn states.
+
+    The states are drawn ``before`` the observation. None where its noise is not Gaussian.
+    """
+    variable = at_draws.variable
+    if variable.system.equations.observation is None:
+        return None
+    seed = pt.lscalar("seed")
+    with_seed = variable._replace(seed=seed)
+    if (graphs := exact_predictions(with_seed)) is not None:
+        mean, cov, log_below, log_above = at_draws.evaluate(graphs, {seed: before.seeds})
+        return Laws(mean, cov, log_below, log_above, known=True)
+    if (graphs := gaussian_predictions(with_seed)) is not None:
+        terms, mean, cov = at_draws.evaluate(graphs, {seed: before.seeds})
+        if _give_terms(mean, cov, observed, terms):
+            return Laws(mean, cov, *_tails(mean, cov, observed), known=True)
+    x = pt.dmatrix("x")
+    drawn = {seed: before.seeds, x: before.drawn}
+    mean, cov = at_draws.evaluate(observations_given(with_seed, x), drawn)
+    return Laws(mean, cov, *_tails(mean, cov, observed), known=False)
+
+
+def calibration_of(laws: Laws, observed: Array) -> Calibration:
+    """Compare the observations (J, p) with the mixture of their laws."""
+    draws = np.isfinite(laws.mean)
+    n_draws = draws.sum(axis=0)
+    unseen = np.isnan(observed) | (n_draws == 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below, few_below = _mixed(laws.log_below, draws)
+        above, few_above = _mixed(laws.log_above, draws)
+    is_low = below < above
+    quantile = ndtri_exp(np.clip(np.where(is_low, below, above), _LOWEST, np.log(0.5)))
+    residual = np.where(is_low, quantile, -quantile)
+    limit = residual_limit(np.maximum(n_draws, 1))
+    few = np.where(is_low, few_below, few_above) & (not laws.known)
+    clipped = (few & (np.abs(residual) > limit)) | (np.minimum(below, above) < _LOWEST)
+    residual = np.where(few, np.clip(residual, -limit, limit), residual)
+    pit = np.where(unseen, np.nan, np.clip(np.exp(below), _LEAST_PIT, 1.0 - _LEAST_PIT))
+    mean, cov = _mixed_moments(laws.mean, laws.cov)
+    return Calibration(pit, np.where(unseen, np.nan, residual), clipped & ~unseen, mean, cov)
+
+
+def calibration_by_rank(predicted: Array, observed: Array, rng: np.random.Generator) -> Calibration:
+    """Compare the observations with draws of their predictions (draws, J, p)."""
+    pit = pit_of(observed, predicted, rng)
+    limit = residual_limit(len(predicted))
+    with np.errstate(divide="ignore"):
+        residual = np.clip(ndtri_exp(np.log(pit)), -limit, limit)
+    mean, cov = _mixed_moments(predicted, np.zeros((*predicted.shape, predicted.shape[-1])))
+    return Calibration(pit, residual, np.abs(residual) >= limit, mean, cov)
+
+
+def _tails(mean: Array, cov: Array, observed: Array) -> tuple[Array, Array]:
+    """Logs of the probabilities of Gaussian variables to be below and above the observations."""
+    variances = np.diagonal(cov, axis1=-2, axis2=-1)
+    z = (observed - mean) / np.sqrt(variances)
+    return log_ndtr(z), log_ndtr(-z)
+
+
+def _give_terms(mean: Array, cov: Array, observed: Array, terms: Array) -> bool:
+    """Whether terms (draws, J) are the Gaussian log-densities of the completely seen rows."""
+    rows = ~np.isnan(observed).any(axis=1)
+    draws = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(terms).all(axis=1)
+    if not (rows.any() and draws.any()):
+        return True
+    z, S = (observed - mean)[draws][:, rows], cov[draws][:, rows]
+    solved = np.linalg.solve(S, z[..., None])[..., 0]
+    log_det = np.linalg.slogdet(2 * np.pi * S)[1]
+    expected = -0.5 * (np.sum(z * solved, axis=-1) + log_det)
+    return bool(np.allclose(terms[draws][:, rows], expected, rtol=_TOLERANCE, atol=_TOLERANCE))
+
+
+def _mixed(log_tails: Array, draws: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Log of the mean of tail probabilities, and whether few draws decide it."""
+    logs = np.where(draws & ~np.isnan(log_tails), log_tails, -np.inf)
+    total = logsumexp(logs, axis=0)
+    n_effective = np.exp(2 * total - logsumexp(2 * logs, axis=0))
+    return total - np.log(draws.sum(axis=0)), ~(n_effective >= _LEAST_DRAWS)
+
+
+def _mixed_moments(means: Array, covs: Array) -> tuple[Array, Array]:
+    """Mean (J, p) and covariance (J, p, p) of a mixture over the draws that are not NaN."""
+    draws = np.isfinite(means).all(axis=2)
+    n = draws.sum(axis=0)[:, None]
+    with np.errstate(invalid="ignore"):
+        mean = np.where(draws[..., None], means, 0.0).sum(axis=0) / n
+        apart = np.where(draws[..., None], means - mean, 0.0)
+        between = np.einsum("sjb,sjc->jbc", apart, apart)
+        within = np.where(draws[..., None, None], covs, 0.0).sum(axis=0)
+        return mean, (between + within) / n[..., None]

@@ -1,0 +1,30 @@
+"""What diagnostics ask of a likelihood: operations without a derivative."""
+
+import pytensor.tensor as pt
+
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.filters.protocol import HealthFilter, PredictionFilter
+from pymc_statespace_filters.ops.base import FilterOp
+
+
+class TermHealth(FilterOp):
+    """Terms (J,) of the likelihood, the effective number (J,) behind each, and health (3,)."""
+
+    output_types = (pt.dvector, pt.dvector, pt.dvector)
+    filter: HealthFilter
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's health."""
+        return self.filter.compile_health(system)
+
+
+class Predictions(FilterOp):
+    """The law of every observation before it is seen: see `protocol.PredictionsFunction`."""
+
+    output_types = (pt.dmatrix, pt.dtensor3, pt.dmatrix, pt.dmatrix)
+    filter: PredictionFilter
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The filter's predictions."""
+        return self.filter.compile_predictions(system)

@@ -1,0 +1,127 @@
+"""Innovations against exact ones, a planted surprise, and what innovations correlate with."""
+
+import warnings
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from tests.references.linear_states import linear_states
+from tests.small_systems import PAIR, PAIR_DATA, STEPS
+
+A, Q, R, P0 = 0.8, 0.3, 0.2, 1.0
+LONG = np.arange(1, 301)
+SURPRISE = 200
+FORCED = psf.StateSpaceModel(
+    transition=lambda x, q, u, a, b: [a * x[0] + b * u[0] + q[0]],
+    process_noise=[[Q]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[R]],
+    initial_mean=[0.0],
+    initial_cov=[[P0]],
+    inputs=["force"],
+)
+
+
+def diagnosed(system, filter, observed, steps, n_draws=200, inputs=None, **values):
+    with pm.Model() as model:
+        for name in values:
+            pm.Normal(name)
+        psf.StateSpace("d", system, filter, steps=steps, observed=observed, inputs=inputs)
+    draws = {name: np.full((2, n_draws // 2), value) for name, value in values.items()}
+    idata = az.from_dict({"posterior": draws})
+    found = psf.filter_diagnostics(idata, model, random_seed=1)
+    return found["filter_diagnostics"].to_dataset()
+
+
+@pytest.fixture(scope="module")
+def forced_record():
+    """A record with a surprise of six predicted deviations, and the exact predictions of it."""
+    force = np.random.default_rng(8).normal(size=(LONG[-1] + 1, 1))
+    params = {"a": A, "b": 1.0}
+    simulated = psf.simulate(FORCED, params, steps=LONG, inputs=force, random_seed=3)
+    observed = simulated["observations"].values.copy()
+    for _ in range(2):  # the prediction of the surprise does not depend on it
+        law = linear_states(
+            [[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]],
+            steps=LONG, observed=observed, rows=LONG, moment="predicted", forcing=force,
+        )  # fmt: skip
+        sd = np.sqrt(law.sd[:, 0] ** 2 + R)
+        observed[SURPRISE] = law.mean[SURPRISE] + 6.0 * sd[SURPRISE]
+    return force, observed, law.mean[:, 0], sd
+
+
+def test_innovations_of_a_linear_system_are_kalmans():
+    noise = np.array([[0.5, 0.1], [0.1, 0.4]])
+    law = linear_states(
+        [[0.5, 0.2], [0.0, 0.8]], np.diag([1.0, 0.5]), np.eye(2), noise, [0.0, 0.3],
+        np.diag([1.0, 2.0]), steps=STEPS, observed=PAIR_DATA, rows=STEPS, moment="predicted",
+    )  # fmt: skip
+    j = np.arange(STEPS.size)
+    cov = law.cov[j, :, j] + noise
+    found = diagnosed(PAIR, psf.EKF(), PAIR_DATA, STEPS, 10, a=0.5, b=0.2)
+    np.testing.assert_allclose(found["d_innovation"], PAIR_DATA - law.mean, atol=1e-9)
+    np.testing.assert_allclose(found["d_innovation_cov"], cov, atol=1e-9)
+    z = (PAIR_DATA - law.mean) / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    np.testing.assert_allclose(found["d_residual"], z, atol=1e-9)
+    assert not found["d_clipped"].any()
+
+
+@pytest.mark.parametrize(("filter", "tolerance"), [(psf.EKF(), 1e-8), (psf.GridFilter(), 0.02)])
+def test_a_surprise_of_six_deviations_shows_as_six(filter, tolerance, forced_record):
+    """A grid wider than the noise has an error of a hundredth in its tails."""
+    force, observed, mean, sd = forced_record
+    found = diagnosed(FORCED, filter, observed, LONG, 8, inputs=force, a=A, b=1.0)
+    residual = found["d_residual"].values[:, 0]
+    assert residual[SURPRISE] == pytest.approx(6.0, abs=6 * tolerance)
+    np.testing.assert_allclose(residual, (observed[:, 0] - mean) / sd, atol=6 * tolerance)
+    assert not found["d_clipped"].any()
+    np.testing.assert_allclose(found["d_innovation"][:, 0], observed[:, 0] - mean, atol=1e-6)
+    np.testing.assert_allclose(found["d_innovation_cov"][:, 0, 0], sd**2, rtol=1e-6)
+
+
+def test_with_particles_it_is_cut_off_and_said_to_be(forced_record):
+    """Predicted moments of 400 draws: within five standard errors."""
+    force, observed, _, _ = forced_record
+    with pytest.warns(psf.FilterWarning, match="fewer than 3 particles") as caught:
+        found = diagnosed(
+            FORCED, psf.BootstrapPF(100), observed, LONG, 400, inputs=force, a=A, b=1.0
+        )
+    assert len(caught) == 1
+    assert found["d_clipped"].values[SURPRISE, 0]
+    assert found["d_clipped"].sum() < 10
+    assert 2.5 < found["d_residual"].values[SURPRISE, 0] < 4
+    sd = np.sqrt(found["d_innovation_cov"].values[SURPRISE, 0, 0])
+    z = found["d_innovation"].values[SURPRISE, 0] / sd
+    assert z == pytest.approx(6.0, abs=5 * 6 / np.sqrt(2 * 400))
+
+
+def test_white_innovations_pass_and_wrong_models_do_not(forced_record):
+    """19 of 20 lags within the band: more than six of 25 outside once in 1000 records."""
+    force, observed, mean, _ = forced_record
+    observed = observed.copy()
+    observed[SURPRISE] = mean[SURPRISE]
+    bound = 1.96 / np.sqrt(LONG.size)
+    right = diagnosed(FORCED, psf.EKF(), observed, LONG, 4, inputs=force, a=A, b=1.0)
+    for name in ("d_autocorrelation", "d_input_correlation"):
+        assert (np.abs(right[name]) > bound).sum() <= 6
+        assert (np.abs(right[name]) < 2 * bound).all()
+    assert right["d_input_correlation"].dims == ("input_lag", "input", "observable")
+    assert list(right["input"].values) == ["force"]
+
+    deaf = diagnosed(FORCED, psf.EKF(), observed, LONG, 4, inputs=force, a=A, b=0.5)
+    assert deaf["d_input_correlation"].sel(input_lag=0).item() > 4 * bound
+    slow = diagnosed(FORCED, psf.EKF(), observed, LONG, 4, inputs=0 * force, a=0.0, b=1.0)
+    assert slow["d_autocorrelation"].sel(lag=1).item() > 4 * bound
+    assert slow["d_whiteness"].item() < 1e-4
+
+
+def test_a_healthy_filter_says_nothing(forced_record):
+    force, observed, _, _ = forced_record
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        diagnosed(
+            FORCED, psf.BootstrapPF(200), observed[:50], LONG[:50], 10, inputs=force, a=A, b=1.0
+        )
