@@ -20,6 +20,10 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Neighbours share no system, so that the two processes do not compile the same code at once.
 LONGEST = (
     "filters/test_outside_filters.py",
+    "filters/test_sigma_points.py",
+    "filters/test_iplf_distributions.py",
+    "filters/test_guided_page.py",
+    "filters/test_truth_guided.py",
     "filters/test_ensemble_states.py",
     "compiler/test_large_states.py",
     "sampling/test_noisy_chains.py",
