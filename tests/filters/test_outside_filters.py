@@ -10,9 +10,11 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytest
+from numba import njit
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters import (
+    CompiledFunction,
     EnsembleFilter,
     Filter,
     RunFilter,
@@ -22,7 +24,7 @@ from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.linear_states import linear_states
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "filter.md"
-# One system with everything, inputs included: the filter of the page takes a minute to compile.
+# One system with everything, inputs included: the filter of the page is compiled for each.
 SYSTEM = psf.StateSpaceModel(
     transition=lambda x, q, u, a: [a * x[0] + 0.1 * x[1] + u[0] + q[0], 0.9 * x[1] + q[1]],
     process_noise=[[0.5, 0.1], [0.1, 0.3]],
@@ -76,7 +78,10 @@ def cubature():
 
 @dataclass(frozen=True)
 class PlainParticles:
-    """A noisy filter with the least there can be: no members, no states, no stored noise."""
+    """A noisy filter with the least there can be: no members, no states, no stored noise.
+
+    Its function is decorated by numba's own ``njit``, and has no key.
+    """
 
     n: int
     noisy: ClassVar[bool] = True
@@ -90,7 +95,13 @@ class PlainParticles:
         return True
 
     def compile(self, system):
-        return psf.BootstrapPF(self.n).compile(system)
+        bootstrap = psf.BootstrapPF(self.n).compile(system).function
+
+        @njit
+        def likelihood(theta, steps, observed, inputs, t0, seed):
+            return bootstrap(theta, steps, observed, inputs, t0, seed)
+
+        return CompiledFunction(likelihood)
 
 
 def model_of(filter):
