@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -71,8 +70,6 @@ def cubature():
     definitions = [cell for cell in cells if re.search(r"^(@njit|@dataclass|from )", cell, re.M)]
     namespace = {"__name__": "a_users_file"}
     exec("\n".join(definitions), namespace)
-    # Likelihood, run and states of one system share a pass, which takes long to compile.
-    namespace["compile_pass"] = cache(namespace["compile_pass"])
     return namespace["CubatureKF"]()
 
 
