@@ -8,6 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.batch import BatchLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
@@ -46,9 +47,20 @@ def kalman(record, decay=DECAY):
     return kalman_log_likelihood(decay * A, Q, C, R, zero, one, steps=STEPS, observed=record)
 
 
-def test_ekf_is_the_kalman_filter(chain, record):
-    terms = psf.log_likelihood(chain, psf.EKF(), {"decay": DECAY}, record, steps=STEPS)
-    np.testing.assert_allclose(terms, kalman(record), rtol=1e-9)
+def test_ekf_is_the_kalman_filter_at_every_point_of_a_batch(chain, record):
+    """Too many states to write out are evaluated in turn; a point that fails touches no other."""
+    points = np.array([[DECAY], [np.nan], [0.7]])
+    batch = evaluator(BatchLogLikelihood(chain, psf.EKF()))
+    terms, health = batch(
+        points, np.array(STEPS), record, np.zeros((0, 0)), np.array(0.0), np.array(0)
+    )
+    for i in (0, 2):
+        np.testing.assert_allclose(terms[i], kalman(record, points[i, 0]), rtol=1e-9)
+        np.testing.assert_array_equal(health[i], [np.inf, 0, -1])
+    # The first observation is of the start, which does not depend on the parameter.
+    np.testing.assert_array_equal(terms[1], [terms[0, 0], -np.inf, -np.inf])
+    assert health[1, 1] != 0
+    assert health[1, 2] == 1
 
 
 def test_enkf_approaches_the_kalman_filter(chain, record):

@@ -11,30 +11,23 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
+from pymc_statespace_filters.system.parameters import flat_parameters
+from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM
 
 STEPS = [0, 10, 20, 40]
 RECORD = [1.0, -0.5, np.nan, 0.8]
 FILTERS = [psf.EKF(), psf.EnKF(50), psf.BootstrapPF(50), psf.PFEnKF(50)]
 
 
-def drift(x, alpha, beta):
-    return [alpha * x[0] + beta * x[0] ** 3]
-
-
-DOUBLE_WELL = psf.StateSpaceModel(
-    transition=psf.EulerMaruyama(drift, lambda sigma_m: [[sigma_m]], dt=0.01),
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.08]],
-    initial_mean=[1.0],
-    initial_cov=lambda spread: [[spread]],
-)
+PARAMETERS = ("alpha", "beta", "sigma", "initial_var")
+KNOWN = {"noise_var": 0.08, "initial_mean": 1.0}
 
 
 def evaluate(filter, points):
     """Terms (S, J), and the reasons that the warnings count."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        terms = psf.log_likelihood(DOUBLE_WELL, filter, points, RECORD, steps=STEPS)
+        terms = psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, points | KNOWN, RECORD, steps=STEPS)
     assert all(issubclass(w.category, psf.FilterWarning) for w in caught)
     counted = sum(
         int(count)
@@ -57,9 +50,7 @@ def test_no_point_gives_nan(filter):
         [4.0, -4.0, 0.5, -1.0],
     ])  # fmt: skip
     points = np.vstack([named, np.column_stack([alpha, beta, sigma, spread])])
-    terms, counted = evaluate(
-        filter, dict(zip(("alpha", "beta", "sigma_m", "spread"), points.T, strict=True))
-    )
+    terms, counted = evaluate(filter, dict(zip(PARAMETERS, points.T, strict=True)))
     total = terms.sum(axis=1)
     assert not np.isnan(terms).any()
     assert not (terms == np.inf).any()
@@ -74,13 +65,16 @@ def test_no_point_gives_nan(filter):
 
 
 def test_the_gradient_of_an_explosion_is_finite():
-    gradient = evaluator(LogLikelihoodGradient(DOUBLE_WELL, psf.EKF()))
+    gradient = evaluator(LogLikelihoodGradient(DOUBLE_WELL_SYSTEM, psf.EKF()))
     rest = (
         np.array(STEPS), np.array(RECORD)[:, None], np.zeros((0, 0)), np.array(0.0), np.array(0),
         np.ones(len(STEPS)),
     )  # fmt: skip
     for point in ([1e6, -1.0, 0.5, 0.5], [4.0, 100.0, 0.5, 0.5], [4.0, -4.0, 0.0, 0.0]):
-        assert np.isfinite(gradient(np.array(point), *rest)).all()
+        theta = flat_parameters(
+            DOUBLE_WELL_SYSTEM, KNOWN | dict(zip(PARAMETERS, point, strict=True))
+        )
+        assert np.isfinite(gradient(theta, *rest)).all()
 
 
 @pytest.mark.parametrize("filter", FILTERS[1:3], ids=lambda f: type(f).__name__)

@@ -1,4 +1,7 @@
-"""Many parameter points side by side: the numbers of each alone, whatever its neighbours do."""
+"""Many parameter points side by side: the numbers of each alone, whatever its neighbours do.
+
+Large states, whose points are evaluated in turn, are in `tests/compiler/test_large_states.py`.
+"""
 
 import numpy as np
 import pymc as pm
@@ -87,22 +90,6 @@ def test_points_that_all_fail():
     (terms, health), (terms_alone, health_alone) = batch_and_loop(BENT, points, BENT_RECORD)
     np.testing.assert_array_equal(terms, terms_alone)
     np.testing.assert_array_equal(health, health_alone)
-
-
-def test_states_too_large_to_write_out_are_evaluated_in_turn():
-    n = 12
-    chain = psf.StateSpaceModel(
-        transition=lambda x, q, a: a * x + 0.1 * pt.roll(x, 1) + q,
-        process_noise=np.eye(n),
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.5]],
-        initial_mean=np.zeros(n),
-        initial_cov=np.eye(n),
-    )
-    record = (STEPS, PAIR_DATA[:, :1], *RECORD[2:])
-    (terms, health), alone = batch_and_loop(chain, np.array([[0.5], [np.nan], [0.7]]), record)
-    np.testing.assert_array_equal(terms, alone[0])
-    np.testing.assert_array_equal(health, alone[1])
 
 
 def test_vectorizing_a_graph_over_parameters_makes_one_batch():
