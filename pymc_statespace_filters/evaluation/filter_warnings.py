@@ -62,8 +62,8 @@ def warn_about(
 def remedy(system: StateSpaceModel) -> str:
     """Say which filter gives the likelihood of a system without collapse."""
     if _exact_filter(system) is not None:
-        return "GridFilter() computes this likelihood without particles: use it."
-    return "GuidedPF(n), whose particles follow the record, is unbiased and keeps them: use it."
+        return "Use GridFilter(), which computes this likelihood without particles."
+    return "Use GuidedPF(n), which is unbiased and moves its particles to where the record leads."
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:
@@ -82,9 +82,13 @@ def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:
     if not np.isfinite(missing).all():
         return f"{where}. {unknown}"
     return (
-        f"{where}, together {missing[few].sum():.1f} nats below those of {exact}; the "
-        f"log-likelihood is {missing.sum():.1f} nats below"
+        f"{where}, together {_below(missing[few].sum())} those of {exact}; the log-likelihood is "
+        f"{_below(missing.sum())}"
     )
+
+
+def _below(missing: float) -> str:
+    return f"{abs(missing):.1f} nats {'below' if missing > 0 else 'above'}"
 
 
 def _exact_filter(system: StateSpaceModel) -> GridFilter | None:

@@ -106,7 +106,7 @@ def test_counts():
     steps = np.arange(150)
     seen = psf.simulate(system, {"c": 0.3}, steps=steps, random_seed=3)["observations"].values
     assert np.unique(seen).size < 12  # many ties
-    found = diagnosed(system, psf.BootstrapPF(400), seen, steps, (1, 400), c=0.3)
+    found = diagnosed(system, psf.BootstrapPF(1000), seen, steps, (1, 400), c=0.3)
     assert (found["d_predicted"] % 1 == 0).all()
     assert found["d_uniformity"].item() > 1e-3
     # The share of predictions below the datum alone, or not above it, is far from uniform.

@@ -48,7 +48,7 @@ def test_bootstrap_filter_falls_far_below_the_truth_and_warns_once():
     assert worst.size == 1
     if n_few == len(listed):
         assert error[worst[0], listed].sum() == pytest.approx(-float(said[3]), abs=0.06)
-    assert message.endswith("GridFilter() computes this likelihood without particles: use it.")
+    assert message.endswith("Use GridFilter(), which computes this likelihood without particles.")
 
 
 def test_the_remedy_where_no_exact_filter_is():
