@@ -49,7 +49,7 @@ def run_filter(
     -------
     xarray.Dataset
         For the state given the observations up to its time: ``mean`` and ``sd`` (time, state), and
-        the covariance ``cov`` (time, state, state_bis). With EnKF, BootstrapPF and PFEnKF also
+        the covariance ``cov`` (time, state, state_bis). With EnKF and the particle filters also
         ``particles`` (time, particle, state) and ``weights`` (time, particle) before resampling;
         the weights sum to one; a particle that is not finite has weight zero, and where none is
         finite mean and covariance are NaN. ``log_likelihood`` (obs_time) holds the terms

@@ -73,7 +73,7 @@ def check_ranks(filter: Filter, n_ranks: int) -> None:
     if not isinstance(filter, EnsembleFilter):
         raise ModelError(
             f"{filter} has no members to distribute over {n_ranks} ranks; take one rank for each "
-            f"evaluation, or a filter with members: EnKF, BootstrapPF or PFEnKF"
+            f"evaluation, or a filter with members: EnKF, GuidedPF, BootstrapPF or PFEnKF"
         )
     if n_ranks > (most := filter.max_ranks()):
         raise ModelError(

@@ -165,5 +165,5 @@ def check_simulated_observations(name: str, system: System) -> None:
         raise ModelError(
             f"{name} updates members by a Kalman gain and so needs an observation function with "
             f"Gaussian noise; with observation_dist or observation_logp use the particle filters "
-            f"BootstrapPF or PFEnKF"
+            f"GuidedPF, BootstrapPF or PFEnKF"
         )

@@ -98,7 +98,7 @@ class GaussianFilterBase:
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise; "
                 f"observation_dist works with IPLF, and observation_dist and observation_logp work "
-                f"with the particle filters BootstrapPF and PFEnKF and, for one state, GridFilter"
+                f"with the particle filters GuidedPF and BootstrapPF and, for one state, GridFilter"
             )
 
     def _check_not_carried(self, system: System) -> None:
@@ -106,7 +106,7 @@ class GaussianFilterBase:
         if system.carried:
             raise ModelError(
                 f"{type(self).__name__} cannot treat the carried states {list(system.carried)}, "
-                f"which no Kalman update may move; use EnKF, BootstrapPF or PFEnKF"
+                f"which no Kalman update may move; use EnKF, GuidedPF or BootstrapPF"
             )
 
 
