@@ -7,7 +7,12 @@ import pymc_statespace_filters as psf
 from tests.mpi.launch import on_ranks
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
-FILTERS = psf.EnKF(300), psf.BootstrapPF(300, resample_below=1), psf.PFEnKF(300)
+FILTERS = (
+    psf.EnKF(300),
+    psf.BootstrapPF(300, resample_below=1),
+    psf.GuidedPF(300, resample_below=1),
+    psf.PFEnKF(300),
+)
 POINTS = {"a": [0.9, 0.3], "b": 0.1}
 
 
