@@ -14,10 +14,11 @@ equal for all particles. Noise is standardised, q ~ N(0, I), so that nothing is 
 covariance, which may be singular.
 
 The linear equations are those of least mean square error over the distribution of the state given
-the whole record, as that follows from the last guide (posterior linearisation, Garcia-Fernandez,
-Svensson and Sarkka 2017): E_{k+1}, A and B are means over 2 n + 1 points. Its mean and covariance
-come from following the guide, x_{k+1} = E_{k+1} with the noise a - K E_k, to which the first guide
-is a Kalman filter. The guide depends on the record and the parameters, not on particles.
+the whole record (posterior linearisation, Garcia-Fernandez, Svensson and Sarkka 2017): E_{k+1}, A
+and B are means over 2 n + 1 points of that distribution. Its means and covariances are found by
+iteration. Those of a Kalman filter give the first guide; each guide gives the next ones, by moving
+along with the noise a - K E_k. The guide depends on the record and the parameters, not on
+particles.
 
 Other sources: backward information filter, Mider, Schauer and van der Meulen (2021); residual
 bridges, Whitaker, Golightly, Boys and Sherlock (2017).
