@@ -307,7 +307,7 @@ class GuidedPF(ParticleFilter):
     ...     initial_cov=[[1.0]],
     ... )
     >>> record = {"observed": [0.3, 1.2], "steps": [0, 3]}
-    >>> terms = psf.log_likelihood(system, psf.GuidedPF(2), {"a": 0.9}, **record)
+    >>> terms = psf.log_likelihood(system, psf.GuidedPF(10), {"a": 0.9}, **record)
     >>> exact = psf.log_likelihood(system, psf.EKF(), {"a": 0.9}, **record)
     >>> bool(abs(terms.sum() - exact.sum()) < 1e-9)
     True
