@@ -334,7 +334,7 @@ def test_filters_refuse_systems_that_they_cannot_treat():
         [1.0],
     )
     for filter in (psf.EKF(), psf.EnKF(10)):
-        with pytest.raises(psf.ModelError, match="GuidedPF.* BootstrapPF"):
+        with pytest.raises(psf.ModelError, match=r"GuidedPF.* BootstrapPF"):
             psf.log_likelihood(counts, filter, *arguments, steps=[0])
     with pytest.raises(psf.ModelError, match=r"EKF .*\['branch'\]"):
         psf.log_likelihood(memory, psf.EKF(), *arguments, steps=[0])

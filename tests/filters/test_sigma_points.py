@@ -1,5 +1,7 @@
 """UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
 
+from functools import cache
+
 import numpy as np
 import pytensor.tensor as pt
 import pytest
@@ -35,6 +37,18 @@ BOTH = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__
 
 def theta_of(params):
     return np.array([params[name] for name in SYSTEM.parameters])
+
+
+@cache
+def value_of(filter):
+    """The likelihood of the system of this file, compiled once."""
+    return filter.compile(compile_system(SYSTEM)).function
+
+
+@cache
+def gradient_of(filter):
+    """Its gradient."""
+    return filter.compile_gradient(compile_system(SYSTEM)).function
 
 
 @BOTH
@@ -74,9 +88,9 @@ def test_states_of_a_linear_system_are_exact(states, filter, moment, params):
 @LINEAR
 def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, params):
     """By those parameters that keep the system linear, and are not at their lower boundary."""
-    system, bar = compile_system(SYSTEM), np.linspace(-1.0, 2.0, len(STEPS))
-    exact = psf.EKF().compile_gradient(system).function(theta_of(params), *RECORD, bar)
-    found = filter.compile_gradient(system).function(theta_of(params), *RECORD, bar)
+    bar = np.linspace(-1.0, 2.0, len(STEPS))
+    exact = gradient_of(psf.EKF())(theta_of(params), *RECORD, bar)
+    found = gradient_of(filter)(theta_of(params), *RECORD, bar)
     names = [n for n in SYSTEM.parameters if n not in ("cubic", "bend")]
     names = [n for n in names if params[n] != 0.0]
     at = [SYSTEM.parameters.index(n) for n in names]
@@ -144,7 +158,7 @@ def unscented_smoother(params):
 
 def test_ukf_is_the_unscented_filter_and_smoother_of_the_textbook(states):
     terms, filtered, smoothed = unscented_smoother(NONLINEAR)
-    value = psf.UKF().compile(compile_system(SYSTEM)).function(theta_of(NONLINEAR), *RECORD)[0]
+    value = value_of(psf.UKF())(theta_of(NONLINEAR), *RECORD)[0]
     np.testing.assert_allclose(value[value != 0.0], terms, rtol=1e-10)
     for moment, truth in [("filtered", filtered), ("smoothed", smoothed)]:
         found = states(psf.UKF(), moment, NONLINEAR)
@@ -232,10 +246,8 @@ def differences(value, theta, step=4e-3):
 @BOTH
 @pytest.mark.parametrize("params", [NONLINEAR, NONLINEAR | {"shake": 1e-2}])
 def test_the_gradient_is_that_of_the_likelihood(filter, params):
-    system = compile_system(SYSTEM)
-    value = filter.compile(system).function
-    gradient = filter.compile_gradient(system).function
-    found = gradient(theta_of(params), *RECORD, np.ones(len(STEPS)))
+    value = value_of(filter)
+    found = gradient_of(filter)(theta_of(params), *RECORD, np.ones(len(STEPS)))
     slopes = differences(lambda theta: value(theta, *RECORD)[0].sum(), theta_of(params))
     np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
 
