@@ -63,7 +63,10 @@ def remedy(system: StateSpaceModel) -> str:
     """Say which filter gives the likelihood of a system without collapse."""
     if _exact_filter(system) is not None:
         return "Use GridFilter(), which computes this likelihood without particles."
-    return "Use GuidedPF(n), which is unbiased and moves its particles to where the record leads."
+    return (
+        "Use GuidedPF(n), which is unbiased and moves its particles to where the record leads; if "
+        "they collapse there, too, BootstrapPF(n) with many."
+    )
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:

@@ -281,6 +281,8 @@ class GuidedPF(ParticleFilter):
     extended Kalman smoother; the gains are the same for all particles. An observation density that
     is not Gaussian enters by its score and information. Where the linear system says little, such
     as in front of a jump over a barrier, weights are uneven but the estimate is right in the mean.
+    Where two states explain the record equally well, as with a sensor of ``abs(x)``, particles
+    follow one of them: most estimates are then too low, a few far too high. Use `BootstrapPF`.
 
     Terms of single observations are noisier than their sum, because particles are where the whole
     record wants them.
