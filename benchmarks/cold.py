@@ -20,6 +20,8 @@ KINDS = {
     "EKF, value and gradient": "ours.of(name, psf.EKF()).value_and_gradient()",
     "EnKF(1250)": "ours.of(name, psf.EnKF(1250)).value()",
     "BootstrapPF(1250)": "ours.of(name, psf.BootstrapPF(1250)).value()",
+    "GuidedPF(100)": "ours.of(name, psf.GuidedPF(100)).value()",
+    "IPLF": "ours.of(name, psf.IPLF()).value()",
     "PFEnKF(250)": "ours.of(name, psf.PFEnKF(250)).value()",
     "GridFilter()": "ours.of(name, psf.GridFilter()).value()",
     "a chain by sample_dram": "chains.first_draws()",

@@ -40,6 +40,7 @@ print(json.dumps({{who: t.median for who, t in in_turn(contenders, 9).items()}})
 FILTERS = {
     "EnKF(1250)": psf.EnKF(1250),
     "BootstrapPF(1250)": psf.BootstrapPF(1250),
+    "GuidedPF(1250)": psf.GuidedPF(1250),
     "PFEnKF(1250)": psf.PFEnKF(1250),
 }
 
