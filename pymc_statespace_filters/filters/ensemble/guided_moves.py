@@ -1,0 +1,137 @@
+"""Particles that a guide moves: noise, weights, and resampling in front of an interval."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, emit
+from pymc_statespace_filters.filters.ensemble.loop import Members, new_members
+from pymc_statespace_filters.filters.ensemble.noise import process_normals
+from pymc_statespace_filters.filters.ensemble.resampling import resample
+from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
+from pymc_statespace_filters.filters.system_table import initialise, propagate_guided
+
+_NUMBER_BYTES = 8
+
+
+class GuidedParticles(NamedTuple):
+    """Members, with what guided moves add to them.
+
+    ``log_ratio`` (N,) follows the states in memory: the log density ratios of moves since they were
+    last added to the weights. ``log_det`` (1,) is their common term. ``log_v`` and ``v`` (N,) are
+    the weights times psi, ``start`` (n, width) the normals of the start, shifted by the guide.
+    """
+
+    members: Members
+    log_ratio: np.ndarray
+    log_det: np.ndarray
+    log_v: np.ndarray
+    v: np.ndarray
+    start: np.ndarray
+
+
+@njit_internal
+def guided_particles(n, p, local):
+    """Particles of n states and p observables, with room for what moves them."""
+    rows = np.empty((n + 1, local.size))
+    rows[n] = 0.0
+    members = new_members(rows[:n], p, local)
+    N = local.size
+    return GuidedParticles(
+        members, rows[n], np.zeros(1), np.empty(N), np.empty(N), np.empty((n, local.width))
+    )
+
+
+@njit_internal
+def start(system, guide, given, particles, local):
+    """Draw the states at step 0 from normals (n, width), shifted by the guide."""
+    n, N = system.n, local.size
+    shifted = particles.start
+    place = 1 + n + n * n
+    for r in range(n):
+        for i in range(N):
+            value = guide.start[1 + r]
+            for c in range(r, n):
+                value += guide.start[place + c - r] * given[c, i]
+            shifted[r, i] = value
+            particles.log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
+        place += n - r
+    particles.log_det[0] = guide.start[0]
+    initialise(system, shifted.ctypes.data, local.width, particles.members.X)
+
+
+@njit_internal
+def weigh_moves(particles):
+    """Add the density ratios of the moves to the weights."""
+    log_w, log_ratio = particles.members.log_w, particles.log_ratio
+    for i in range(log_w.size):
+        log_w[i] += log_ratio[i] + particles.log_det[0]
+        log_ratio[i] = 0.0
+    particles.log_det[0] = 0.0
+
+
+@njit_internal
+def _log_psi(guide, j, k, X, out):
+    """Write log psi of every particle after observation j, without its constant."""
+    n, N = X.shape
+    x, psi, place = guide.path[k], guide.psi[j], n
+    for i in range(N):
+        out[i] = 0.0
+    for a in range(n):
+        for b in range(a):
+            for i in range(N):
+                out[i] -= psi[place] * (X[a, i] - x[a]) * (X[b, i] - x[b])
+            place += 1
+        for i in range(N):
+            out[i] += (psi[a] - 0.5 * psi[place] * (X[a, i] - x[a])) * (X[a, i] - x[a])
+        place += 1
+
+
+@njit_internal
+def look_ahead(guide, j, k, particles, local):
+    """Weigh the particles by psi; return the log of the sum of w psi and its effective number."""
+    members, log_v = particles.members, particles.log_v
+    _log_psi(guide, j, k, members.X, log_v)
+    for i in range(log_v.size):
+        log_v[i] = members.log_w[i] + log_v[i] if members.alive[i] else -np.inf
+    return normalise_weights(log_v, particles.v, local)
+
+
+@njit_internal
+def resample_ahead(guide, j, k, log_total, resampling, z, particles, local):
+    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it."""
+    log_w, log_psi = particles.members.log_w, particles.log_v
+    resample(resampling, z, particles.v, particles.members.X, local)
+    _log_psi(guide, j, k, particles.members.X, log_psi)
+    for i in range(log_w.size):
+        log_w[i] = log_total - math.log(local.n_members) - log_psi[i]
+
+
+@njit_internal
+def move(system, guide, record, noise, first, last, particles, local):
+    """Move the particles from one step to another."""
+    X, gains, log_det = particles.members.X, guide.gains, 0.0
+    row = np.int64(gains.ctypes.data) + _NUMBER_BYTES * (first * gains.shape[1] + 1)
+    for k in range(first, last):
+        t, z = record.t0 + k * system.dt, process_normals(noise, k)
+        propagate_guided(system, k, t, z, local.width, X, row)
+        row += _NUMBER_BYTES * gains.shape[1]
+        log_det += gains[k, 0]
+    particles.log_det[0] += log_det
+
+
+@njit_internal
+def emit_forecast(callback, j, k, particles, nothing, ancestors):
+    """Show the particles with the weights that their moves have left them."""
+    if callback[0] == 0:
+        return
+    members, log_v = particles.members, particles.log_v
+    for i in range(log_v.size):
+        log_v[i] = members.log_w[i] + particles.log_ratio[i] + particles.log_det[0]
+    shown = Members(
+        X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
+        alive=members.alive,
+    )  # fmt: skip
+    emit(callback, FORECAST, j, k, shown, nothing, ancestors)
