@@ -112,6 +112,11 @@ def test_too_little_noise_names_the_factor_to_be_saved():
     assert "250 times fewer" in text
 
 
+def test_an_estimate_without_noise_needs_no_advice():
+    """That of a guided filter on a linear system varies by rounding only."""
+    assert variance_advice(of_variance(2e-29), "at its highest draw", 0) is None
+
+
 def test_estimates_that_fail_are_named():
     text = variance_advice(of_variance(1.0, n=10, n_failed=20), "at the start", 0)
     assert "failed for 20 of 30 noise seeds" in text

@@ -37,6 +37,8 @@ MIDDLE = math.sqrt(TARGET[0] * TARGET[1])
 # overestimates; below the second the noise costs an eighth of the moves, while a thirtieth of the
 # particles would suffice.
 TOO_NOISY, TOO_QUIET = 10.0, 0.05
+# Below this the estimate is exact, as that of a guided filter on a linear system.
+ROUNDING = 1e-12
 
 # Two-sided probability of the intervals.
 _CONFIDENCE = 0.95
@@ -133,7 +135,7 @@ def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
             f"it between {TARGET[0]:g} and {TARGET[1]:g}; psf.suggest_particles(model) finds the "
             "number."
         )
-    if 0.0 < spread.variance < TOO_QUIET:
+    if ROUNDING < spread.variance < TOO_QUIET:
         return (
             f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
             f"With about {_rounded(MIDDLE / spread.variance)} times fewer particles it would lie "
