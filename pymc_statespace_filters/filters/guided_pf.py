@@ -2,7 +2,8 @@
 
 In front of every observation particles are resampled by w psi, the weight given the whole record;
 on the way to the next one their noise is drawn from N(a - K x, R R') instead of N(0, I); weights
-are divided by both. See `ensemble.guide` for psi and the gains.
+are divided by both. See `ensemble.guide` for psi and the gains, and `ensemble.defence` for the
+particles that stay unguided where the guide is in doubt.
 """
 
 from collections.abc import Sequence
@@ -17,8 +18,10 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.filters.bootstrap import update
 from pymc_statespace_filters.filters.ensemble.callbacks import ENDED, RESAMPLED, UPDATED, emit
+from pymc_statespace_filters.filters.ensemble.defence import NOBODY, first_unguided, is_doubtful
 from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
 from pymc_statespace_filters.filters.ensemble.guided_moves import (
+    begin_interval,
     emit_forecast,
     guided_particles,
     look_ahead,
@@ -58,23 +61,26 @@ def _run(
     noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
     scheme = int(given[N_LEADING + 1])
     resampling = resampler(given[N_LEADING], scheme, order, system.n, local)
-    particles, guide = guided_particles(system.n, system.p, local), make_guide(system, record)
+    particles = guided_particles(system.n, system.m, system.p, local)
+    guide = make_guide(system, record)
     members, to = particles.members, (callback, integers, reals)
     state[0], state[1], state[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
     start(system, guide, initial_rows(noise), particles, local)
-    emit_forecast(to, -1, k, particles, nothing, ancestors)
+    unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
+    emit_forecast(to, -1, k, unguided, particles, nothing, ancestors)
     for j in range(n_observations):
         while k < at[j]:
             until = at[j] if callback == 0 else k + 1
-            move(system, guide, record, noise, k, until, particles, local)
+            move(system, guide, record, noise, k, until, unguided, particles, local)
             k = until
-            emit_forecast(to, j, k, particles, nothing, ancestors)
+            emit_forecast(to, j, k, unguided, particles, nothing, ancestors)
         if is_missing(record.observed, j):
             out[j] = 0.0
             continue
-        weigh_moves(particles)
+        weigh_moves(particles, unguided, members.log_w)
+        begin_interval(particles)
         d = record.observed[j]
         found = update(system, j, k, t0 + k * dt, d, noise, members, local, ())
         if found.failure != NONE:
@@ -84,8 +90,11 @@ def _run(
         log_total, numbers[j] = look_ahead(guide, j, k, particles, local)
         state[0] = min(state[0], numbers[j])
         emit(to, UPDATED, j, k, members, d, ancestors)
-        if resampling.always or numbers[j] < resampling.threshold:
+        doubtful, unguided = is_doubtful(guide, j + 1), NOBODY
+        if resampling.always or doubtful or numbers[j] < resampling.threshold:
             z = resampling_normals(noise, j, k)
+            if doubtful:
+                unguided = first_unguided(z)
             resample_ahead(guide, j, k, log_total, resampling, z, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)
     if state[1] == NONE:
@@ -128,8 +137,10 @@ class GuidedPF(ParticleFilter):
     Kalman smoother; the gains are the same for all particles. An observation density that
     is not Gaussian enters by its score and information. Where the linear system says little, such
     as in front of a jump over a barrier, weights are uneven but the estimate is right in the mean.
-    Where two states explain the record equally well, as with a sensor of ``abs(x)``, particles
-    follow one of them: most estimates are then too low, a few far too high. Use `BootstrapPF`.
+    In intervals over which the linear system may be wrong one particle in ten moves unguided, so
+    that no weight of such an interval is above ten. Where two states explain the record equally
+    well, as with a sensor of ``abs(x)``, particles follow one of them: most estimates are then too
+    low, a few far too high. Use `BootstrapPF`.
 
     Terms of single observations are noisier than their sum, because particles are where the whole
     record wants them.
@@ -138,6 +149,7 @@ class GuidedPF(ParticleFilter):
 
     References
     ----------
+    Hesterberg (1995), Technometrics 37, 185-194: defensive mixtures.
     Whitaker, Golightly, Boys and Sherlock (2017), Statistics and Computing 27, 885-900: proposals
     of noise given the next observation. Mider, Schauer and van der Meulen (2021), Electronic
     Journal of Statistics 15, 4295-4342: guides from the whole record. Garcia-Fernandez, Svensson

@@ -213,10 +213,10 @@ def follow(system, first, last, t0, path, gains, steps, cov):
 
 
 @njit_internal
-def look_back(address, first, last, path, steps, gains, psi):
+def look_back(address, first, last, path, steps, gains, psi, misfit):
     """Move psi back, and condition the noise on it, see `guide_loops`."""
     arguments = LookBackArguments(
-        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi
+        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi, misfit=misfit
     )
     call_address(address, arguments)
 

@@ -52,8 +52,11 @@ def linearize_step(
 
 
 def step_size(n: int, m: int) -> int:
-    """Length of a linearised step: the next state, A, B and the noise q there."""
-    return n + n * n + n * m + m
+    """Length of a linearised step: the next state, A, B, the noise q there, and a covariance.
+
+    It is that of what the linear equations leave out, a lower triangle.
+    """
+    return n + n * n + n * m + m + n * (n + 1) // 2
 
 
 def smoothed_cov(n: int, m: int) -> Graph:
@@ -113,7 +116,8 @@ def _vector(name: str, size: int) -> TensorVariable:
 def _parts(step: TensorVariable, n: int, m: int) -> tuple[TensorVariable, ...]:
     """The next state, A, B and q of a linearised step."""
     first, last = n + n * n, n + n * n + n * m
-    return step[:n], step[n:first].reshape((n, n)), step[first:last].reshape((n, m)), step[last:]
+    A, B = step[n:first].reshape((n, n)), step[first:last].reshape((n, m))
+    return step[:n], A, B, step[last : last + m]
 
 
 def _symmetric(triangle: TensorVariable, n: int) -> TensorVariable:

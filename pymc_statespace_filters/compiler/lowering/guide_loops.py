@@ -24,7 +24,7 @@ FollowArguments = arguments_class("FollowArguments", FOLLOW_ARGUMENTS, __name__)
 
 LOOK_BACK_ARGUMENTS = {
     "first": types.intp, "last": types.intp, "path": F64_PTR, "steps": F64_PTR, "gains": F64_PTR,
-    "psi": F64_PTR,
+    "psi": F64_PTR, "misfit": F64_PTR,
 }  # fmt: skip
 
 LookBackArguments = arguments_class("LookBackArguments", LOOK_BACK_ARGUMENTS, __name__)
@@ -42,7 +42,7 @@ def follow_loop(
     n_means, n_cov, n_points = n + n * n + n * m, n * (n + 1) // 2, 2 * n + 1
     n_step, n_row = step_size(n, m), 1 + n_gains(n, m)
     scale = float(max(3, n))
-    take_root = _lower_root(n)
+    take_root, residual_cov = _lower_root(n), _residual_cov(n, m, scale)
     reach, weight, at_centre = math.sqrt(scale), 0.5 / scale, 1.0 - n / scale
 
     def follow(c, inputs, first, last, t0, dt, path, gains, steps, cov):
@@ -73,6 +73,7 @@ def follow_loop(
                     step[i] += at_centre * results[i, 0]
             for a in range(n):
                 E[k + 1, a] = step[a]
+            residual_cov(X, results, step)
             values = smooth(step, gain[1:], P)
             for i in range(n_cov):
                 P[i] = values[i]
@@ -103,18 +104,54 @@ def _lower_root(n: int) -> Any:
     return write
 
 
+def _residual_cov(n: int, m: int, scale: float) -> Any:
+    """The function that ends a linearised step with the covariance of what it leaves out.
+
+    In the mean over points x +- sqrt(scale) L e_a, of the next states minus their linear equations.
+    """
+    n_points, first = 2 * n + 1, step_size(n, m) - n * (n + 1) // 2
+    weight = 0.5 / scale
+
+    @inline_always
+    def write(X, results, step):
+        place, residual = first, np.empty((n, n_points))
+        for a in range(n):
+            for point in range(1, n_points):
+                value = results[a, point] - step[a]
+                for b in range(n):
+                    value -= step[n + a * n + b] * (X[b, point] - X[b, 0])
+                residual[a, point] = value
+            for b in range(a + 1):
+                total = 0.0
+                for point in range(1, n_points):
+                    total += residual[a, point] * residual[b, point]
+                step[place] = weight * total
+                place += 1
+
+    return write
+
+
 def look_back_loop(step_back: Any, n: int, m: int) -> Callable:
     """Move psi from step ``last`` back to ``first`` and condition the noise on the way.
 
-    If psi is not finite, it is forgotten and the step stays unguided.
+    Adds to ``misfit`` how much log psi may be wrong by what the linear equations leave out. If psi
+    is not finite, it is forgotten and the step stays unguided.
     """
     n_psi, n_gain = n + n * (n + 1) // 2, n_gains(n, m)
     n_step, n_row = step_size(n, m), 1 + n_gain
+    residual_cov = n_step - n * (n + 1) // 2
 
-    def look_back(first, last, path, steps, gains, psi):
+    def look_back(first, last, path, steps, gains, psi, misfit):
         E, ahead = carray(path, ((last + 1) * n,)), carray(psi, (n_psi,))
         all_gains, all_steps = carray(gains, (last, n_row)), carray(steps, (last, n_step))
+        left_out = carray(misfit, (1,))
         for k in range(last - 1, first - 1, -1):
+            place = 0
+            for a in range(n):
+                for b in range(a + 1):
+                    part = ahead[n + place] * all_steps[k, residual_cov + place]
+                    left_out[0] += 0.5 * part if a == b else part
+                    place += 1
             values = step_back(all_steps[k], E[k * n : (k + 2) * n], ahead)
             gain, finite = all_gains[k], True
             for i in range(n_psi):

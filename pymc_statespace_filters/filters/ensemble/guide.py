@@ -57,7 +57,9 @@ class Guide(NamedTuple):
     (T, ..) is log det R of a step and what shifts its noise, ``start`` the same for the normals at
     step 0, of which there are n. ``psi`` (J, n + n (n + 1) / 2) is log psi at an observation, lam
     and the lower triangle of Lam, without the observation itself. ``cov`` (J, n (n + 1) / 2) is the
-    covariance around the path there. See `lowering.guidance`.
+    covariance around the path there. See `lowering.guidance`. ``misfit`` (J,) says by how much the
+    linear equations may be wrong in the interval that ends at an observation, or at the first one
+    after it that is not missing: the mean of delta' Lam delta / 2 over their residuals, in nats.
     """
 
     path: np.ndarray
@@ -66,6 +68,7 @@ class Guide(NamedTuple):
     start: np.ndarray
     psi: np.ndarray
     cov: np.ndarray
+    misfit: np.ndarray
 
 
 @njit_internal
@@ -77,10 +80,10 @@ def make_guide(system, record):
     n, m, J = system.n, system.m, record.steps.size
     T, n_cov = record.steps[-1] if J else np.int64(0), n * (n + 1) // 2
     guide = Guide(
-        path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m)),
+        path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m + n_cov)),
         gains=np.zeros((T, 1 + m + m * n + m * (m + 1) // 2)),
         start=np.zeros(1 + n + n * n + n_cov), psi=np.zeros((J, n + n_cov)),
-        cov=np.zeros((J, n_cov)),
+        cov=np.zeros((J, n_cov)), misfit=np.zeros(J),
     )  # fmt: skip
     for most_iterations in (_MOST_ITERATIONS, 0):
         _filter(system, record, guide)
@@ -191,14 +194,19 @@ def _look_back(system, record, guide):
         copy_into(guide.psi[j], psi)
         if not is_missing(record.observed, j):
             _add_observation(system, record, j, guide.path[last], guide.cov[j], here, psi)
-        look_back(address, first, last, guide.path, guide.steps, guide.gains, psi)
+            guide.misfit[j] = 0.0
+        else:
+            guide.misfit[j] = guide.misfit[j + 1] if j + 1 < guide.misfit.size else 0.0
+        misfit = guide.misfit[j:].ctypes.data
+        look_back(address, first, last, guide.path, guide.steps, guide.gains, psi, misfit)
     mean, root = _initial(system)
-    start, path = np.zeros(n + 2 * n * n + n), np.zeros((2, n))
+    start, path = np.zeros(n + 2 * n * n + n + psi.size - n), np.zeros((2, n))
     copy_into(start[:n], mean)
     copy_into(start[n + n * n : n + 2 * n * n], root.reshape(n * n))
     copy_into(path[1], guide.path[0])
     zero, one = np.int64(0), np.int64(1)
-    look_back(system.start_back, zero, one, path, start, guide.start, psi)
+    misfit = np.zeros(1)
+    look_back(system.start_back, zero, one, path, start, guide.start, psi, misfit.ctypes.data)
 
 
 @njit_internal

@@ -7,8 +7,14 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, emit
+from pymc_statespace_filters.filters.ensemble.defence import (
+    NOBODY,
+    STRIDE,
+    mixture_weight,
+    undo_guide,
+)
 from pymc_statespace_filters.filters.ensemble.loop import Members, new_members
-from pymc_statespace_filters.filters.ensemble.noise import process_normals
+from pymc_statespace_filters.filters.ensemble.noise import process_normals, process_rows
 from pymc_statespace_filters.filters.ensemble.resampling import resample
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
 from pymc_statespace_filters.filters.system_table import initialise, propagate_guided
@@ -22,6 +28,7 @@ class GuidedParticles(NamedTuple):
     ``log_ratio`` (N,) follows the states in memory: the log density ratios of moves since they were
     last added to the weights. ``log_det`` (1,) is their common term. ``log_v`` and ``v`` (N,) are
     the weights times psi, ``start`` (n, width) the normals of the start, shifted by the guide.
+    ``normals`` (m, width) is scratch.
     """
 
     members: Members
@@ -30,18 +37,20 @@ class GuidedParticles(NamedTuple):
     log_v: np.ndarray
     v: np.ndarray
     start: np.ndarray
+    normals: np.ndarray
 
 
 @njit_internal
-def guided_particles(n, p, local):
-    """Particles of n states and p observables, with room for what moves them."""
+def guided_particles(n, m, p, local):
+    """Particles of n states, m noises and p observables, with room for what moves them."""
     rows = np.empty((n + 1, local.size))
     rows[n] = 0.0
     members = new_members(rows[:n], p, local)
     N = local.size
     return GuidedParticles(
-        members, rows[n], np.zeros(1), np.empty(N), np.empty(N), np.empty((n, local.width))
-    )
+        members=members, log_ratio=rows[n], log_det=np.zeros(1), log_v=np.empty(N), v=np.empty(N),
+        start=np.empty((n, local.width)), normals=np.empty((m, local.width)),
+    )  # fmt: skip
 
 
 @njit_internal
@@ -56,19 +65,30 @@ def start(system, guide, given, particles, local):
             for c in range(r, n):
                 value += guide.start[place + c - r] * given[c, i]
             shifted[r, i] = value
-            particles.log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
+            particles.members.log_w[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
         place += n - r
-    particles.log_det[0] = guide.start[0]
+    for i in range(N):
+        particles.members.log_w[i] += guide.start[0]
     initialise(system, shifted.ctypes.data, local.width, particles.members.X)
 
 
 @njit_internal
-def weigh_moves(particles):
-    """Add the density ratios of the moves to the weights."""
-    log_w, log_ratio = particles.members.log_w, particles.log_ratio
-    for i in range(log_w.size):
-        log_w[i] += log_ratio[i] + particles.log_det[0]
-        log_ratio[i] = 0.0
+def weigh_moves(particles, unguided, out):
+    """Add the density ratios of the moves to the weights, in ``out``."""
+    log_w, log_ratio, log_det = particles.members.log_w, particles.log_ratio, particles.log_det[0]
+    if unguided == NOBODY:
+        for i in range(log_w.size):
+            out[i] = log_w[i] + (log_ratio[i] + log_det)
+    else:
+        for i in range(log_w.size):
+            out[i] = log_w[i] + mixture_weight(log_ratio[i] + log_det)
+
+
+@njit_internal
+def begin_interval(particles):
+    """Forget the density ratios of earlier moves."""
+    for i in range(particles.log_ratio.size):
+        particles.log_ratio[i] = 0.0
     particles.log_det[0] = 0.0
 
 
@@ -110,12 +130,16 @@ def resample_ahead(guide, j, k, log_total, resampling, z, particles, local):
 
 
 @njit_internal
-def move(system, guide, record, noise, first, last, particles, local):
-    """Move the particles from one step to another."""
+def move(system, guide, record, noise, first, last, unguided, particles, local):
+    """Move the particles from one step to another, every tenth from ``unguided`` on by itself."""
     X, gains, log_det = particles.members.X, guide.gains, 0.0
     row = np.int64(gains.ctypes.data) + _NUMBER_BYTES * (first * gains.shape[1] + 1)
     for k in range(first, last):
         t, z = record.t0 + k * system.dt, process_normals(noise, k)
+        if unguided != NOBODY:
+            ours = (unguided - local.first) % STRIDE
+            undo_guide(gains[k, 1:], X, process_rows(noise, k), ours, particles.normals)
+            z = np.int64(particles.normals.ctypes.data)
         propagate_guided(system, k, t, z, local.width, X, row)
         row += _NUMBER_BYTES * gains.shape[1]
         log_det += gains[k, 0]
@@ -123,13 +147,12 @@ def move(system, guide, record, noise, first, last, particles, local):
 
 
 @njit_internal
-def emit_forecast(callback, j, k, particles, nothing, ancestors):
+def emit_forecast(callback, j, k, unguided, particles, nothing, ancestors):
     """Show the particles with the weights that their moves have left them."""
     if callback[0] == 0:
         return
     members, log_v = particles.members, particles.log_v
-    for i in range(log_v.size):
-        log_v[i] = members.log_w[i] + particles.log_ratio[i] + particles.log_det[0]
+    weigh_moves(particles, unguided, log_v)
     shown = Members(
         X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
         alive=members.alive,

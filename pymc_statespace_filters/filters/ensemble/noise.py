@@ -104,6 +104,15 @@ def process_normals(noise, k):
 
 
 @njit_internal
+def process_rows(noise, k):
+    """The normals of step k, a matrix (m, width), after `process_normals`."""
+    rows, width = noise.sizes.process, noise.sizes.width
+    first = (noise.sizes.initial + k * rows) * width if noise.stored.size > 0 else 0
+    given = noise.stored if noise.stored.size > 0 else noise.buffer
+    return given[first : first + rows * width].reshape(rows, width)
+
+
+@njit_internal
 def observation_normals(noise, j, k):
     """Address of the normals of the simulated observation j, at step k."""
     sizes = noise.sizes

@@ -137,8 +137,8 @@ def smooth_resampling(filter: Any, n_states: int) -> Any:
 
 
 def n_normals(scheme: str, n_particles: int) -> int:
-    """Number of normals that a scheme uses, in whole blocks."""
-    return 2 * padded(n_particles + 1) if scheme == "multinomial" else padded(2)
+    """Number of normals of a resampling, in whole blocks; a scheme leaves the last of each half."""
+    return 2 * padded(n_particles + 2) if scheme == "multinomial" else padded(2)
 
 
 def check_sortable(scheme: str, n_states: int) -> None:
