@@ -28,10 +28,10 @@ ENDS = ((-1.7, 2.4), (0.1, 2.8), (-1.0, 0.7))
 def log_likelihood(alpha, steepness, sigma):
     record = double_well()
     params = {**KNOWN, "alpha": alpha, "beta": -steepness, "sigma": sigma}
-    exact = psf.GridFilter(tolerance=1e-6)
     terms = psf.log_likelihood(
-        DOUBLE_WELL_SYSTEM, exact, params, record.observed, steps=record.steps
-    )
+        DOUBLE_WELL_SYSTEM, psf.GridFilter(tolerance=1e-6), params, record.observed,
+        steps=record.steps,
+    )  # fmt: skip
     return terms.sum(axis=-1)
 
 
