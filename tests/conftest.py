@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+import pytest
+
 # One BLAS thread: the matrices are small, and the test processes already fill the cores.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
@@ -50,3 +52,16 @@ def pytest_collection_modifyitems(items):
     tests = Path(__file__).parent
     order = {tests / name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path, len(LONGEST)))
+
+
+@pytest.fixture(scope="module")
+def interpreted():
+    """PyTensor's graphs run in Python, for files whose subject they are not.
+
+    Machine code of a graph takes seconds to compile. The functions of filters and systems are
+    machine code in either mode, and the same.
+    """
+    import pytensor
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        yield

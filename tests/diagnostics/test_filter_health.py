@@ -14,6 +14,8 @@ from tests.references.linear_states import linear_states
 from tests.sampling.autoregression import simulated
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 TRUTH = {"phi": 0.7, "spread": 0.7}
 LONG = np.arange(300)
 

@@ -11,6 +11,8 @@ import pymc_statespace_filters as psf
 from tests.references.linear_states import linear_states
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 A, Q, R, P0 = 0.8, 0.3, 0.2, 1.0
 LONG = np.arange(1, 301)
 SURPRISE = 200

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytest
 from scipy.optimize import minimize
 
@@ -15,6 +16,8 @@ from pymc_statespace_filters.sampling.particle_number.search import Row
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.sampling.autoregression import autoregression, simulated
 from tests.test_readme import run_code_of
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 STEPS = np.arange(1, 61)
 LINEAR = autoregression(observation_noise=[[0.2]])
@@ -175,7 +178,8 @@ def test_ensemble_filters_are_tuned_too():
 
 def test_the_pages_on_sampling_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # one writes a checkpoint
-    names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
+    with pytensor.config.change_flags(mode="NUMBA"):
+        names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
     table = names["table"]
     assert 1.0 < table.loc[table.attrs["n_particles"], "variance_centre"] < 3.3
     assert (tmp_path / "first-run").is_dir()
