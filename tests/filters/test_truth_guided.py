@@ -6,15 +6,12 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
-from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.truth_systems import (
     DOUBLE_WELL_SYSTEM,
     double_well_parameters,
     linear_system,
+    log_likelihoods,
 )
 from tests.references.records import (
     BROAD_DOUBLE_WELL,
@@ -28,17 +25,6 @@ from tests.references.records import (
 )
 
 N_SEEDS = 20_000
-
-
-def log_likelihoods(system, filter, params, seeds, **record):
-    """Of each seed, without the checks of `psf.log_likelihood`, which take as long to compile."""
-    compiled = filter.compile(compile_system(system))
-    run = cached_on_disk(compiled.function, compiled.key)
-    settings = {"times": None, "inputs": None, "t0": 0.0} | record
-    steps, observed, inputs, t0 = checked_record(system, **settings)
-    arguments = (flat_parameters(system, params), steps, observed, inputs, t0.item())
-    return np.array([run(*arguments, (seed, np.empty(0)))[0].sum() for seed in seeds])
-
 
 # Three states, two noises, two sensors, and a start that is known in one direction.
 CHAIN = LinearSystem(

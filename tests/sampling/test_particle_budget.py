@@ -14,6 +14,7 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpre
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
 from pymc_statespace_filters.sampling.particle_number.search import Row
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from tests.filters.truth_systems import log_likelihoods
 from tests.sampling.autoregression import autoregression, simulated
 from tests.test_readme import run_code_of
 
@@ -46,10 +47,7 @@ def exact_mode():
 
 def measured_variance(filter, params, n_seeds=600):
     seeds = np.arange(10_000, 10_000 + n_seeds)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FilterWarning)  # some seeds collapse: part of the noise
-        terms = psf.log_likelihood(LINEAR, filter, params, DATA, steps=STEPS, seed=seeds)
-    return terms.sum(axis=-1).var(ddof=1)
+    return log_likelihoods(LINEAR, filter, params, seeds, observed=DATA, steps=STEPS).var(ddof=1)
 
 
 @pytest.mark.parametrize("first", [25, pytest.param(2000, marks=pytest.mark.slow)])
