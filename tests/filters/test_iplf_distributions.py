@@ -5,6 +5,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from numba import njit
 from scipy import stats
 from scipy.integrate import quad
 
@@ -127,15 +128,18 @@ def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_missing_rows():
     observed = np.array([[4.0, 2.0], [3.0, np.nan], [1.0, 0.0], [6.0, 1.0]])
     record = (np.array([0, 5, 10, 20]), observed, np.zeros((0, 0)), 0.0, 0)
     filter, system, theta = psf.IPLF(n_iterations=2), compile_system(COUNTS), np.array([0.5, 1.0])
-    forward, backward = (
-        compiled.function
-        for compiled in (filter.compile_taped(system), filter.compile_pullback(system))
-    )
+    forward = filter.compile_taped(system).function
+    backward = filter.compile_pullback(system).function
+
+    @njit
+    def value_and_gradient(theta, steps, observed, inputs, t0, seed, terms_bar):
+        terms, _, tape = forward(theta, steps, observed, inputs, t0, seed)
+        return terms, backward(theta, steps, observed, inputs, t0, seed, tape, terms_bar)
 
     def value(theta):
-        return forward(theta, *record)[0]
+        return value_and_gradient(theta, *record, np.ones(4))[0]
 
-    found = backward(theta, *record, forward(theta, *record)[2], np.ones(4))
+    _, found = value_and_gradient(theta, *record, np.ones(4))
     weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
     for i, h in enumerate([2e-3, 4e-3]):
         moves = theta + np.arange(-4, 5)[:, None] * h * np.eye(2)[i]

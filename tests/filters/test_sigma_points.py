@@ -1,10 +1,12 @@
 """UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
 import pytest
+from numba import njit
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
@@ -38,17 +40,33 @@ def theta_of(params):
     return np.array([params[name] for name in SYSTEM.parameters])
 
 
+class Evaluation(NamedTuple):
+    terms: np.ndarray
+    health: np.ndarray
+    tape: np.ndarray
+    gradient: np.ndarray
+
+
 @cache
-def passes(filter, system=SYSTEM):
-    """The forward and the backward pass, compiled once for values and gradients."""
+def both_passes(filter, system):
+    """The function (theta, record, terms_bar) -> terms, health, tape and gradient."""
     compiled = compile_system(system)
-    return filter.compile_taped(compiled).function, filter.compile_pullback(compiled).function
+    forward = filter.compile_taped(compiled).function
+    backward = filter.compile_pullback(compiled).function
+
+    @njit
+    def run(theta, steps, observed, inputs, t0, seed, terms_bar):
+        terms, health, tape = forward(theta, steps, observed, inputs, t0, seed)
+        gradient = backward(theta, steps, observed, inputs, t0, seed, tape, terms_bar)
+        return terms, health, tape, gradient
+
+    return run
 
 
-def gradient(filter, theta, terms_bar, system=SYSTEM, record=RECORD):
-    forward, backward = passes(filter, system)
-    _, _, tape = forward(theta, *record)
-    return backward(theta, *record, tape, terms_bar)
+def evaluate(filter, theta, terms_bar=None, system=SYSTEM, record=RECORD):
+    """Of all terms, or of their sum with these weights."""
+    terms_bar = np.ones(len(record[0])) if terms_bar is None else terms_bar
+    return Evaluation(*both_passes(filter, system)(theta, *record, terms_bar))
 
 
 def kalman(params):
@@ -70,9 +88,9 @@ def kalman(params):
 @BOTH
 @LINEAR
 def test_linear_systems_are_exact(filter, params):
-    terms, health, _ = passes(filter)[0](theta_of(params), *RECORD)
-    np.testing.assert_allclose(terms, kalman(params), rtol=1e-9, atol=0.0)
-    np.testing.assert_array_equal(health, [np.inf, 0.0, -1.0])
+    found = evaluate(filter, theta_of(params))
+    np.testing.assert_allclose(found.terms, kalman(params), rtol=1e-9, atol=0.0)
+    np.testing.assert_array_equal(found.health, [np.inf, 0.0, -1.0])
 
 
 @BOTH
@@ -169,7 +187,7 @@ def unscented_smoother(params):
 
 def test_ukf_is_the_unscented_filter_and_smoother_of_the_textbook(states):
     terms, filtered, smoothed = unscented_smoother(NONLINEAR)
-    value = passes(psf.UKF())[0](theta_of(NONLINEAR), *RECORD)[0]
+    value = evaluate(psf.UKF(), theta_of(NONLINEAR)).terms
     np.testing.assert_allclose(value[value != 0.0], terms, rtol=1e-10)
     for moment, truth in [("filtered", filtered), ("smoothed", smoothed)]:
         found = states(psf.UKF(), moment, NONLINEAR)
@@ -182,8 +200,9 @@ def test_one_iteration_of_iplf_is_the_update_of_ukf():
 
     The tape has the mean and the covariance before every prediction and every update.
     """
-    _, _, ukf = passes(psf.UKF())[0](theta_of(NONLINEAR), *RECORD)
-    _, _, iplf = passes(psf.IPLF(n_iterations=1))[0](theta_of(NONLINEAR), *RECORD)
+    ukf = evaluate(psf.UKF(), theta_of(NONLINEAR)).tape
+    forward = psf.IPLF(n_iterations=1).compile_taped(compile_system(SYSTEM)).function
+    _, _, iplf = forward(theta_of(NONLINEAR), *RECORD)
     assert len(ukf) == STEPS[-1] + len(STEPS)
     np.testing.assert_allclose(iplf, ukf, rtol=1e-10, atol=1e-12)
 
@@ -234,9 +253,9 @@ def test_a_batch_is_its_points(filter):
     points = theta_of(NONLINEAR) * np.random.default_rng(2).uniform(0.7, 1.3, size=(11, 7))
     terms, health = filter.compile_batch(compile_system(SYSTEM)).function(points, *RECORD)
     for i, point in enumerate(points):
-        one = passes(filter)[0](point, *RECORD)
-        np.testing.assert_allclose(terms[i], one[0], rtol=1e-10)
-        np.testing.assert_array_equal(health[i], one[1])
+        one = evaluate(filter, point)
+        np.testing.assert_allclose(terms[i], one.terms, rtol=1e-10)
+        np.testing.assert_array_equal(health[i], one.health)
 
 
 NINTH_ORDER = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -253,9 +272,8 @@ def differences(value, theta, step=4e-3):
 @BOTH
 @pytest.mark.parametrize("params", [NONLINEAR, NONLINEAR | {"shake": 1e-2}])
 def test_the_gradient_is_that_of_the_likelihood(filter, params):
-    forward, _ = passes(filter)
-    found = gradient(filter, theta_of(params), np.ones(len(STEPS)))
-    slopes = differences(lambda theta: forward(theta, *RECORD)[0].sum(), theta_of(params))
+    found = evaluate(filter, theta_of(params)).gradient
+    slopes = differences(lambda theta: evaluate(filter, theta).terms.sum(), theta_of(params))
     np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
 
 
@@ -270,7 +288,7 @@ def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, pa
         return kalman(params | dict(zip(names, theta, strict=True))) @ terms_bar
 
     slopes = differences(value, np.array([params[n] for n in names]), step=8e-3)
-    found = gradient(filter, theta_of(params), terms_bar)
+    found = evaluate(filter, theta_of(params), terms_bar).gradient
     at = [SYSTEM.parameters.index(n) for n in names]
     np.testing.assert_allclose(found[at], slopes, rtol=1e-9)
 
@@ -290,10 +308,12 @@ KNOWN_START = psf.StateSpaceModel(
 def test_the_gradient_is_exact_with_a_known_start_and_noise_on_the_velocity(filter):
     record = (np.array([0, 2, 7]), np.array([[0.4], [0.7], [0.1]]), np.zeros((0, 0)), 0.0, 0)
     theta = np.array([1.3, 0.4, 0.7, 0.2, 0.1])
-    forward, _ = passes(filter, KNOWN_START)
-    found = gradient(filter, theta, np.ones(3), KNOWN_START, record)
-    slopes = differences(lambda at: forward(at, *record)[0].sum(), theta)
-    np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+
+    def at(theta):
+        return evaluate(filter, theta, system=KNOWN_START, record=record)
+
+    slopes = differences(lambda theta: at(theta).terms.sum(), theta)
+    np.testing.assert_allclose(at(theta).gradient, slopes, rtol=1e-8, atol=1e-9)
 
 
 @BOTH
