@@ -1,7 +1,10 @@
 """What every test run needs before numpy and PyTensor are imported."""
 
+import gc
 import os
 from pathlib import Path
+
+import pytest
 
 # One BLAS thread: the matrices are small, and the test processes already fill the cores.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -12,6 +15,10 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 # to link C code against either: the search for one ends in a warning.
 CACHE = Path(__file__).parents[1] / ".cache" / "pytensor"
 os.environ.setdefault("PYTENSOR_FLAGS", f"base_compiledir={CACHE},blas__ldflags=,cxx=")
+
+# Compilation makes millions of objects that stay, which the garbage collector would visit over and
+# over: a twentieth of the time.
+gc.set_threshold(50_000, 20, 10)
 
 # Pictures are drawn without a screen.
 os.environ.setdefault("MPLBACKEND", "agg")
@@ -50,3 +57,16 @@ def pytest_collection_modifyitems(items):
     tests = Path(__file__).parent
     order = {tests / name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path, len(LONGEST)))
+
+
+@pytest.fixture(scope="module")
+def interpreted():
+    """PyTensor's graphs run in Python, for files whose subject they are not.
+
+    Machine code of a graph takes seconds to compile. The functions of filters and systems are
+    machine code in either mode, and the same.
+    """
+    import pytensor
+
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        yield

@@ -3,6 +3,7 @@
 import arviz as az
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 import pytest
 
@@ -12,6 +13,8 @@ from tests.diagnostics.records import SYSTEM
 from tests.references.linear_states import linear_states
 from tests.sampling.autoregression import simulated
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 TRUTH = {"phi": 0.7, "spread": 0.7}
 LONG = np.arange(300)
@@ -153,7 +156,11 @@ def test_another_filter_fewer_draws_and_the_same_again(noisy):
 
 
 def test_failures_are_counted():
-    with pytest.warns(psf.FilterWarning, match="in 10 of 10 evaluations"):
+    """In machine code, with particles."""
+    with (
+        pytensor.config.change_flags(mode="NUMBA"),
+        pytest.warns(psf.FilterWarning, match="in 10 of 10 evaluations"),
+    ):
         found = diagnosed(
             SYSTEM, psf.BootstrapPF(20), [0.1, 0.2, 1e200, 0.3], np.arange(4), (1, 10), **TRUTH
         )

@@ -11,6 +11,8 @@ import pymc_statespace_filters as psf
 from tests.references.linear_states import linear_states
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 A, Q, R, P0 = 0.8, 0.3, 0.2, 1.0
 LONG = np.arange(1, 301)
 SURPRISE = 200
@@ -43,14 +45,17 @@ def forced_record():
     params = {"a": A, "b": 1.0}
     simulated = psf.simulate(FORCED, params, steps=LONG, inputs=force, random_seed=3)
     observed = simulated["observations"].values.copy()
-    for _ in range(2):  # the prediction of the surprise does not depend on it
+
+    def predicted(rows):
         law = linear_states(
             [[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]],
-            steps=LONG, observed=observed, rows=LONG, moment="predicted", forcing=force,
+            steps=LONG, observed=observed, rows=rows, moment="predicted", forcing=force,
         )  # fmt: skip
-        sd = np.sqrt(law.sd[:, 0] ** 2 + R)
-        observed[SURPRISE] = law.mean[SURPRISE] + 6.0 * sd[SURPRISE]
-    return force, observed, law.mean[:, 0], sd
+        return law.mean[:, 0], np.sqrt(law.sd[:, 0] ** 2 + R)
+
+    mean, sd = predicted(LONG[[SURPRISE]])
+    observed[SURPRISE] = mean + 6.0 * sd
+    return force, observed, *predicted(LONG)
 
 
 def test_innovations_of_a_linear_system_are_kalmans():

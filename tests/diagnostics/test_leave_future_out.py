@@ -22,6 +22,8 @@ from tests.diagnostics.records import (
     scores,
 )
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 N = STEPS.size - 1  # rows that are seen
 
 

@@ -12,6 +12,8 @@ from pymc_statespace_filters.errors import ModelError
 from tests.diagnostics.records import SYSTEM
 from tests.small_systems import PAIR, PAIR_DATA, STEPS, pair_terms
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 RECORD = np.array([0.3, -0.2, np.nan, 0.9, 1.4])
 AT = [0, 2, 3, 4, 7]
 

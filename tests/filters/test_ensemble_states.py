@@ -126,6 +126,14 @@ def test_moments_of_a_linear_system(name, moment):
     assert_right(several, exact(moment), slack)
 
 
+@pytest.mark.parametrize("moment", ["filtered", "smoothed"])
+def test_guided_moments_of_a_linear_system(moment):
+    """Predicted states have none: the particles move towards observations to come."""
+    filter = psf.GuidedPF(500)
+    several = [states(moment, filter, seed=i, draw_seed=-i) for i in range(N_SEEDS)]
+    assert_right(several, exact(moment), 0.02)
+
+
 @pytest.mark.parametrize("moment", ["predicted", "filtered", "smoothed"])
 @pytest.mark.parametrize("name", ["enkf", "bootstrap"])
 def test_draws_have_the_law_of_the_states(name, moment):

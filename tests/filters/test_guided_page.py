@@ -11,18 +11,15 @@ from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
 from tests.filters.truth_systems import (
     DOUBLE_WELL_SYSTEM,
     double_well_parameters,
-    linear_system,
 )
 from tests.ranks import on_ranks
 from tests.references.records import (
     BROAD_DOUBLE_WELL,
     DOUBLE_WELL,
-    OSCILLATOR,
     PRECISE_DOUBLE_WELL,
     broad_double_well,
     double_well,
     double_well_with_surprises,
-    oscillator_with_gaps,
 )
 
 WELL = double_well_parameters(BROAD_DOUBLE_WELL)
@@ -145,25 +142,6 @@ def test_carried_states_are_taken_from_the_reference():
     exact = psf.log_likelihood(plain, psf.EKF(), {}, **record).sum()
     terms = psf.log_likelihood(switched, psf.GuidedPF(10), {}, **record, seed=np.arange(3))
     assert terms.sum(axis=1) == pytest.approx(exact, abs=1e-9)
-
-
-def test_states_of_a_linear_system_are_those_of_the_kalman_smoother():
-    steps, observed = oscillator_with_gaps()
-    with pm.Model():
-        pm.Normal("unused")
-        psf.StateSpace("d", linear_system(OSCILLATOR), psf.EKF(), steps=steps, observed=observed)
-        idata = psf.sample_dram(2, tune=2, chains=1, random_seed=1, progressbar=False,
-                                compute_convergence_checks=False)  # fmt: skip
-        for function in (psf.filtered_states, psf.smoothed_states):
-            exact, guided = (
-                function(idata, filter=filter, extend_inferencedata=False, random_seed=2)
-                for filter in (psf.EKF(), psf.GuidedPF(4000))
-            )
-            (group,) = exact.children
-            scale = exact[group]["d_sd"].values
-            error = np.abs(exact[group]["d_mean"] - guided[group]["d_mean"])
-            assert error.max() < 0.25 * scale.max()
-            assert np.allclose(guided[group]["d_sd"], scale, rtol=0.25)
 
 
 def test_does_not_warn_where_it_is_right():

@@ -5,6 +5,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from numba import njit
 from scipy import stats
 from scipy.integrate import quad
 
@@ -126,15 +127,25 @@ COUNTS = psf.StateSpaceModel(
 def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_missing_rows():
     observed = np.array([[4.0, 2.0], [3.0, np.nan], [1.0, 0.0], [6.0, 1.0]])
     record = (np.array([0, 5, 10, 20]), observed, np.zeros((0, 0)), 0.0, 0)
-    system, theta = compile_system(COUNTS), np.array([0.5, 1.0])
-    value = psf.IPLF().compile(system).function
-    found = psf.IPLF().compile_gradient(system).function(theta, *record, np.ones(4))
+    filter, system, theta = psf.IPLF(n_iterations=2), compile_system(COUNTS), np.array([0.5, 1.0])
+    forward = filter.compile_taped(system).function
+    backward = filter.compile_pullback(system).function
+
+    @njit
+    def value_and_gradient(theta, steps, observed, inputs, t0, seed, terms_bar):
+        terms, _, tape = forward(theta, steps, observed, inputs, t0, seed)
+        return terms, backward(theta, steps, observed, inputs, t0, seed, tape, terms_bar)
+
+    def value(theta):
+        return value_and_gradient(theta, *record, np.ones(4))[0]
+
+    _, found = value_and_gradient(theta, *record, np.ones(4))
     weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
     for i, h in enumerate([2e-3, 4e-3]):
         moves = theta + np.arange(-4, 5)[:, None] * h * np.eye(2)[i]
-        slope = weights @ [value(move, *record)[0].sum() for move in moves] / h
+        slope = weights @ [value(move).sum() for move in moves] / h
         np.testing.assert_allclose(found[i], slope, rtol=1e-8)
-    assert value(theta, *record)[0][1] == pytest.approx(0.0, abs=1e-14)
+    assert value(theta)[1] == pytest.approx(0.0, abs=1e-14)
 
 
 COUNTER = psf.StateSpaceModel(

@@ -1,10 +1,12 @@
 """UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
 import pytest
+from numba import njit
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
@@ -25,10 +27,9 @@ from tests.filters.test_ekf_states import (
     exact,
     process_cov,
 )
-from tests.filters.test_truth_ekf import MULTIVARIATE, gappy_record
+from tests.filters.test_truth_ekf import gappy_record
+from tests.filters.test_truth_guided import CHAIN
 from tests.filters.truth_systems import linear_system
-from tests.ops.test_batch import BENT, BENT_RECORD, bent_points
-from tests.references.records import OSCILLATOR
 
 RECORD = (STEPS, OBSERVED, FORCE, T0, 0)
 FILTERS = [psf.UKF(), psf.IPLF(n_iterations=2)]
@@ -39,24 +40,65 @@ def theta_of(params):
     return np.array([params[name] for name in SYSTEM.parameters])
 
 
-@cache
-def value_of(filter):
-    """The likelihood of the system of this file, compiled once."""
-    return filter.compile(compile_system(SYSTEM)).function
+class Evaluation(NamedTuple):
+    terms: np.ndarray
+    health: np.ndarray
+    tape: np.ndarray
+    gradient: np.ndarray
 
 
 @cache
-def gradient_of(filter):
-    """Its gradient."""
-    return filter.compile_gradient(compile_system(SYSTEM)).function
+def both_passes(filter, system):
+    """The function (theta, record, terms_bar) -> terms, health, tape and gradient."""
+    compiled = compile_system(system)
+    forward = filter.compile_taped(compiled).function
+    backward = filter.compile_pullback(compiled).function
+
+    @njit
+    def run(theta, steps, observed, inputs, t0, seed, terms_bar):
+        terms, health, tape = forward(theta, steps, observed, inputs, t0, seed)
+        gradient = backward(theta, steps, observed, inputs, t0, seed, tape, terms_bar)
+        return terms, health, tape, gradient
+
+    return run
+
+
+def evaluate(filter, theta, terms_bar=None, system=SYSTEM, record=RECORD):
+    """Of all terms, or of their sum with these weights."""
+    terms_bar = np.ones(len(record[0])) if terms_bar is None else terms_bar
+    return Evaluation(*both_passes(filter, system)(theta, *record, terms_bar))
+
+
+def kalman(params):
+    """The exact terms of the system of this file where it is linear."""
+    pushes = SYSTEM.dt * (FORCE[:, 0] + 0.3 * np.cos(T0 + SYSTEM.dt * ROWS))
+    return kalman_log_likelihood(
+        [[1.0, SYSTEM.dt], [-SYSTEM.dt * params["k"], 1.0 - 0.4 * SYSTEM.dt]],
+        process_cov(params),
+        [[1.0, 0.0], [0.5, 1.0]],
+        NOISE_JAC @ GAMMA @ NOISE_JAC.T,
+        [0.5, -0.1],
+        params["spread"] * np.array([[1.0, 0.5], [0.5, 1.0]]),
+        steps=STEPS,
+        observed=OBSERVED - params["c"] * FORCE[STEPS] * [0.0, 1.0],
+        forcing=np.column_stack([np.zeros(len(FORCE)), pushes]),
+    )
 
 
 @BOTH
-@pytest.mark.parametrize("reference", [OSCILLATOR, MULTIVARIATE], ids=["oscillator", "singular"])
-def test_linear_systems_are_exact(filter, reference):
-    steps, observed = gappy_record(len(reference.C), first_step=2)
-    terms = psf.log_likelihood(linear_system(reference), filter, {}, observed, steps=steps)
-    truth = kalman_log_likelihood(*reference.kalman_arguments(), steps=steps, observed=observed)
+@LINEAR
+def test_linear_systems_are_exact(filter, params):
+    found = evaluate(filter, theta_of(params))
+    np.testing.assert_allclose(found.terms, kalman(params), rtol=1e-9, atol=0.0)
+    np.testing.assert_array_equal(found.health, [np.inf, 0.0, -1.0])
+
+
+@BOTH
+def test_three_states_without_a_weight_at_the_mean_are_exact(filter):
+    """With singular noise, a start known in one direction, and steps before the first datum."""
+    steps, observed = gappy_record(len(CHAIN.C), first_step=2)
+    terms = psf.log_likelihood(linear_system(CHAIN), filter, {}, observed, steps=steps)
+    truth = kalman_log_likelihood(*CHAIN.kalman_arguments(), steps=steps, observed=observed)
     np.testing.assert_allclose(terms, truth, rtol=1e-9, atol=0.0)
 
 
@@ -82,19 +124,6 @@ def test_states_of_a_linear_system_are_exact(states, filter, moment, params):
     found, truth = states(filter, moment, params), exact(moment, params)
     np.testing.assert_allclose(found.mean, truth.mean, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(found.sd**2, truth.sd**2, rtol=0.0, atol=1e-9)
-
-
-@BOTH
-@LINEAR
-def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, params):
-    """By those parameters that keep the system linear, and are not at their lower boundary."""
-    bar = np.linspace(-1.0, 2.0, len(STEPS))
-    exact = gradient_of(psf.EKF())(theta_of(params), *RECORD, bar)
-    found = gradient_of(filter)(theta_of(params), *RECORD, bar)
-    names = [n for n in SYSTEM.parameters if n not in ("cubic", "bend")]
-    names = [n for n in names if params[n] != 0.0]
-    at = [SYSTEM.parameters.index(n) for n in names]
-    np.testing.assert_allclose(found[at], exact[at], rtol=1e-9)
 
 
 @LINEAR
@@ -158,7 +187,7 @@ def unscented_smoother(params):
 
 def test_ukf_is_the_unscented_filter_and_smoother_of_the_textbook(states):
     terms, filtered, smoothed = unscented_smoother(NONLINEAR)
-    value = value_of(psf.UKF())(theta_of(NONLINEAR), *RECORD)[0]
+    value = evaluate(psf.UKF(), theta_of(NONLINEAR)).terms
     np.testing.assert_allclose(value[value != 0.0], terms, rtol=1e-10)
     for moment, truth in [("filtered", filtered), ("smoothed", smoothed)]:
         found = states(psf.UKF(), moment, NONLINEAR)
@@ -167,14 +196,15 @@ def test_ukf_is_the_unscented_filter_and_smoother_of_the_textbook(states):
 
 
 def test_one_iteration_of_iplf_is_the_update_of_ukf():
-    """For the state; the likelihood is another approximation of the same integral."""
-    record = {"observed": OBSERVED, "steps": STEPS, "inputs": FORCE, "t0": T0}
-    ukf, iplf = (
-        psf.run_filter(SYSTEM, filter, NONLINEAR, **record)
-        for filter in (psf.UKF(), psf.IPLF(n_iterations=1))
-    )
-    for name in ("mean", "cov"):
-        np.testing.assert_allclose(iplf[name], ukf[name], rtol=1e-10, atol=1e-12)
+    """For the state; the likelihood is another approximation of the same integral.
+
+    The tape has the mean and the covariance before every prediction and every update.
+    """
+    ukf = evaluate(psf.UKF(), theta_of(NONLINEAR)).tape
+    forward = psf.IPLF(n_iterations=1).compile_taped(compile_system(SYSTEM)).function
+    _, _, iplf = forward(theta_of(NONLINEAR), *RECORD)
+    assert len(ukf) == STEPS[-1] + len(STEPS)
+    np.testing.assert_allclose(iplf, ukf, rtol=1e-10, atol=1e-12)
 
 
 SQUARE = psf.StateSpaceModel(
@@ -220,16 +250,12 @@ def test_the_scaling_is_that_of_wan_and_van_der_merwe():
 
 @BOTH
 def test_a_batch_is_its_points(filter):
-    steps, observed, inputs, t0, _ = BENT_RECORD
-    points, system = bent_points(11), compile_system(BENT)
-    terms, health = filter.compile_batch(system).function(
-        points, steps, observed, inputs, float(t0), 0
-    )
-    alone = filter.compile(system).function
+    points = theta_of(NONLINEAR) * np.random.default_rng(2).uniform(0.7, 1.3, size=(11, 7))
+    terms, health = filter.compile_batch(compile_system(SYSTEM)).function(points, *RECORD)
     for i, point in enumerate(points):
-        one = alone(point, steps, observed, inputs, float(t0), 0)
-        np.testing.assert_allclose(terms[i], one[0], rtol=1e-10)
-        np.testing.assert_array_equal(health[i], one[1])
+        one = evaluate(filter, point)
+        np.testing.assert_allclose(terms[i], one.terms, rtol=1e-10)
+        np.testing.assert_array_equal(health[i], one.health)
 
 
 NINTH_ORDER = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -246,10 +272,25 @@ def differences(value, theta, step=4e-3):
 @BOTH
 @pytest.mark.parametrize("params", [NONLINEAR, NONLINEAR | {"shake": 1e-2}])
 def test_the_gradient_is_that_of_the_likelihood(filter, params):
-    value = value_of(filter)
-    found = gradient_of(filter)(theta_of(params), *RECORD, np.ones(len(STEPS)))
-    slopes = differences(lambda theta: value(theta, *RECORD)[0].sum(), theta_of(params))
+    found = evaluate(filter, theta_of(params)).gradient
+    slopes = differences(lambda theta: evaluate(filter, theta).terms.sum(), theta_of(params))
     np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+
+
+@BOTH
+@LINEAR
+def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, params):
+    """By those parameters that keep the system linear, and are not at their lower boundary."""
+    terms_bar = np.linspace(-1.0, 2.0, len(STEPS))
+    names = [n for n in SYSTEM.parameters if n not in ("cubic", "bend") and params[n] != 0.0]
+
+    def value(theta):
+        return kalman(params | dict(zip(names, theta, strict=True))) @ terms_bar
+
+    slopes = differences(value, np.array([params[n] for n in names]), step=8e-3)
+    found = evaluate(filter, theta_of(params), terms_bar).gradient
+    at = [SYSTEM.parameters.index(n) for n in names]
+    np.testing.assert_allclose(found[at], slopes, rtol=1e-9)
 
 
 KNOWN_START = psf.StateSpaceModel(
@@ -266,11 +307,13 @@ KNOWN_START = psf.StateSpaceModel(
 @BOTH
 def test_the_gradient_is_exact_with_a_known_start_and_noise_on_the_velocity(filter):
     record = (np.array([0, 2, 7]), np.array([[0.4], [0.7], [0.1]]), np.zeros((0, 0)), 0.0, 0)
-    system, theta = compile_system(KNOWN_START), np.array([1.3, 0.4, 0.7, 0.2, 0.1])
-    value = filter.compile(system).function
-    found = filter.compile_gradient(system).function(theta, *record, np.ones(3))
-    slopes = differences(lambda at: value(at, *record)[0].sum(), theta)
-    np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+    theta = np.array([1.3, 0.4, 0.7, 0.2, 0.1])
+
+    def at(theta):
+        return evaluate(filter, theta, system=KNOWN_START, record=record)
+
+    slopes = differences(lambda theta: at(theta).terms.sum(), theta)
+    np.testing.assert_allclose(at(theta).gradient, slopes, rtol=1e-8, atol=1e-9)
 
 
 @BOTH

@@ -18,6 +18,7 @@ from tests.filters.truth_systems import (
     DOUBLE_WELL_SYSTEM,
     double_well_parameters,
     linear_system,
+    log_likelihoods,
 )
 from tests.references import faulty_filters
 from tests.references.faulty_filters import Fault
@@ -27,8 +28,6 @@ from tests.references.records import (
     broad_double_well,
     oscillator_with_gaps,
 )
-
-pytestmark = pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
 
 # Monte Carlo errors fall as N^(-1/2). The kernel densities of a PF-EnKF have a bias of the square
 # of their bandwidth, N^(-1/3) for two states and N^(-2/5) for one.
@@ -87,15 +86,9 @@ def package_errors(make_filter, system, parameters, record, truth):
     """Errors of the package's filter as a function of its size and the number of seeds."""
 
     def errors(count, n_seeds):
-        terms = psf.log_likelihood(
-            system,
-            make_filter(count),
-            parameters,
-            record.observed,
-            steps=record.steps,
-            seed=np.arange(n_seeds),
-        )
-        return terms.sum(axis=-1) - truth
+        seeds = np.arange(n_seeds)
+        found = log_likelihoods(system, make_filter(count), parameters, seeds, **record._asdict())
+        return found - truth
 
     return errors
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
+from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters, log_likelihoods
 from tests.references.records import (
     DOUBLE_WELL,
     PRECISE_DOUBLE_WELL,
@@ -16,20 +16,11 @@ from tests.references.records import (
     double_well_with_surprises,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
 
-
-def log_likelihoods(filter, reference, record, n_seeds):
+def of_double_well(filter, reference, record, n_seeds):
     """Total log-likelihoods (n_seeds,) from the package."""
-    terms = psf.log_likelihood(
-        DOUBLE_WELL_SYSTEM,
-        filter,
-        double_well_parameters(reference),
-        record.observed,
-        steps=record.steps,
-        seed=np.arange(n_seeds),
-    )
-    return terms.sum(axis=-1)
+    params, seeds = double_well_parameters(reference), np.arange(n_seeds)
+    return log_likelihoods(DOUBLE_WELL_SYSTEM, filter, params, seeds, **record._asdict())
 
 
 def assert_mean(sample, expected, expected_se=0.0):
@@ -67,13 +58,13 @@ def test_ekf_loses_eighteen_nats_at_the_crossing():
 )
 def test_bias_is_that_of_the_algorithm(filter, n_seeds, bias, bias_se):
     truth = DOUBLE_WELL.point_mass_filter().run(*double_well()).terms.sum()
-    error = log_likelihoods(filter, DOUBLE_WELL, double_well(), n_seeds) - truth
+    error = of_double_well(filter, DOUBLE_WELL, double_well(), n_seeds) - truth
     assert_mean(error, bias, bias_se)
 
 
 def test_bootstrap_likelihood_has_the_right_mean():
     truth = DOUBLE_WELL.point_mass_filter().run(*double_well()).terms.sum()
-    error = log_likelihoods(psf.BootstrapPF(1000), DOUBLE_WELL, double_well(), 400) - truth
+    error = of_double_well(psf.BootstrapPF(1000), DOUBLE_WELL, double_well(), 400) - truth
     assert error.var() < 2.5
     assert_mean(np.exp(error), 1.0)
 
@@ -89,9 +80,7 @@ def test_likelihood_as_printed_counts_the_observation_twice(
     """Its limit is known: the mean of p(d_j | x) under the state's density given d_j as well."""
     record = Record(*(part[:101] for part in whole_record))
     answer = reference.point_mass_filter().run(*record)
-    printed = log_likelihoods(
-        psf.PFEnKF(500, likelihood="as_printed"), reference, record, n_seeds=8
-    )
+    printed = of_double_well(psf.PFEnKF(500, likelihood="as_printed"), reference, record, n_seeds=8)
     excess = (printed - answer.terms.sum()) / len(record.steps)
     limit = (answer.seen_twice.sum() - answer.terms.sum()) / len(record.steps)
     assert limit == pytest.approx(nats_per_observation, abs=0.01)

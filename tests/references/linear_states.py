@@ -52,14 +52,13 @@ def linear_states(
     mean, cov = _all_steps(A, Q, np.atleast_1d(m0), P0, max(steps[-1], rows[-1]) + 1, forcing)
     data = np.reshape(observed, (steps.size, C.shape[0]))
     if moment == "smoothed":
-        mean, cov = _given(mean, cov, C, R, steps, data)
-        return GaussianStates(mean[rows], cov[rows][:, :, rows])
+        return _given(mean, cov, C, R, steps, data, rows)
     n = A.shape[0]
     out = GaussianStates(np.empty((rows.size, n)), np.zeros((rows.size, n, rows.size, n)))
     for i, row in enumerate(rows):
         known = steps < row if moment == "predicted" else steps <= row
-        m, P = _given(mean, cov, C, R, steps[known], data[known])
-        out.mean[i], out.cov[i, :, i] = m[row], P[row][:, row]
+        found = _given(mean, cov, C, R, steps[known], data[known], [row])
+        out.mean[i], out.cov[i, :, i] = found.mean[0], found.cov[0, :, 0]
     return out
 
 
@@ -78,15 +77,19 @@ def _all_steps(A, Q, m0, P0, n_steps, forcing):
     return mean, cov
 
 
-def _given(mean, cov, C, R, steps, data):
-    """Condition on the observations at these steps."""
-    (K, n), p = mean.shape, C.shape[0]
-    prior = cov.reshape(K * n, K * n)
-    look = np.zeros((steps.size, p, K, n))
-    look[np.arange(steps.size), :, steps] = C
+def _given(mean, cov, C, R, steps, data, rows):
+    """The states at the rows given the observations at these steps."""
+    n_rows, n = len(rows), mean.shape[1]
     seen = np.isfinite(data.ravel())
-    look = look.reshape(-1, K * n)[seen]
-    noise = np.kron(np.eye(steps.size), R)[np.ix_(seen, seen)]
-    gain = np.linalg.solve(look @ prior @ look.T + noise, look @ prior).T
-    mean = mean.ravel() + gain @ (data.ravel()[seen] - look @ mean.ravel())
-    return mean.reshape(K, n), (prior - gain @ look @ prior).reshape(K, n, K, n)
+    of_data = np.einsum("pi,jikl->jpkl", C, cov[steps])  # Cov(observation j, state k)
+    among_data = np.einsum("jpkl,ql->jpkq", of_data[:, :, steps], C)
+    size = seen.size
+    S = among_data.reshape(size, size) + np.kron(np.eye(steps.size), R)
+    cross = of_data[:, :, rows].reshape(size, n_rows * n)[seen]
+    gain = np.linalg.solve(S[np.ix_(seen, seen)], cross).T
+    residual = (data - mean[steps] @ C.T).ravel()[seen]
+    prior = cov[rows][:, :, rows].reshape(n_rows * n, n_rows * n)
+    return GaussianStates(
+        mean[rows] + (gain @ residual).reshape(n_rows, n),
+        (prior - gain @ cross).reshape(n_rows, n, n_rows, n),
+    )

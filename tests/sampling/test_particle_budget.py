@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytest
 from scipy.optimize import minimize
 
@@ -13,8 +14,11 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpre
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
 from pymc_statespace_filters.sampling.particle_number.search import Row
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from tests.filters.truth_systems import log_likelihoods
 from tests.sampling.autoregression import autoregression, simulated
 from tests.test_readme import run_code_of
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 STEPS = np.arange(1, 61)
 LINEAR = autoregression(observation_noise=[[0.2]])
@@ -43,10 +47,7 @@ def exact_mode():
 
 def measured_variance(filter, params, n_seeds=600):
     seeds = np.arange(10_000, 10_000 + n_seeds)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FilterWarning)  # some seeds collapse: part of the noise
-        terms = psf.log_likelihood(LINEAR, filter, params, DATA, steps=STEPS, seed=seeds)
-    return terms.sum(axis=-1).var(ddof=1)
+    return log_likelihoods(LINEAR, filter, params, seeds, observed=DATA, steps=STEPS).var(ddof=1)
 
 
 @pytest.mark.parametrize("first", [25, pytest.param(2000, marks=pytest.mark.slow)])
@@ -175,7 +176,8 @@ def test_ensemble_filters_are_tuned_too():
 
 def test_the_pages_on_sampling_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # one writes a checkpoint
-    names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
+    with pytensor.config.change_flags(mode="NUMBA"):
+        names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
     table = names["table"]
     assert 1.0 < table.loc[table.attrs["n_particles"], "variance_centre"] < 3.3
     assert (tmp_path / "first-run").is_dir()

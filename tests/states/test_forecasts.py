@@ -26,6 +26,8 @@ from tests.states.models import (
     shown,
 )
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 RATE = 1e-3  # of right implementations fail each statistical test
 FUTURE = np.array([7, 8, 11])  # after step 6, with a gap
 LONG_FORCE = np.append(FORCE, [-1.0, 0.0, 3.0, 1.0, 2.0])

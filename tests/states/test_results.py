@@ -22,6 +22,8 @@ from tests.states.models import (
     pushed_law,
 )
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 CALLS = {
     "filtered_states": psf.filtered_states,
     "smoothed_states": psf.smoothed_states,
