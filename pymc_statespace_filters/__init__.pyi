@@ -40,7 +40,7 @@ from .plots import (
     plot_states,
 )
 from .pymc_model.distribution import StateSpace
-from .sampling import DRAM, run_models, sample_dram, suggest_particles
+from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.integrators import EulerMaruyama
@@ -80,6 +80,7 @@ __all__ = [
     "estimate_evidence",
     "filter_diagnostics",
     "filtered_states",
+    "find_starts",
     "forecast",
     "freeplay",
     "hysteresis",

@@ -18,15 +18,15 @@ from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
 )
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
 from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
-from pymc_statespace_filters.evidence.posterior.density import ModelDensity
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, build_posterior
 from pymc_statespace_filters.evidence.posterior.observed_data import (
     data_fingerprint,
     observation_count,
 )
-from pymc_statespace_filters.evidence.posterior.support import Support
 from pymc_statespace_filters.progress import row_progress
+from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
+from pymc_statespace_filters.pymc_model.support import Support
 
 MAXIMUM = "maximum likelihood"
 

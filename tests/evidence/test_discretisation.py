@@ -13,7 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.checks import discretisation
 from pymc_statespace_filters.evidence.checks.discretisation import check_discretisation
-from pymc_statespace_filters.evidence.posterior.density import RowFunction
+from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence import chib_jeliazkov
-from pymc_statespace_filters.evidence.posterior import density
+from pymc_statespace_filters.pymc_model import density
 
 SD = 1.2
 Y = 0.7

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
-from pymc_statespace_filters.evidence.posterior.density import RowFunction
 from pymc_statespace_filters.evidence.posterior.observed_data import scalar_count
+from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_stability
 
 N_DRAWS = 100

@@ -32,7 +32,7 @@ from pymc_statespace_filters.evidence.log_mean import (
     log_mean_of_chains,
     pareto_k,
 )
-from pymc_statespace_filters.evidence.posterior.support import can_sample
+from pymc_statespace_filters.pymc_model.support import can_sample
 
 EDGE = 0.05  # fraction of a bounded support, at each end
 # Limits beyond which the reweighted evidence is unreliable.

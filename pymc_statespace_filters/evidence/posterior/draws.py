@@ -12,9 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
+from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+from pymc_statespace_filters.pymc_model.prior import ModelPrior
 
 N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
 STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie

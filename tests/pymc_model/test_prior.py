@@ -8,8 +8,8 @@ from scipy.special import expit, logsumexp
 from scipy.stats import halfnorm, kstest, norm
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior.density import ModelDensity
-from pymc_statespace_filters.evidence.posterior.prior import ModelPrior
+from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.prior import ModelPrior
 
 N = 4000
 

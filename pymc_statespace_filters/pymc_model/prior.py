@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior.density import RowFunction
-from pymc_statespace_filters.evidence.posterior.support import can_sample, is_restricted
+from pymc_statespace_filters.pymc_model.density import RowFunction
+from pymc_statespace_filters.pymc_model.support import can_sample, is_restricted
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native import parallel_map as many_calls
-from pymc_statespace_filters.evidence.posterior.density import ModelDensity
+from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.sampling.autoregression import autoregression
 

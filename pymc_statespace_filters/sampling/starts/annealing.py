@@ -1,0 +1,120 @@
+r"""Anneal a population from the prior to the posterior.
+
+The points pass through the distributions :math:`p(x) L(x)^\beta`. Each inverse temperature
+:math:`\beta` is the one at which the effective number of points has fallen to half; the points are
+then resampled by :math:`L^{\beta' - \beta}` and moved by Metropolis steps (Del Moral, Doucet and
+Jasra 2006, "Sequential Monte Carlo samplers", J. R. Stat. Soc. B 68, 411-436). At the end they are
+distributed nearly as the posterior, over all modes that the population has met, in proportion to
+their mass.
+
+Half of the proposals are random walks with the covariance of the population, the others differences
+of two of its points (ter Braak 2006, Stat. Comput. 16, 239-249), which follow ridges and lead from
+mode to mode. Proposals depend on the points that they move, a bias that starts can bear.
+
+An estimated likelihood is kept with its point, and a proposal gets fresh noise.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import logsumexp
+
+_ESS_FRACTION = 0.5  # left by a step of the temperature
+_MOVES, _LAST_MOVES = 3, 9  # at each temperature, and at the posterior
+_ACCEPTANCE, _SCALES = (
+    0.25,
+    (0.02, 2.0),
+)  # of the moves; bounds relative to the optimum for a Gaussian
+_JUMPS, _JITTER = 0.1, 1e-3  # share of whole differences; normal noise on differences, in sd
+
+Array = NDArray[np.float64]
+LogDensities = Callable[[Array], tuple[Array, Array]]
+
+
+class Population(NamedTuple):
+    """Points (N, k) with their log priors and log-likelihoods (N,)."""
+
+    x: Array
+    log_prior: Array
+    log_likelihood: Array
+
+    def at(self, index: NDArray[np.int64]) -> "Population":
+        """Copies of the points with these indices."""
+        return Population(self.x[index], self.log_prior[index], self.log_likelihood[index])
+
+
+def anneal(
+    population: Population, log_densities: LogDensities, n: int, rng: np.random.Generator
+) -> Population:
+    """Lead draws of the prior to the posterior; ``n`` points are left.
+
+    ``log_densities`` gives log prior and log-likelihood of points (m, k). At least one draw must
+    have a positive likelihood.
+    """
+    temperature, scale = 0.0, 1.0
+    while temperature < 1.0:
+        log_likelihood = population.log_likelihood
+        raised = next_temperature(temperature, log_likelihood)
+        weights = np.exp((raised - temperature) * (log_likelihood - log_likelihood.max()))
+        temperature = raised
+        population = population.at(_systematic(weights, n, rng))
+        for _ in range(_MOVES if temperature < 1.0 else _LAST_MOVES):
+            population, rate = _moved(population, temperature, scale, log_densities, rng)
+            scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
+    return population
+
+
+def next_temperature(temperature: float, log_likelihood: Array) -> float:
+    """The temperature at which half of the points of positive likelihood are left; at most one."""
+    alive = log_likelihood[np.isfinite(log_likelihood)]
+
+    def surplus(step: float) -> float:
+        log_effective = 2 * logsumexp(step * alive) - logsumexp(2 * step * alive)
+        return math.exp(log_effective) / len(alive) - _ESS_FRACTION
+
+    if surplus(1.0 - temperature) >= 0.0:
+        return 1.0
+    # Under a wide prior the step may be smaller than any absolute tolerance.
+    return temperature + brentq(surplus, 0.0, 1.0 - temperature, xtol=1e-300, rtol=1e-9)
+
+
+def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of ``n`` points by systematic resampling."""
+    ends = np.cumsum(weights)
+    places = (rng.random() + np.arange(n)) * (ends[-1] / n)
+    return np.minimum(np.searchsorted(ends, places, side="right"), weights.size - 1)
+
+
+def _moved(
+    population: Population,
+    temperature: float,
+    scale: float,
+    log_densities: LogDensities,
+    rng: np.random.Generator,
+) -> tuple[Population, float]:
+    """Move every point by a Metropolis step; also the acceptance rate."""
+    x, log_prior, log_likelihood = population
+    n, k = x.shape
+    spread = x.std(axis=0)
+    i, j = rng.integers(n, size=(2, n))
+    length = np.where(rng.random(n) < _JUMPS, 1.0, scale * 2.38 / math.sqrt(2 * k))
+    difference = length[:, np.newaxis] * (x[i] - x[j])
+    difference += _JITTER * spread * rng.standard_normal((n, k))
+    # sum of z_l (x_l - mean) / sqrt(n) has the covariance of the population, singular or not
+    walk = rng.standard_normal((n, n)) @ (x - x.mean(axis=0)) * (scale * 2.38 / math.sqrt(n * k))
+    by_walk = rng.random((n, 1)) < 0.5
+    proposed = x + np.where(by_walk, walk, difference)
+
+    new_prior, new_likelihood = log_densities(proposed)
+    with np.errstate(invalid="ignore"):  # zero density at both points: NaN, not accepted
+        log_ratio = new_prior - log_prior + temperature * (new_likelihood - log_likelihood)
+        accepted = np.log(rng.random(n)) < log_ratio
+    return Population(
+        np.where(accepted[:, np.newaxis], proposed, x),
+        np.where(accepted, new_prior, log_prior),
+        np.where(accepted, new_likelihood, log_likelihood),
+    ), float(accepted.mean())

@@ -1,0 +1,137 @@
+"""`find_starts`: points of the posterior, in all its modes, whatever the prior."""
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from scipy.stats import kstest, norm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.starts.annealing import next_temperature
+from tests.sampling.autoregression import autoregression, simulated
+
+
+def starts_of(model, chains=4, seed=1):
+    return psf.find_starts(model, chains=chains, random_seed=seed, progressbar=False)
+
+
+def test_are_distributed_as_a_narrow_posterior():
+    """The posterior is 3000 times narrower than the prior; Kolmogorov-Smirnov at 0.1 %."""
+    exact = norm(2.0, 0.1)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 300.0, shape=2)
+        pm.Normal("y", mu, 0.1, observed=[2.0, -5.0])
+    found = np.array([start["mu"] for start in starts_of(model, 256)])
+    assert found.shape == (256, 2)
+    for component, shift in zip(found.T, (0.0, 7.0), strict=True):
+        # moves leave some points in one place: count those that differ
+        assert kstest(np.unique(component) + shift, exact.cdf).pvalue > 0.001
+    assert abs(np.corrcoef(found.T)[0, 1]) < 0.3
+
+
+def test_are_in_both_modes_in_proportion_to_their_mass():
+    """Over ten seeds the share of the smaller mode is 0.3 with a standard deviation of 0.02."""
+    with pm.Model() as model:
+        x = pm.Normal("x", 0.0, 10.0)
+        modes = [pt.log(w) + pm.logp(pm.Normal.dist(m, 0.05), x) for w, m in ((0.7, -4), (0.3, 4))]
+        pm.Potential("likelihood", pt.logaddexp(*modes))
+    shares = [
+        np.mean([start["x"] > 0 for start in starts_of(model, 256, seed)]) for seed in range(10)
+    ]
+    assert np.mean(shares) == pytest.approx(0.3, abs=0.07)
+    assert min(shares) > 0.05
+
+
+def test_find_the_frequency_of_an_oscillation():
+    """Chains that start at draws of the prior stay on ridges of other frequencies."""
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 60.0, 0.1)
+    seen = 1.5 * np.sin(2.3 * t + 0.4) + 0.05 * rng.standard_normal(t.size)
+    with pm.Model() as model:
+        frequency = pm.LogNormal("frequency", 0.0, 1.0)
+        amplitude = pm.HalfNormal("amplitude", 3.0)
+        phase = pm.Normal("phase", 0.0, 1.0)
+        sigma = pm.HalfNormal("sigma", 1.0)
+        pm.Normal("y", amplitude * pt.sin(frequency * t + phase), sigma, observed=seen)
+    for seed in (1, 2, 3):
+        for start in starts_of(model, seed=seed):
+            assert start["frequency"] == pytest.approx(2.3, abs=0.003)
+            assert start["sigma"] == pytest.approx(0.05, abs=0.01)
+            assert np.isfinite(model.compile_logp()(_transformed(model, start)))
+
+
+def _transformed(model, start):
+    return model.initial_point() | {
+        model.rvs_to_values[rv].name: np.asarray(
+            start[rv.name] if transform is None else transform.forward(start[rv.name]).eval()
+        )
+        for rv, transform in model.rvs_to_transforms.items()
+        if rv in model.free_RVs
+    }
+
+
+def test_are_initial_values_of_both_samplers():
+    with pm.Model():
+        scale = pm.HalfNormal("scale", 10.0)
+        share = pm.Dirichlet("share", np.ones(3))
+        below = pm.Uniform("below", 0.0, scale)  # its transform depends on another variable
+        pm.Normal("y", scale * share[0] + below, 1.0, observed=[1.0, 1.3])
+        starts = psf.find_starts(chains=2, random_seed=1, progressbar=False)
+        for start in starts:
+            assert start["share"].sum() == pytest.approx(1.0)
+            assert 0.0 < start["below"] < start["scale"]
+        settings = {"chains": 2, "initvals": starts, "random_seed": 1, "progressbar": False}
+        settings |= {"draws": 4, "tune": 0, "compute_convergence_checks": False}
+        chains = psf.sample_dram(stages=1, proposal_cov=1e-20 * np.eye(4), **settings)
+        for chain, start in enumerate(starts):
+            for name, value in start.items():
+                first = chains["posterior"][name].isel(chain=chain, draw=0)
+                assert first.values == pytest.approx(value, rel=1e-6)
+        pm.sample(step=pm.Metropolis(), cores=1, **settings)
+
+
+def test_noisy_likelihoods_and_seeds():
+    with pm.Model() as model:
+        params = {"phi": pm.Uniform("phi", 0.0, 1.0), "spread": pm.HalfNormal("spread", 1.0)}
+        steps = np.arange(1, 31)
+        observed = simulated(steps, 1, 0.8, 0.5)
+        psf.StateSpace(
+            "d", autoregression(), psf.BootstrapPF(50), params=params, steps=steps,
+            observed=observed,
+        )  # fmt: skip
+    (first,), (again,), (other,) = (starts_of(model, 1, seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+def test_half_of_the_points_are_left_by_a_step_of_the_temperature():
+    log_likelihood = np.array([-np.inf, *np.linspace(-1e6, 0.0, 50)])
+    raised = next_temperature(0.2, log_likelihood)
+    weights = np.exp((raised - 0.2) * log_likelihood[1:])
+    assert weights.sum() ** 2 / (weights**2).sum() == pytest.approx(25.0, rel=1e-6)
+    assert next_temperature(0.9, np.zeros(4)) == 1.0
+
+
+@pytest.mark.parametrize(("chains", "message"), [(0, "chains"), (2.5, "chains"), (257, "at most")])
+def test_wrong_numbers_of_chains_are_refused(chains, message):
+    with pm.Model() as model:
+        pm.Normal("x", 0, 1)
+    with pytest.raises(ModelError, match=message):
+        psf.find_starts(model, chains=chains)
+
+
+def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():
+    with pm.Model() as improper:
+        pm.Flat("x")
+    with pytest.raises(ModelError, match="prior of x is improper"):
+        psf.find_starts(improper)
+    with pm.Model() as impossible:
+        x = pm.Normal("x", 0, 1)
+        pm.Potential("never", pt.switch(x > 100.0, 0.0, -np.inf))
+    with pytest.raises(ModelError, match="zero at all of 2048 draws"):
+        psf.find_starts(impossible, progressbar=False)
+    with pm.Model() as discrete:
+        pm.Poisson("n", 3)
+    with pytest.raises(ModelError, match="discrete"):
+        psf.find_starts(discrete)
