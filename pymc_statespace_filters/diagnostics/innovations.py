@@ -14,8 +14,9 @@ def lags_of(n_observations: int) -> NDArray[np.int64]:
 
 
 def standardised(innovation: Array, cov: Array) -> Array:
-    """Innovations (J, p) divided by their standard deviations."""
-    return innovation / np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    """Innovations (J, p) divided by their standard deviations; NaN where these are zero."""
+    sd = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    return np.divide(innovation, sd, out=np.full_like(sd, np.nan), where=sd > 0.0)
 
 
 def autocorrelation_of(z: Array, lags: NDArray[np.int64]) -> Array:

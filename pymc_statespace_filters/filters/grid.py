@@ -117,9 +117,10 @@ class GridFilter:
     def check(self, system: System) -> None:
         """Raise if the system is not one that this filter can treat."""
         if system.n != 1:
+            gaussian = "EKF" if system.gaussian_observation else "IPLF"
             raise ModelError(
                 f"GridFilter treats systems of one state, got {system.n} states "
-                f"{list(system.states)}; use GuidedPF, or EKF where the state stays Gaussian"
+                f"{list(system.states)}; use GuidedPF, or {gaussian} where the state stays Gaussian"
             )
         if system.carried:
             raise ModelError(

@@ -17,17 +17,26 @@ from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.filters.bootstrap import update
-from pymc_statespace_filters.filters.ensemble.callbacks import ENDED, RESAMPLED, UPDATED, emit
+from pymc_statespace_filters.filters.ensemble.callbacks import (
+    ENDED,
+    PREDICTED,
+    RESAMPLED,
+    UPDATED,
+    emit,
+)
 from pymc_statespace_filters.filters.ensemble.defence import NOBODY, first_unguided, is_doubtful
 from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
 from pymc_statespace_filters.filters.ensemble.guided_moves import (
     begin_interval,
+    copy_again,
     emit_forecast,
     guided_particles,
     look_ahead,
     move,
+    predict,
     resample_ahead,
     start,
+    unguided_copies,
     weigh_moves,
 )
 from pymc_statespace_filters.filters.ensemble.loop import (
@@ -68,14 +77,17 @@ def _run(
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
     start(system, guide, initial_rows(noise), particles, local)
+    copies = unguided_copies(system, initial_rows(noise), particles, to, local)
     unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
     emit_forecast(to, -1, k, unguided, particles, nothing, ancestors)
+    emit(to, PREDICTED, -1, k, copies.members, nothing, ancestors)
     for j in range(n_observations):
         while k < at[j]:
             until = at[j] if callback == 0 else k + 1
             move(system, guide, record, noise, k, until, unguided, particles, local)
             k = until
             emit_forecast(to, j, k, unguided, particles, nothing, ancestors)
+            predict(system, record, noise, j, k, copies, to, nothing, ancestors, local)
         if is_missing(record.observed, j):
             out[j] = 0.0
             continue
@@ -97,6 +109,7 @@ def _run(
                 unguided = first_unguided(z)
             resample_ahead(guide, j, k, log_total, resampling, z, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)
+        copy_again(particles, copies, to)
     if state[1] == NONE:
         emit(to, ENDED, n_observations, k, members, nothing, ancestors)
 

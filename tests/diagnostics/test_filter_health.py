@@ -11,7 +11,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics.calibration import uniformity_of
 from tests.diagnostics.records import SYSTEM
 from tests.references.linear_states import linear_states
-from tests.sampling.autoregression import simulated
+from tests.sampling.autoregression import autoregression, simulated
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
@@ -39,7 +39,7 @@ def long_record():
     return simulated(LONG, 5, **TRUTH)
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(300)])
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(300), psf.GuidedPF(300)])
 def test_predictions_of_a_linear_system_have_kalmans_law(filter):
     """Means and variances of 4000 draws within five standard errors: one seed in 10 000 fails."""
     noise = np.array([[0.5, 0.1], [0.1, 0.4]])
@@ -58,6 +58,18 @@ def test_predictions_of_a_linear_system_have_kalmans_law(filter):
     # The two observables of a draw belong to one state.
     joint = np.mean(np.prod(predicted[:, 1] - law.mean[1], axis=-1))
     assert joint == pytest.approx(law.cov[1, 0, 1, 1] + 0.1, abs=0.15)
+
+
+def test_guided_particles_do_not_know_what_they_predict():
+    """Moved by the guide, all would be within the sensor's error of 0.01 of the observation."""
+    system = autoregression(observation_noise=[[1e-4]])
+    steps = np.arange(1, 60, 3)
+    observed = simulated(steps, 2, 0.9, 0.3, observation_noise=1e-4)
+    found = diagnosed(system, psf.GuidedPF(200), observed, steps, phi=0.9, spread=0.3)
+    # after an observation the state is known; three steps of variance 0.3^2 follow
+    variance = 0.09 * (1 + 0.81 + 0.81**2)
+    assert found["d_innovation_cov"].values[1:].ravel() == pytest.approx(variance, rel=0.2)
+    assert found["d_innovation"].values[1:].std() == pytest.approx(variance**0.5, rel=0.35)
 
 
 def test_the_group_has_its_dimensions_and_gaps_of_the_record():

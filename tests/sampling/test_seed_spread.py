@@ -112,6 +112,13 @@ def test_too_little_noise_names_the_factor_to_be_saved():
     assert "250 times fewer" in text
 
 
+def test_a_factor_that_cannot_be_saved_is_not_named():
+    text = variance_advice(of_variance(1e-7), "at its highest draw", 0)
+    assert "variance of only 1e-07" in text
+    assert "far fewer particles" in text
+    assert "times fewer" not in text
+
+
 def test_an_estimate_without_noise_needs_no_advice():
     """That of a guided filter on a linear system varies by rounding only."""
     assert variance_advice(of_variance(2e-29), "at its highest draw", 0) is None

@@ -16,8 +16,9 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 )
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 
-FORECAST, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(4))
-"""Events at step k: members were initialised or moved there from step k - 1; an observation has
+FORECAST, PREDICTED, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(5))
+"""Events at step k: members were initialised or moved there from step k - 1; if they were guided by
+later observations, copies of them were moved without it since the last one; an observation has
 updated members and weights; members were resampled (``ancestors`` tells from which); the record has
 ended."""
 

@@ -98,8 +98,8 @@ def make_guide(system, record):
     guide.path[:] = 0.0
     guide.psi[:] = 0.0
     for k in range(T):
-        _leave_unguided(guide.gains[k], n, m)
-    _leave_unguided(guide.start, n, n)
+        leave_unguided(guide.gains[k], n, m)
+    leave_unguided(guide.start, n, n)
     return guide
 
 
@@ -118,7 +118,7 @@ def _filter(system, record, guide):
     mean, root = _initial(system)
     cov, update, here = np.empty(n * (n + 1) // 2), update_work(n), new_information(n)
     for k in range(guide.gains.shape[0]):
-        _leave_unguided(guide.gains[k], n, system.m)
+        leave_unguided(guide.gains[k], n, system.m)
     copy_into(guide.path[0], mean)
     _cov_of(root, cov)
     first = np.int64(0)
@@ -222,7 +222,7 @@ def _add_observation(system, record, j, x, cov, here, psi):
 
 
 @njit_internal
-def _leave_unguided(gains, n, m):
+def leave_unguided(gains, n, m):
     """Gains of noise that is not shifted."""
     gains[:] = 0.0
     place = 1 + m + m * n

@@ -17,7 +17,7 @@ from pymc_statespace_filters.compiler.native.jit import (
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     CALLBACK_ARGUMENTS,
-    FORECAST,
+    PREDICTED,
     UPDATED,
     searchsorted,
 )
@@ -26,7 +26,7 @@ from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction
 
 # The last event at a step that a moment includes.
-_LAST_EVENTS = {"predicted": int(FORECAST), "filtered": int(UPDATED)}
+_LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
 
 # Integers of the callbacks, then the steps of the rows. Reals of the states: mean, sd, draw, each
 # (R, n), and effective number (R,). Reals of a run: mean (R, n), covariance (R, n, n), members

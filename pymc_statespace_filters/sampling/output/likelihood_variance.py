@@ -39,6 +39,8 @@ MIDDLE = math.sqrt(TARGET[0] * TARGET[1])
 TOO_NOISY, TOO_QUIET = 10.0, 0.05
 # Below this the estimate is exact, as that of a guided filter on a linear system.
 ROUNDING = 1e-12
+# Above this factor it is extrapolated too far to be named.
+MOST_FEWER = 1000.0
 
 # Two-sided probability of the intervals.
 _CONFIDENCE = 0.95
@@ -136,9 +138,15 @@ def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
             "number."
         )
     if ROUNDING < spread.variance < TOO_QUIET:
+        factor = MIDDLE / spread.variance
+        only = f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds."
+        if factor > MOST_FEWER:
+            return (
+                f"{only} Noise does not slow this chain; far fewer particles may make it faster; "
+                "psf.suggest_particles(model) finds the number."
+            )
         return (
-            f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
-            f"With about {_rounded(MIDDLE / spread.variance)} times fewer particles it would lie "
+            f"{only} With about {_rounded(factor)} times fewer particles it would lie "
             f"between {TARGET[0]:g} and {TARGET[1]:g} and the chain would gain more per unit of "
             "time; psf.suggest_particles(model) finds the number."
         )
