@@ -7,7 +7,8 @@ mixture of both densities, no weight of an interval is above ten (Hesterberg 199
 importance sampling and defensive mixture distributions", Technometrics 37, 185-194).
 
 The unguided are every tenth particle from a random place. Each is unguided with probability 1/10,
-which is all that an unbiased estimate needs.
+which is all that an unbiased estimate needs. In front of the first observation, where no normals
+are left for a place, they begin with the first particle, and the mixture has their share of N.
 """
 
 import numpy as np
@@ -17,7 +18,7 @@ from pymc_statespace_filters.compiler.numerics.exponential import exp, log
 from pymc_statespace_filters.compiler.numerics.normals import uniform
 
 STRIDE = 10
-_UNGUIDED = 1.0 / STRIDE
+UNGUIDED = 1.0 / STRIDE
 _LARGEST_MISFIT = 1e-3  # nats in an interval; zero for linear equations
 
 NOBODY = np.int64(-1)
@@ -28,6 +29,12 @@ NOBODY = np.int64(-1)
 def is_doubtful(guide, j):
     """Whether the guide may be wrong in the interval that ends at observation j."""
     return j < guide.misfit.size and guide.misfit[j] > _LARGEST_MISFIT
+
+
+@njit_internal
+def unguided_at_start(n_particles):
+    """The share of every tenth of the particles, the first included."""
+    return ((n_particles + STRIDE - 1) // STRIDE) / n_particles
 
 
 @njit_internal
@@ -60,10 +67,10 @@ def undo_guide(gains, X, Z, first, out):
 
 
 @njit_internal
-def mixture_weight(log_ratio):
-    """Log of prior over mixture, from that of prior over guide."""
+def mixture_weight(log_ratio, share):
+    """Log of prior over mixture, from that of prior over guide and the share of unguided."""
     small = exp(-abs(log_ratio))
     negative = log_ratio < 0.0
-    larger = 1.0 - _UNGUIDED if negative else _UNGUIDED
-    smaller = _UNGUIDED if negative else 1.0 - _UNGUIDED
+    larger = 1.0 - share if negative else share
+    smaller = share if negative else 1.0 - share
     return (log_ratio if negative else 0.0) - log(larger + smaller * small)

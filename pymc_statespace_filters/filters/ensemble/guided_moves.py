@@ -73,15 +73,18 @@ def start(system, guide, given, particles, local):
 
 
 @njit_internal
-def weigh_moves(particles, unguided, out):
-    """Add the density ratios of the moves to the weights, in ``out``."""
+def weigh_moves(particles, unguided, share, out):
+    """Add the density ratios of the moves to the weights, in ``out``.
+
+    ``share`` is the probability to be unguided, if there is a first ``unguided``.
+    """
     log_w, log_ratio, log_det = particles.members.log_w, particles.log_ratio, particles.log_det[0]
     if unguided == NOBODY:
         for i in range(log_w.size):
             out[i] = log_w[i] + (log_ratio[i] + log_det)
     else:
         for i in range(log_w.size):
-            out[i] = log_w[i] + mixture_weight(log_ratio[i] + log_det)
+            out[i] = log_w[i] + mixture_weight(log_ratio[i] + log_det, share)
 
 
 @njit_internal
@@ -147,12 +150,12 @@ def move(system, guide, record, noise, first, last, unguided, particles, local):
 
 
 @njit_internal
-def emit_forecast(callback, j, k, unguided, particles, nothing, ancestors):
+def emit_forecast(callback, j, k, unguided, share, particles, nothing, ancestors):
     """Show the particles with the weights that their moves have left them."""
     if callback[0] == 0:
         return
     members, log_v = particles.members, particles.log_v
-    weigh_moves(particles, unguided, log_v)
+    weigh_moves(particles, unguided, share, log_v)
     shown = Members(
         X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
         alive=members.alive,
