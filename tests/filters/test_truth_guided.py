@@ -142,6 +142,19 @@ def test_mean_of_the_likelihood_is_exact(case, resample_below):
     assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / np.sqrt(N_SEEDS)
 
 
+@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
+@pytest.mark.parametrize("n_particles", [2, 11])
+def test_mean_is_exact_where_the_guide_is_in_doubt_before_the_first_observation(n_particles):
+    """One of two, or two of eleven, are unguided: taken as one of ten, 10 and 5 errors off."""
+    given, record = double_well_parameters(BROAD_DOUBLE_WELL), {"observed": [-0.8], "steps": [60]}
+    exact = psf.log_likelihood(DOUBLE_WELL_SYSTEM, psf.GridFilter(), given, **record).sum()
+    terms = psf.log_likelihood(
+        DOUBLE_WELL_SYSTEM, psf.GuidedPF(n_particles), given, **record, seed=np.arange(N_SEEDS)
+    )
+    ratio = np.exp(terms.sum(axis=1) - exact)
+    assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / np.sqrt(N_SEEDS)
+
+
 def test_is_near_the_truth_on_a_record_with_surprises():
     """Where a bootstrap filter of a thousand particles is sixty nats low, without a warning."""
     record = double_well_with_surprises()
