@@ -73,9 +73,9 @@ def _run(
     state[0], state[1], state[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
-    start(system, guide, initial_rows(noise), particles, local)
     unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
     share = unguided_at_start(local.n_members)
+    start(system, guide, initial_rows(noise), unguided, particles, local)
     emit_forecast(to, -1, k, unguided, share, particles, nothing, ancestors)
     for j in range(n_observations):
         while k < at[j]:

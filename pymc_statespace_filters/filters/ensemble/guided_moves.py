@@ -54,10 +54,17 @@ def guided_particles(n, m, p, local):
 
 
 @njit_internal
-def start(system, guide, given, particles, local):
-    """Draw the states at step 0 from normals (n, width), shifted by the guide."""
+def start(system, guide, given, unguided, particles, local):
+    """Draw the states at step 0 from normals (n, width), shifted by the guide.
+
+    What it does to the weights counts as a move of the first interval.
+    """
     n, N = system.n, local.size
-    shifted = particles.start
+    shifted, log_ratio = particles.start, particles.log_ratio
+    if unguided != NOBODY:
+        ours, normals = (unguided - local.first) % STRIDE, np.empty((n, local.width))
+        undo_guide(guide.start[1:], np.zeros((n, N)), given, ours, normals)
+        given = normals
     place = 1 + n + n * n
     for r in range(n):
         for i in range(N):
@@ -65,10 +72,9 @@ def start(system, guide, given, particles, local):
             for c in range(r, n):
                 value += guide.start[place + c - r] * given[c, i]
             shifted[r, i] = value
-            particles.members.log_w[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
+            log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
         place += n - r
-    for i in range(N):
-        particles.members.log_w[i] += guide.start[0]
+    particles.log_det[0] += guide.start[0]
     initialise(system, shifted.ctypes.data, local.width, particles.members.X)
 
 
