@@ -102,7 +102,8 @@ def _run(
             z = resampling_normals(noise, j, k)
             if doubtful:
                 unguided = first_unguided(z)
-            resample_ahead(guide, j, k, log_total, resampling, z, particles, local)
+            mixed = UNGUIDED if doubtful else 0.0
+            resample_ahead(guide, j, k, log_total, resampling, z, mixed, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)
     if state[1] == NONE:
         emit(to, ENDED, n_observations, k, members, nothing, ancestors)

@@ -4,7 +4,8 @@ Where the equations bend over what is known of the state, a linear guide may lea
 the state can take. The few particles that take it have large weights, and most estimates are too
 low, a few far too high. With a share of unguided particles, and weights that divide by the
 mixture of both densities, no weight of an interval is above ten (Hesterberg 1995, "Weighted average
-importance sampling and defensive mixture distributions", Technometrics 37, 185-194).
+importance sampling and defensive mixture distributions", Technometrics 37, 185-194). Resampling in
+front of such an interval draws with the same share from the weights without psi.
 
 The unguided are every tenth particle from a random place. Each is unguided with probability 1/10,
 which is all that an unbiased estimate needs. In front of the first observation, where no normals
@@ -68,7 +69,7 @@ def undo_guide(gains, X, Z, first, out):
 
 @njit_internal
 def mixture_weight(log_ratio, share):
-    """Log of prior over mixture, from that of prior over guide and the share of unguided."""
+    """Log of prior over mixture, from that of prior over guide and the share of the prior."""
     small = exp(-abs(log_ratio))
     negative = log_ratio < 0.0
     larger = 1.0 - share if negative else share

@@ -129,13 +129,27 @@ def look_ahead(guide, j, k, particles, local):
 
 
 @njit_internal
-def resample_ahead(guide, j, k, log_total, resampling, z, particles, local):
-    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it."""
-    log_w, log_psi = particles.members.log_w, particles.log_v
-    resample(resampling, z, particles.v, particles.members.X, local)
+def resample_ahead(guide, j, k, log_total, resampling, z, share, particles, local):
+    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it.
+
+    Of the probability a ``share``, which may be zero, is that of w alone.
+    """
+    w, v, log_w, log_psi = (
+        particles.members.w,
+        particles.v,
+        particles.members.log_w,
+        particles.log_v,
+    )
+    if share > 0.0:
+        for i in range(v.size):
+            v[i] = (1.0 - share) * v[i] + share * w[i]
+    resample(resampling, z, v, particles.members.X, local)
     _log_psi(guide, j, k, particles.members.X, log_psi)
     for i in range(log_w.size):
-        log_w[i] = log_total - math.log(local.n_members) - log_psi[i]
+        log_ratio = log_total - log_psi[i]
+        if share > 0.0:
+            log_ratio = mixture_weight(log_ratio, share)
+        log_w[i] = log_ratio - math.log(local.n_members)
 
 
 @njit_internal
