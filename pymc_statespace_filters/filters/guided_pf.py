@@ -24,7 +24,13 @@ from pymc_statespace_filters.filters.ensemble.callbacks import (
     UPDATED,
     emit,
 )
-from pymc_statespace_filters.filters.ensemble.defence import NOBODY, first_unguided, is_doubtful
+from pymc_statespace_filters.filters.ensemble.defence import (
+    NOBODY,
+    UNGUIDED,
+    first_unguided,
+    is_doubtful,
+    unguided_at_start,
+)
 from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
 from pymc_statespace_filters.filters.ensemble.guided_moves import (
     begin_interval,
@@ -76,22 +82,23 @@ def _run(
     state[0], state[1], state[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
-    start(system, guide, initial_rows(noise), particles, local)
-    copies = unguided_copies(system, initial_rows(noise), particles, to, local)
     unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
-    emit_forecast(to, -1, k, unguided, particles, nothing, ancestors)
+    share = unguided_at_start(local.n_members)
+    start(system, guide, initial_rows(noise), unguided, particles, local)
+    copies = unguided_copies(system, initial_rows(noise), particles, to, local)
+    emit_forecast(to, -1, k, unguided, share, particles, nothing, ancestors)
     emit(to, PREDICTED, -1, k, copies.members, nothing, ancestors)
     for j in range(n_observations):
         while k < at[j]:
             until = at[j] if callback == 0 else k + 1
             move(system, guide, record, noise, k, until, unguided, particles, local)
             k = until
-            emit_forecast(to, j, k, unguided, particles, nothing, ancestors)
+            emit_forecast(to, j, k, unguided, share, particles, nothing, ancestors)
             predict(system, record, noise, j, k, copies, to, nothing, ancestors, local)
         if is_missing(record.observed, j):
             out[j] = 0.0
             continue
-        weigh_moves(particles, unguided, members.log_w)
+        weigh_moves(particles, unguided, share, members.log_w)
         begin_interval(particles)
         d = record.observed[j]
         found = update(system, j, k, t0 + k * dt, d, noise, members, local, ())
@@ -102,12 +109,13 @@ def _run(
         log_total, numbers[j] = look_ahead(guide, j, k, particles, local)
         state[0] = min(state[0], numbers[j])
         emit(to, UPDATED, j, k, members, d, ancestors)
-        doubtful, unguided = is_doubtful(guide, j + 1), NOBODY
+        doubtful, unguided, share = is_doubtful(guide, j + 1), NOBODY, UNGUIDED
         if resampling.always or doubtful or numbers[j] < resampling.threshold:
             z = resampling_normals(noise, j, k)
             if doubtful:
                 unguided = first_unguided(z)
-            resample_ahead(guide, j, k, log_total, resampling, z, particles, local)
+            mixed = UNGUIDED if doubtful else 0.0
+            resample_ahead(guide, j, k, log_total, resampling, z, mixed, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)
         copy_again(particles, copies, to)
     if state[1] == NONE:
@@ -132,7 +140,8 @@ class GuidedPF(ParticleFilter):
         Number N of particles, at least 2.
     resample_below : float
         Resample after an observation if the effective number of particles given the whole record is
-        below this fraction of N: 1 resamples at every observation, 0 never.
+        below this fraction of N: 1 resamples at every observation, 0 only in front of an interval
+        over which the linear system may be wrong, where all settings do.
     resampling : {"systematic", "multinomial", "sorted"}
         Resampling scheme, see `BootstrapPF`.
 

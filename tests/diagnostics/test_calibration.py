@@ -88,12 +88,41 @@ def test_a_tail_that_one_draw_decides_is_cut_off():
     np.testing.assert_allclose((observed - found.mean)[1:, 0] / sd[1:], [6.0, -6.0], rtol=0.02)
 
 
+def test_a_tail_is_known_by_the_effective_number_of_its_draws():
+    """Five unequal draws are worth 4.2 of equal ones; with a smaller rest they are worth 2.2."""
+    for rest, clipped in [(0.5, False), (0.15, True)]:
+        tails = 1e-3 * np.array([1.0, rest, rest, rest, rest / 2.0])
+        shape = (5, 1, 1)
+        above = np.log(tails).reshape(shape)
+        below = np.log1p(-tails).reshape(shape)
+        laws = Laws(np.zeros(shape), np.ones((*shape, 1)), below, above, known=False)
+        found = calibration_of(laws, np.zeros((1, 1)))
+        expected = residual_limit(5) if clipped else norm.isf(tails.mean())
+        assert found.residual.item() == pytest.approx(expected, rel=1e-9)
+        assert found.clipped.item() == clipped
+
+
+def test_moments_of_a_mixture_have_covariances():
+    mean = np.array([[[1.0, -2.0]], [[-1.0, 2.0]], [[np.nan, 0.0]]])
+    cov = np.broadcast_to([[0.5, 0.1], [0.1, 0.3]], (3, 1, 2, 2))
+    tails = np.full((3, 1, 2), np.log(0.5))
+    found = calibration_of(Laws(mean, cov, tails, tails, True), np.zeros((1, 2)))
+    np.testing.assert_allclose(found.mean, [[0.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(found.cov, [[[1.5, -1.9], [-1.9, 4.3]]])
+
+
 def test_coverage_of_central_intervals():
     pit = np.column_stack([(np.arange(100) + 0.5) / 100, np.full(100, 0.2)])
     pit[:10, 1] = np.nan
     np.testing.assert_allclose(coverage_of(pit, 0.5), [0.5, 0.0])
     np.testing.assert_allclose(coverage_of(pit, 0.9), [0.9, 1.0])
     assert np.isnan(coverage_of(np.full((3, 1), np.nan), 0.5)).all()
+
+
+def test_whiteness_is_the_test_of_ljung_and_box():
+    """Ten residuals of alternating sign: two lags, Q = 120 (0.81 / 9 + 0.64 / 8) = 20.4."""
+    residual = np.tile([1.0, -1.0], 5)
+    assert whiteness_of(residual) == pytest.approx(np.exp(-10.2), rel=1e-12)
 
 
 def test_white_noise_is_rejected_as_often_as_the_level_says():

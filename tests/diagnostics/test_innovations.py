@@ -8,6 +8,13 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.diagnostics.innovations import (
+    autocorrelation_of,
+    input_correlation_of,
+    inputs_before,
+    lags_of,
+    standardised,
+)
 from tests.references.linear_states import linear_states
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 
@@ -121,6 +128,29 @@ def test_white_innovations_pass_and_wrong_models_do_not(forced_record):
     slow = diagnosed(FORCED, psf.EKF(), observed, LONG, 4, inputs=0 * force, a=0.0, b=1.0)
     assert slow["d_autocorrelation"].sel(lag=1).item() > 4 * bound
     assert slow["d_whiteness"].item() < 1e-4
+
+
+def test_lags_are_counted_towards_the_past():
+    """A record of period three, and one that follows an input two rows later."""
+    rng, lags = np.random.default_rng(4), np.arange(1, 6)
+    periodic = np.tile(rng.normal(size=3), 20)[:, None]
+    found = autocorrelation_of(periodic, lags)[:, 0]
+    np.testing.assert_array_equal(np.isclose(found, 1.0), lags == 3)
+    inputs = rng.normal(size=(60, 2))
+    late = np.full((60, 1), np.nan)
+    late[2:, 0] = inputs[:-2, 1]
+    found = input_correlation_of(late, inputs, np.insert(lags, 0, 0))
+    assert found.shape == (6, 2, 1)
+    np.testing.assert_array_equal(np.argwhere(np.isclose(found, 1.0)), [[2, 1, 0]])
+
+
+def test_lags_inputs_and_scales_of_innovations():
+    for n_observations, most in [(300, 25), (40, 10), (2, 1)]:
+        np.testing.assert_array_equal(lags_of(n_observations), np.arange(1, most + 1))
+    before = inputs_before(np.array([[10.0], [11.0], [12.0]]), np.array([0, 1, 3]))
+    np.testing.assert_array_equal(before, [[np.nan], [10.0], [12.0]])
+    z = standardised(np.array([[2.0, -9.0]]), np.array([[[4.0, 1.0], [1.0, 9.0]]]))
+    np.testing.assert_array_equal(z, [[1.0, -3.0]])
 
 
 def test_a_healthy_filter_says_nothing(forced_record):

@@ -7,9 +7,11 @@ import numpy as np
 import pytensor.tensor as pt
 import pytest
 from numba import njit
+from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.filters.gaussian.sigma_points import SigmaPoints
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.test_ekf_states import (
     FORCE,
@@ -225,6 +227,65 @@ def test_ukf_knows_mean_and_variance_of_a_square():
     gain = 2.0 * m * p / variance
     np.testing.assert_allclose(run["mean"].values.item(), m + gain * (d - mean), rtol=1e-13)
     np.testing.assert_allclose(run["cov"].values.item(), p - gain * 2.0 * m * p, rtol=1e-12)
+
+
+def test_noise_and_sensors_that_all_bend_have_covariances():
+    """Two products of two correlated states, and noise that grows with one of them."""
+    m, P, d = np.array([0.7, -0.4]), np.array([[0.6, 0.2], [0.2, 0.3]]), np.array([1.1, 0.3])
+    Gamma = np.array([[0.2, 0.05], [0.05, 0.1]])
+
+    def products(x):
+        return [x[0] ** 2, x[0] * x[1]]
+
+    system = psf.StateSpaceModel(
+        transition=lambda x: [x[0], x[1]],
+        observation=lambda x, e: [x[0] ** 2 + e[0], x[0] * x[1] + x[0] * e[1]],
+        observation_noise=Gamma,
+        initial_mean=m,
+        initial_cov=P,
+    )
+    run = psf.run_filter(system, psf.UKF(), {}, d[None], steps=[0])
+    mean, cov, cross = spread(products, m, P)
+    # E[D Gamma D'] with D = diag(1, x0)
+    S = cov + Gamma * np.array([[1.0, m[0]], [m[0], m[0] ** 2 + P[0, 0]]])
+    term = -0.5 * (d - mean) @ np.linalg.solve(S, d - mean)
+    term -= 0.5 * np.log(np.linalg.det(2.0 * np.pi * S))
+    np.testing.assert_allclose(run["log_likelihood"], [term], rtol=1e-12)
+    gain = cross @ np.linalg.inv(S)
+    np.testing.assert_allclose(run["mean"].values.ravel(), m + gain @ (d - mean), rtol=1e-12)
+    np.testing.assert_allclose(run["cov"].values.reshape(2, 2), P - gain @ S @ gain.T, rtol=1e-11)
+
+
+def test_default_points_are_those_of_the_cubature_filter_from_three_states_on():
+    squares = [SigmaPoints().squared_distance(n) for n in (1, 2, 3, 4, 14)]
+    assert squares == [3.0, 3.0, 3.0, 4.0, 14.0]
+
+
+def regression_of_a_square(m, p):
+    """Mean, slope and remaining variance of the square of N(m, p)."""
+    return m**2 + p, 2.0 * m, 2.0 * p**2
+
+
+def test_iplf_iterates_over_the_posterior():
+    """The iteration written out for a square, and the density by points of its posterior."""
+    m, p, r, d = 0.7, 0.6, 0.05, 1.9
+    run = psf.run_filter(SQUARE, psf.IPLF(), {"m": m, "p": p, "r": r}, [d], steps=[0])
+    mean, variance, means = m, p, []
+    for _ in range(5):
+        level, slope, rest = regression_of_a_square(mean, variance)
+        total = slope**2 * p + rest + r
+        gain = p * slope / total
+        predicted = level + slope * (m - mean)
+        mean, variance = m + gain * (d - predicted), p - gain**2 * total
+        means.append(mean)
+    assert abs(means[-1] - means[0]) > 0.05
+    np.testing.assert_allclose(run["mean"].values.item(), mean, rtol=1e-11)
+    np.testing.assert_allclose(run["cov"].values.item(), variance, rtol=1e-11)
+    x = mean + np.sqrt(3.0 * variance) * np.array([0.0, 1.0, -1.0])
+    ratio = norm.pdf(d, x**2, np.sqrt(r)) * norm.pdf(x, m, np.sqrt(p))
+    ratio /= norm.pdf(x, mean, np.sqrt(variance))
+    term = np.log(np.array([4.0, 1.0, 1.0]) / 6.0 @ ratio)
+    np.testing.assert_allclose(run["log_likelihood"], [term], rtol=1e-10)
 
 
 def test_the_scaling_is_that_of_wan_and_van_der_merwe():

@@ -4,10 +4,12 @@ Where the equations bend over what is known of the state, a linear guide may lea
 the state can take. The few particles that take it have large weights, and most estimates are too
 low, a few far too high. With a share of unguided particles, and weights that divide by the
 mixture of both densities, no weight of an interval is above ten (Hesterberg 1995, "Weighted average
-importance sampling and defensive mixture distributions", Technometrics 37, 185-194).
+importance sampling and defensive mixture distributions", Technometrics 37, 185-194). Resampling in
+front of such an interval draws with the same share from the weights without psi.
 
 The unguided are every tenth particle from a random place. Each is unguided with probability 1/10,
-which is all that an unbiased estimate needs.
+which is all that an unbiased estimate needs. In front of the first observation, where no normals
+are left for a place, they begin with the first particle, and the mixture has their share of N.
 """
 
 import numpy as np
@@ -17,7 +19,7 @@ from pymc_statespace_filters.compiler.numerics.exponential import exp, log
 from pymc_statespace_filters.compiler.numerics.normals import uniform
 
 STRIDE = 10
-_UNGUIDED = 1.0 / STRIDE
+UNGUIDED = 1.0 / STRIDE
 _LARGEST_MISFIT = 1e-3  # nats in an interval; zero for linear equations
 
 NOBODY = np.int64(-1)
@@ -28,6 +30,12 @@ NOBODY = np.int64(-1)
 def is_doubtful(guide, j):
     """Whether the guide may be wrong in the interval that ends at observation j."""
     return j < guide.misfit.size and guide.misfit[j] > _LARGEST_MISFIT
+
+
+@njit_internal
+def unguided_at_start(n_particles):
+    """The share of every tenth of the particles, the first included."""
+    return ((n_particles + STRIDE - 1) // STRIDE) / n_particles
 
 
 @njit_internal
@@ -60,10 +68,10 @@ def undo_guide(gains, X, Z, first, out):
 
 
 @njit_internal
-def mixture_weight(log_ratio):
-    """Log of prior over mixture, from that of prior over guide."""
+def mixture_weight(log_ratio, share):
+    """Log of prior over mixture, from that of prior over guide and the share of the prior."""
     small = exp(-abs(log_ratio))
     negative = log_ratio < 0.0
-    larger = 1.0 - _UNGUIDED if negative else _UNGUIDED
-    smaller = _UNGUIDED if negative else 1.0 - _UNGUIDED
+    larger = 1.0 - share if negative else share
+    smaller = share if negative else 1.0 - share
     return (log_ratio if negative else 0.0) - log(larger + smaller * small)

@@ -55,10 +55,17 @@ def guided_particles(n, m, p, local):
 
 
 @njit_internal
-def start(system, guide, given, particles, local):
-    """Draw the states at step 0 from normals (n, width), shifted by the guide."""
+def start(system, guide, given, unguided, particles, local):
+    """Draw the states at step 0 from normals (n, width), shifted by the guide.
+
+    What it does to the weights counts as a move of the first interval.
+    """
     n, N = system.n, local.size
-    shifted = particles.start
+    shifted, log_ratio = particles.start, particles.log_ratio
+    if unguided != NOBODY:
+        ours, normals = (unguided - local.first) % STRIDE, np.empty((n, local.width))
+        undo_guide(guide.start[1:], np.zeros((n, N)), given, ours, normals)
+        given = normals
     place = 1 + n + n * n
     for r in range(n):
         for i in range(N):
@@ -66,23 +73,25 @@ def start(system, guide, given, particles, local):
             for c in range(r, n):
                 value += guide.start[place + c - r] * given[c, i]
             shifted[r, i] = value
-            particles.members.log_w[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
+            log_ratio[i] += 0.5 * (given[r, i] * given[r, i] - value * value)
         place += n - r
-    for i in range(N):
-        particles.members.log_w[i] += guide.start[0]
+    particles.log_det[0] += guide.start[0]
     initialise(system, shifted.ctypes.data, local.width, particles.members.X)
 
 
 @njit_internal
-def weigh_moves(particles, unguided, out):
-    """Add the density ratios of the moves to the weights, in ``out``."""
+def weigh_moves(particles, unguided, share, out):
+    """Add the density ratios of the moves to the weights, in ``out``.
+
+    ``share`` is the probability to be unguided, if there is a first ``unguided``.
+    """
     log_w, log_ratio, log_det = particles.members.log_w, particles.log_ratio, particles.log_det[0]
     if unguided == NOBODY:
         for i in range(log_w.size):
             out[i] = log_w[i] + (log_ratio[i] + log_det)
     else:
         for i in range(log_w.size):
-            out[i] = log_w[i] + mixture_weight(log_ratio[i] + log_det)
+            out[i] = log_w[i] + mixture_weight(log_ratio[i] + log_det, share)
 
 
 @njit_internal
@@ -121,13 +130,27 @@ def look_ahead(guide, j, k, particles, local):
 
 
 @njit_internal
-def resample_ahead(guide, j, k, log_total, resampling, z, particles, local):
-    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it."""
-    log_w, log_psi = particles.members.log_w, particles.log_v
-    resample(resampling, z, particles.v, particles.members.X, local)
+def resample_ahead(guide, j, k, log_total, resampling, z, share, particles, local):
+    """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it.
+
+    Of the probability a ``share``, which may be zero, is that of w alone.
+    """
+    w, v, log_w, log_psi = (
+        particles.members.w,
+        particles.v,
+        particles.members.log_w,
+        particles.log_v,
+    )
+    if share > 0.0:
+        for i in range(v.size):
+            v[i] = (1.0 - share) * v[i] + share * w[i]
+    resample(resampling, z, v, particles.members.X, local)
     _log_psi(guide, j, k, particles.members.X, log_psi)
     for i in range(log_w.size):
-        log_w[i] = log_total - math.log(local.n_members) - log_psi[i]
+        log_ratio = log_total - log_psi[i]
+        if share > 0.0:
+            log_ratio = mixture_weight(log_ratio, share)
+        log_w[i] = log_ratio - math.log(local.n_members)
 
 
 @njit_internal
@@ -201,12 +224,12 @@ def copy_again(particles, unguided, callback):
 
 
 @njit_internal
-def emit_forecast(callback, j, k, unguided, particles, nothing, ancestors):
+def emit_forecast(callback, j, k, unguided, share, particles, nothing, ancestors):
     """Show the particles with the weights that their moves have left them."""
     if callback[0] == 0:
         return
     members, log_v = particles.members, particles.log_v
-    weigh_moves(particles, unguided, log_v)
+    weigh_moves(particles, unguided, share, log_v)
     shown = Members(
         X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
         alive=members.alive,

@@ -1,0 +1,42 @@
+"""The warning of failures and collapse names the evaluation whose particles were the fewest."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
+
+# Health that does not come from a filter: smallest effective number, failure, observation.
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q: [x[0] + q[0], x[1]],
+    process_noise=[[1.0]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[1.0]],
+    initial_mean=[0.0, 0.0],
+    initial_cov=np.eye(2),
+)
+
+
+def warned(rows):
+    asked = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_about(SYSTEM, "a filter", np.array(rows), lambda i: asked.append(i) or ())
+    return [str(w.message) for w in caught], asked
+
+
+def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
+    failure = max(FAILURES)
+    rows = [[5.0, 0.0, -1.0], [2.0, 0.0, -1.0], [0.0, failure, 3.0], [1.25, 0.0, -1.0]]
+    (failed, collapsed), asked = warned(rows)
+    assert failed == f"a filter gave -inf in 1 of 4 evaluations: 1 times {FAILURES[failure]}"
+    assert "in 2 of 4 evaluations (smallest effective number 1.25)" in collapsed
+    assert asked == [3]
+
+
+@pytest.mark.parametrize("smallest", [COLLAPSED, np.inf])
+def test_enough_particles_are_not_warned_of(smallest):
+    assert warned([[smallest, 0.0, -1.0]]) == ([], [])
