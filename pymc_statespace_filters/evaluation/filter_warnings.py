@@ -10,6 +10,7 @@ import numpy as np
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters.grid import GridFilter
+from pymc_statespace_filters.filters.guided_pf import GuidedPF
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.ops.base import evaluator
@@ -53,16 +54,18 @@ def warn_about(
             f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
             f"number {smallest[worst]:.3g}). {_extent(system, filter, arguments_of(worst))}, by a "
             f"different amount for every seed; more particles lessen this only slowly. "
-            f"{remedy(system)}",
+            f"{_remedy(system, filter)}",
             FilterWarning,
             stacklevel=stacklevel,
         )
 
 
-def remedy(system: StateSpaceModel) -> str:
+def _remedy(system: StateSpaceModel, filter: Any) -> str:
     """Say which filter gives the likelihood of a system without collapse."""
     if _exact_filter(system) is not None:
         return "Use GridFilter(), which computes this likelihood without particles."
+    if isinstance(filter, GuidedPF):
+        return "Use more particles; if they collapse again, BootstrapPF(n) with many."
     return (
         "Use GuidedPF(n), which is unbiased and moves its particles to where the record leads; if "
         "they collapse there, too, BootstrapPF(n) with many."

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.evaluation import filter_warnings
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
 
@@ -20,11 +21,11 @@ SYSTEM = psf.StateSpaceModel(
 )
 
 
-def warned(rows):
+def warned(rows, filter="a filter"):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about(SYSTEM, "a filter", np.array(rows), lambda i: asked.append(i) or ())
+        warn_about(SYSTEM, filter, np.array(rows), lambda i: asked.append(i) or ())
     return [str(w.message) for w in caught], asked
 
 
@@ -35,6 +36,16 @@ def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
     assert failed == f"a filter gave -inf in 1 of 4 evaluations: 1 times {FAILURES[failure]}"
     assert "in 2 of 4 evaluations (smallest effective number 1.25)" in collapsed
     assert asked == [3]
+
+
+def test_a_filter_is_not_its_own_remedy(monkeypatch):
+    monkeypatch.setattr(filter_warnings, "_extent", lambda *_: "Some terms")
+    (of_guided,), _ = warned([[1.5, 0.0, -1.0]], psf.GuidedPF(100))
+    (of_bootstrap,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100))
+    assert of_guided.endswith(
+        "Use more particles; if they collapse again, BootstrapPF(n) with many."
+    )
+    assert "Use GuidedPF(n)" in of_bootstrap
 
 
 @pytest.mark.parametrize("smallest", [COLLAPSED, np.inf])
