@@ -19,7 +19,6 @@ from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.filters.bootstrap import update
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
-    PREDICTED,
     RESAMPLED,
     UPDATED,
     emit,
@@ -34,16 +33,18 @@ from pymc_statespace_filters.filters.ensemble.defence import (
 from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
 from pymc_statespace_filters.filters.ensemble.guided_moves import (
     begin_interval,
-    copy_again,
     emit_forecast,
     guided_particles,
     look_ahead,
     move,
-    predict,
     resample_ahead,
     start,
-    unguided_copies,
     weigh_moves,
+)
+from pymc_statespace_filters.filters.ensemble.guided_predictions import (
+    copy_again,
+    predict,
+    start_copies,
 )
 from pymc_statespace_filters.filters.ensemble.loop import (
     FILTER_ARGUMENTS,
@@ -85,9 +86,9 @@ def _run(
     unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
     share = unguided_at_start(local.n_members)
     start(system, guide, initial_rows(noise), unguided, particles, local)
-    copies = unguided_copies(system, initial_rows(noise), particles, to, local)
+    copies = start_copies(system, noise, members, to, local)
     emit_forecast(to, -1, k, unguided, share, particles, nothing, ancestors)
-    emit(to, PREDICTED, -1, k, copies.members, nothing, ancestors)
+    predict(system, record, noise, -1, k, copies, to, nothing, ancestors, local)
     for j in range(n_observations):
         while k < at[j]:
             until = at[j] if callback == 0 else k + 1
@@ -117,7 +118,7 @@ def _run(
             mixed = UNGUIDED if doubtful else 0.0
             resample_ahead(guide, j, k, log_total, resampling, z, mixed, particles, local)
             emit(to, RESAMPLED, j, k, members, nothing, ancestors)
-        copy_again(particles, copies, to)
+        copy_again(members, copies, to)
     if state[1] == NONE:
         emit(to, ENDED, n_observations, k, members, nothing, ancestors)
 

@@ -15,7 +15,7 @@ from pymc_statespace_filters.evidence.estimators.smc_moves import (
     resample_systematic,
     sample_prior_particles,
 )
-from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC, next_temperature
+from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
 from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     REAL,
@@ -169,20 +169,6 @@ class TestParts:
         ancestor = np.repeat(np.arange(24), 2)  # eight runs of six particles, three ancestors each
         found = tempered_smc._summary(np.zeros(8), ancestor, [])
         assert found.settings["n_ancestors"] == 3
-
-    @pytest.mark.parametrize("spread", [1.0, 1e3, 1e9])
-    def test_temperatures_leave_a_share_of_the_effective_number(self, spread):
-        log_likelihood = -spread * np.random.default_rng(86).chisquare(3, 1000)
-        log_likelihood[::3] = -np.inf
-        raised = next_temperature(0.0, log_likelihood)
-        weights = np.exp(raised * log_likelihood)
-        alive = np.isfinite(log_likelihood).sum()
-        effective = weights.sum() ** 2 / (weights**2).sum()
-        assert 0 < raised < 1
-        assert effective / alive == pytest.approx(tempered_smc.ESS_FRACTION, rel=1e-4)
-
-    def test_the_last_temperature_is_one(self):
-        assert next_temperature(0.3, np.array([-1.0, -1.01, -1.02])) == 1.0
 
     def test_resampling_copies_by_weight_within_each_run(self):
         rng = np.random.default_rng(87)

@@ -108,15 +108,7 @@ def test_an_exception_of_the_model_is_raised():
         density.evaluate(np.array([[0.0], [2.0], [0.5]]), seeds)
 
 
-@pytest.fixture
-def _interrupts_arrive():
-    """A shell has them ignored in what it runs in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("_interrupts_arrive")
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupt_stops_all_threads():
     def slow(x):
         time.sleep(0.01)

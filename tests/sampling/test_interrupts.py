@@ -10,13 +10,7 @@ from pymc_statespace_filters.parallel.signals import (
     ignored_interrupts,
 )
 
-
-@pytest.fixture(autouse=True)
-def _interrupts_arrive():
-    """Whatever started these tests may have had them ignore Ctrl-C."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+pytestmark = pytest.mark.usefixtures("interrupts_arrive")
 
 
 def test_an_interrupt_is_noticed():

@@ -8,7 +8,6 @@ from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.starts.annealing import next_temperature
 from tests.sampling.autoregression import autoregression, simulated
 
 
@@ -103,14 +102,6 @@ def test_noisy_likelihoods_and_seeds():
     (first,), (again,), (other,) = (starts_of(model, 1, seed) for seed in (1, 1, 2))
     assert first == again
     assert first != other
-
-
-def test_half_of_the_points_are_left_by_a_step_of_the_temperature():
-    log_likelihood = np.array([-np.inf, *np.linspace(-1e6, 0.0, 50)])
-    raised = next_temperature(0.2, log_likelihood)
-    weights = np.exp((raised - 0.2) * log_likelihood[1:])
-    assert weights.sum() ** 2 / (weights**2).sum() == pytest.approx(25.0, rel=1e-6)
-    assert next_temperature(0.9, np.zeros(4)) == 1.0
 
 
 @pytest.mark.parametrize(("chains", "message"), [(0, "chains"), (2.5, "chains"), (257, "at most")])

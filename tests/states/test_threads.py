@@ -141,15 +141,7 @@ def test_an_exception_arrives():
         at_draws_of(picky, 10).parameters()
 
 
-@pytest.fixture
-def _interrupts_arrive():
-    """A shell has them ignored in what it runs in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("_interrupts_arrive")
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupt_stops_the_work():
     calls = []
 

@@ -35,7 +35,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.errors import ModelError
@@ -49,6 +48,7 @@ from pymc_statespace_filters.evidence.estimators.smc_moves import (
 )
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from pymc_statespace_filters.system.checks import check_count, is_integer
+from pymc_statespace_filters.tempering import next_temperature
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
 ESS_FRACTION = 0.85  # left by a step of the temperature; longer steps miss tails
@@ -118,7 +118,7 @@ class TemperedSMC:
         stages: list[_Stage] = []
         while True:
             # Weight before resampling and moving: the estimate is unbiased for any moves.
-            raised = next_temperature(temperature, particles.log_likelihood)
+            raised = next_temperature(temperature, particles.log_likelihood, ESS_FRACTION)
             log_weights = (raised - temperature) * particles.log_likelihood
             log_weights = log_weights.reshape(self.n_runs, self.n_particles)
             log_evidences += logsumexp(log_weights, axis=1) - np.log(self.n_particles)
@@ -129,24 +129,6 @@ class TemperedSMC:
             particles, stage = move_particles(particles, temperature, scale, posterior, rng)
             scale = stage.scale
             stages.append(stage)
-
-
-def next_temperature(temperature: float, log_likelihood: Array) -> float:
-    """The temperature at which the effective sample size has fallen to `ESS_FRACTION`; at most one.
-
-    The fraction refers to particles of positive likelihood: all others are lost at the first step,
-    however small.
-    """
-    alive = log_likelihood[np.isfinite(log_likelihood)]
-
-    def surplus(step: float) -> float:
-        log_effective = 2 * logsumexp(step * alive) - logsumexp(2 * step * alive)
-        return math.exp(log_effective) / len(alive) - ESS_FRACTION
-
-    if surplus(1 - temperature) >= 0:
-        return 1.0
-    # Under a wide prior the step may be smaller than any absolute tolerance.
-    return temperature + brentq(surplus, 0.0, 1 - temperature, xtol=1e-300, rtol=1e-9)
 
 
 def move_particles(

@@ -5,15 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, PREDICTED, emit
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, emit
 from pymc_statespace_filters.filters.ensemble.defence import (
     NOBODY,
     STRIDE,
     mixture_weight,
     undo_guide,
 )
-from pymc_statespace_filters.filters.ensemble.guide import leave_unguided
 from pymc_statespace_filters.filters.ensemble.loop import Members, new_members
 from pymc_statespace_filters.filters.ensemble.noise import process_normals, process_rows
 from pymc_statespace_filters.filters.ensemble.resampling import resample
@@ -135,12 +134,8 @@ def resample_ahead(guide, j, k, log_total, resampling, z, share, particles, loca
 
     Of the probability a ``share``, which may be zero, is that of w alone.
     """
-    w, v, log_w, log_psi = (
-        particles.members.w,
-        particles.v,
-        particles.members.log_w,
-        particles.log_v,
-    )
+    w, log_w = particles.members.w, particles.members.log_w
+    v, log_psi = particles.v, particles.log_v
     if share > 0.0:
         for i in range(v.size):
             v[i] = (1.0 - share) * v[i] + share * w[i]
@@ -168,59 +163,6 @@ def move(system, guide, record, noise, first, last, unguided, particles, local):
         row += _NUMBER_BYTES * gains.shape[1]
         log_det += gains[k, 0]
     particles.log_det[0] += log_det
-
-
-class Unguided(NamedTuple):
-    """Copies of the particles that move without the guide, to predict what comes next.
-
-    Guided particles are where the observation is, and none of them where else it could have been.
-    ``members`` are the states (n, N) and weights, ``gains`` those of a step without guidance.
-    """
-
-    members: Members
-    gains: np.ndarray
-
-
-@njit_internal
-def unguided_copies(system, given, particles, callback, local):
-    """Copies that start from normals (n, width); empty if there is no callback to show them to."""
-    n, m = system.n, system.m
-    size = local.size if callback[0] != 0 else 0
-    rows, log_w = np.zeros((n + 1, size)), np.empty(size)
-    gains = np.zeros(1 + m + m * n + m * (m + 1) // 2)
-    leave_unguided(gains, n, m)
-    members = particles.members
-    copies = Members(
-        X=rows[:n], D=members.D, X_f=members.X_f, w=members.w, log_w=log_w, log_p=members.log_p,
-        alive=members.alive,
-    )  # fmt: skip
-    if size:
-        initialise(system, given.ctypes.data, local.width, copies.X)
-        for i in range(size):
-            log_w[i] = -math.log(local.n_members)
-    return Unguided(copies, gains)
-
-
-@njit_internal
-def predict(system, record, noise, j, k, unguided, callback, nothing, ancestors, local):
-    """Move the copies to step k, and show them."""
-    if callback[0] == 0:
-        return
-    z, gains = process_normals(noise, k - 1), np.int64(unguided.gains.ctypes.data) + _NUMBER_BYTES
-    X = unguided.members.X
-    t = record.t0 + (k - 1) * system.dt
-    propagate_guided(system, k - 1, t, z, local.width, X, gains)
-    emit(callback, PREDICTED, j, k, unguided.members, nothing, ancestors)
-
-
-@njit_internal
-def copy_again(particles, unguided, callback):
-    """Begin the copies anew from the particles after an update."""
-    if callback[0] == 0:
-        return
-    copy_into(unguided.members.log_w, particles.members.log_w)
-    for a in range(particles.members.X.shape[0]):
-        copy_into(unguided.members.X[a], particles.members.X[a])
 
 
 @njit_internal

@@ -20,15 +20,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import logsumexp
+
+from pymc_statespace_filters.tempering import next_temperature
 
 _ESS_FRACTION = 0.5  # left by a step of the temperature
 _MOVES, _LAST_MOVES = 3, 9  # at each temperature, and at the posterior
-_ACCEPTANCE, _SCALES = (
-    0.25,
-    (0.02, 2.0),
-)  # of the moves; bounds relative to the optimum for a Gaussian
+_ACCEPTANCE = 0.25  # of the moves
+_SCALES = 0.02, 2.0  # bounds for their length, relative to the optimum for a Gaussian
 _JUMPS, _JITTER = 0.1, 1e-3  # share of whole differences; normal noise on differences, in sd
 
 Array = NDArray[np.float64]
@@ -58,7 +56,7 @@ def anneal(
     temperature, scale = 0.0, 1.0
     while temperature < 1.0:
         log_likelihood = population.log_likelihood
-        raised = next_temperature(temperature, log_likelihood)
+        raised = next_temperature(temperature, log_likelihood, _ESS_FRACTION)
         weights = np.exp((raised - temperature) * (log_likelihood - log_likelihood.max()))
         temperature = raised
         population = population.at(_systematic(weights, n, rng))
@@ -66,20 +64,6 @@ def anneal(
             population, rate = _moved(population, temperature, scale, log_densities, rng)
             scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
     return population
-
-
-def next_temperature(temperature: float, log_likelihood: Array) -> float:
-    """The temperature at which half of the points of positive likelihood are left; at most one."""
-    alive = log_likelihood[np.isfinite(log_likelihood)]
-
-    def surplus(step: float) -> float:
-        log_effective = 2 * logsumexp(step * alive) - logsumexp(2 * step * alive)
-        return math.exp(log_effective) / len(alive) - _ESS_FRACTION
-
-    if surplus(1.0 - temperature) >= 0.0:
-        return 1.0
-    # Under a wide prior the step may be smaller than any absolute tolerance.
-    return temperature + brentq(surplus, 0.0, 1.0 - temperature, xtol=1e-300, rtol=1e-9)
 
 
 def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
