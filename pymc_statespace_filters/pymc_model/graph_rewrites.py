@@ -15,6 +15,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.ekf import EKF
+from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.ops.distributed import (
@@ -189,3 +191,16 @@ def smooth_filters(model: pm.Model) -> dict[str, Filter]:
     nodes = state_space_nodes(model)
     ops = {name: nodes[name].op for name in noisy_filters(model)}
     return {name: op.filter.smooth(compile_system(op.system)) for name, op in ops.items()}
+
+
+def pilot_filters(model: pm.Model) -> dict[str, Filter]:
+    """An `EKF` in place of each expensive filter, by names; none if a system does not allow it."""
+    found: dict[str, Filter] = {}
+    for name, node in state_space_nodes(model).items():
+        if node.op.filter.noisy or isinstance(node.op.filter, GridFilter):
+            found[name] = EKF()
+            try:
+                check_system_and_filter(node.op.system, found[name])
+            except ModelError:
+                return {}
+    return found

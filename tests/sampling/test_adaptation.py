@@ -22,7 +22,7 @@ from pymc_statespace_filters.sampling.target.target import Target
 
 @njit
 def learn_from(adapt_every, continuous, state, position, stage):
-    learn(adapt_every, continuous, state, position, stage)
+    learn(adapt_every, continuous, state, position, stage, False)
 
 
 def adapted(continuous, adapt_every, state, position, stage):

@@ -50,10 +50,10 @@ class Checkpoint:
     def __init__(self, ticket: Ticket, lease: FolderLease | None = None):
         self.path, self.ticket = Path(ticket.folder), ticket
         self._lease = lease
-        self._journals: dict[int, ChainJournal] = {}
+        self._journals: dict[int | str, ChainJournal] = {}
 
-    def journal(self, chain: int) -> ChainJournal:
-        """The journal of a chain, 0 the first; always the same object.
+    def journal(self, chain: int | str) -> ChainJournal:
+        """The journal of a chain, 0 the first, or of "starts"; always the same object.
 
         One rank at a time uses the journal of a chain, and begins with `ChainJournal.read`.
         """

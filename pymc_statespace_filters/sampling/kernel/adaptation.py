@@ -43,8 +43,10 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     FIRST,
     MOVED,
     N_BLOCKS,
+    N_PIECE,
     N_STALLS,
     SCALE,
+    WALKED,
     AdaptationState,
     Moments,
     N,
@@ -75,6 +77,7 @@ def learn(
     state: AdaptationState,
     position: np.ndarray,
     stage: int,
+    is_free: bool,
 ) -> None:
     """Adapt to one iteration of warm-up, in place.
 
@@ -89,11 +92,15 @@ def learn(
         Of the chain after the iteration.
     stage : int
         The stage whose proposal was accepted, 0 if none was.
+    is_free : bool
+        Whether the proposal was not the random walk's. Its draw counts for the covariance, but not
+        for the acceptance rate.
     """
     block = state.block.counts
     _include(state.block, 1.0, position)
     block[MOVED] += 1.0 if stage > 0 else 0.0
-    block[FIRST] += 1.0 if stage == 1 else 0.0
+    block[WALKED] += 0.0 if is_free else 1.0
+    block[FIRST] += 1.0 if stage == 1 and not is_free else 0.0
     if _has_stalled(adapt_every, state.numbers, block):
         _forget_block(state)
     elif block[N] >= adapt_every:
@@ -142,11 +149,12 @@ def _merge(moments: Moments, other: Moments) -> None:
     _include(moments, other.counts[N], other.mean)
     moments.counts[MOVED] += other.counts[MOVED]
     moments.counts[FIRST] += other.counts[FIRST]
+    moments.counts[WALKED] += other.counts[WALKED]
 
 
 @_internal
 def _clear(moments: Moments) -> None:
-    for i in range(3):
+    for i in range(N_PIECE):
         moments.counts[i] = 0.0
     for i in range(moments.mean.size):
         moments.mean[i] = 0.0
@@ -183,9 +191,9 @@ def _forget_block(state: AdaptationState) -> None:
 def _close_block(state: AdaptationState) -> None:
     """Merge a complete block, and set the scale by its acceptance rate."""
     numbers, block = state.numbers, state.block.counts
-    if block[FIRST] < LOW_ACCEPTANCE * block[N]:
+    if block[FIRST] < LOW_ACCEPTANCE * block[WALKED]:
         numbers[SCALE] *= SHRINK
-    elif block[FIRST] > FAIR_ACCEPTANCE * block[N]:
+    elif block[FIRST] > FAIR_ACCEPTANCE * block[WALKED]:
         numbers[SCALE] = 1.0
     numbers[N_BLOCKS] += 1.0
     numbers[N_STALLS] = 0.0
@@ -200,7 +208,7 @@ def _close_block(state: AdaptationState) -> None:
 
 @_internal
 def _replace(moments: Moments, other: Moments) -> None:
-    for i in range(3):
+    for i in range(N_PIECE):
         moments.counts[i] = other.counts[i]
     for i in range(other.mean.size):
         moments.mean[i] = other.mean[i]

@@ -7,13 +7,16 @@ from numba.extending import register_jitable
 
 # Cells of the numbers of a state, and of the counts of moments.
 SCALE, N_BLOCKS, N_STALLS = range(3)
-N, MOVED, FIRST = range(3)
+N, MOVED, FIRST, WALKED = range(4)
+N_PIECE = 4
 
 
 class Moments(NamedTuple):
     """Running moments of a piece of a chain, for its covariance."""
 
-    counts: np.ndarray  # (3,): iterations; those that moved; those that moved by the first stage
+    # (4,): iterations; those that moved; those that moved by the first stage of the random walk;
+    # those that made a random walk
+    counts: np.ndarray
     mean: np.ndarray  # (d,), of the positions
     scatter: np.ndarray  # (d, d), sum of outer products of the deviations from the mean
 
@@ -59,13 +62,13 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
 
 def packed_size(dim: int) -> int:
     """Length of a packed state of dimension d."""
-    return 3 + 4 * dim**2 + 3 * (3 + dim + dim**2)
+    return 3 + 4 * dim**2 + 3 * (N_PIECE + dim + dim**2)
 
 
 @register_jitable
 def unpack(packed: np.ndarray, dim: int) -> AdaptationState:
     """View a vector of length `packed_size` as a state."""
-    square, n_moments = dim * dim, 3 + dim + dim * dim
+    square, n_moments = dim * dim, N_PIECE + dim + dim * dim
     at = 3 + 4 * square
     return AdaptationState(
         packed[:3],
@@ -97,7 +100,7 @@ def _matrix(packed: np.ndarray, at: int, dim: int) -> np.ndarray:
 @register_jitable
 def _moments(packed: np.ndarray, at: int, dim: int) -> Moments:
     return Moments(
-        packed[at : at + 3],
-        packed[at + 3 : at + 3 + dim],
-        _matrix(packed, at + 3 + dim, dim),
+        packed[at : at + N_PIECE],
+        packed[at + N_PIECE : at + N_PIECE + dim],
+        _matrix(packed, at + N_PIECE + dim, dim),
     )

@@ -8,6 +8,7 @@ any iteration, on any rank.
 import numpy as np
 
 from pymc_statespace_filters.sampling.kernel.state import RandomBlock
+from pymc_statespace_filters.student_mixture import DEGREES_OF_FREEDOM
 
 BLOCK = 256
 
@@ -20,6 +21,8 @@ def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: 
         rng.standard_normal((BLOCK, n_stages, dim)),
         -rng.standard_exponential((BLOCK, n_stages + 1)),
         draw_seeds(rng, (BLOCK, n_stages, n_noisy)),
+        rng.random((BLOCK, 2)),
+        np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, BLOCK)),
     )
 
 

@@ -19,8 +19,8 @@ NOT_A_NUMBER, RAISED = -1, -2
 LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN = range(3)
 ACCEPTANCE, SCALING = 2, 3
 N_NUMBERS = 4
-STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED = range(6)
-N_COUNTS = 6
+STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED, INDEPENDENT = range(7)
+N_COUNTS = 7
 # Cells of the control block that a running chain shares with the main thread.
 PAUSE_REQUESTED, N_DONE = range(2)
 
@@ -57,6 +57,7 @@ class ChainState(NamedTuple):
     seeds: np.ndarray  # int64 (noisy,), of the estimate
     numbers: np.ndarray  # (3,), columns LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN
     adaptation: np.ndarray  # packed, see `adaptation_state.unpack`
+    mixture: np.ndarray  # packed, see `independence.unpack_mixture`
     carried: np.ndarray  # the noise itself, if proposals are correlated with it
     key: np.ndarray  # uint64 (2,), of the chain's random numbers
 
@@ -72,6 +73,9 @@ class RandomBlock(NamedTuple):
     normals: np.ndarray  # (iterations, stages, d), for the proposals
     log_uniforms: np.ndarray  # (iterations, stages + 1), to accept a stage or a screened move
     seeds: np.ndarray  # int64 (iterations, stages, noisy), of the estimated likelihoods
+    # (iterations, 2), uniform: to choose the kind of proposal, and a component of the mixture
+    choices: np.ndarray
+    spreads: np.ndarray  # (iterations,), of a Student-t distribution relative to a normal one
 
 
 class Draws(NamedTuple):
@@ -79,8 +83,9 @@ class Draws(NamedTuple):
 
     positions: np.ndarray  # (n, d)
     numbers: np.ndarray  # (n, 4), columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING
-    # int64 (n, 6), columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS,
-    # N_FAILED, FAILURE (the last failure code), N_SCREENED, N_SCREEN_FAILED
+    # int64 (n, 7), columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS,
+    # N_FAILED, FAILURE (the last failure code), N_SCREENED, N_SCREEN_FAILED, INDEPENDENT (1 if
+    # the proposal was drawn from the mixture)
     counts: np.ndarray
     seeds: np.ndarray  # int64 (n, noisy)
     covs: np.ndarray  # (n_covs, d, d), of the first stage's proposals, in the first iterations only

@@ -1,12 +1,13 @@
 """The iterations of a chain in machine code: propose, evaluate, accept, adapt, record.
 
-PyMC's step method calls it for one iteration at a time, ``sample_dram`` for many.
+PyMC's step method calls it for one iteration at a time, ``sample_dram`` for many. An iteration
+proposes by a random walk with delayed rejection, or from a mixture (see `independence`).
 
 With a noisy likelihood every proposal of every stage has its own noise, and the estimate at the
 current point is kept. The densities of the noise then cancel in Eq. 3.32, so that the chain is
 exact for prior times expected likelihood, with any number of stages.
 
-With a screen the whole delayed-rejection move runs on a cheap density, and the expensive one is
+With a screen the whole move runs on a cheap density, and the expensive one is
 evaluated only at its end point, once, with fresh noise (see `surrogate`).
 
 References
@@ -28,10 +29,18 @@ from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
+from pymc_statespace_filters.sampling.kernel.independence import (
+    SHARE,
+    ProposalMixture,
+    draw_from_mixture,
+    log_mixture_density,
+    unpack_mixture,
+)
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
     FAILURE,
     HEALTH_SIZE,
+    INDEPENDENT,
     LOG_DENSITY,
     LOG_SCREEN,
     N_DONE,
@@ -51,7 +60,7 @@ from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acce
 
 
 class _Move(NamedTuple):
-    """Result of delayed rejection; an accepted point is in the arrays of the density."""
+    """Result of a proposal or several; an accepted point is in the arrays of the density."""
 
     stage: int
     value: Evaluation
@@ -59,6 +68,13 @@ class _Move(NamedTuple):
     n_evaluations: int
     n_failed: int
     failure: int
+
+
+class _Laws(NamedTuple):
+    """What proposals are drawn from."""
+
+    chol: np.ndarray  # (d, d), of the random walk's first stage
+    mixture: ProposalMixture
 
 
 _internal = linked()
@@ -70,6 +86,7 @@ _SOURCES = (
     "adaptation.py",
     "adaptation_state.py",
     "delayed_rejection.py",
+    "independence.py",
     "surrogate.py",
 )
 _SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
@@ -92,7 +109,7 @@ def evaluate(density):
         return Evaluation(-np.inf, RAISED, 0.0)
     out, n_effective = density.call.out, np.inf
     for i in range(density.n_healths):
-        at = 2 + HEALTH_SIZE * i
+        at = 3 + HEALTH_SIZE * i  # behind the log-densities of posterior and prior
         n_effective = min(n_effective, out[at])
         if out[at + 1] != 0.0:
             return Evaluation(-np.inf, int(out[at + 1]), n_effective)
@@ -135,6 +152,33 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
 
 
 @_internal
+def _independence(density, log_density, position, mixture, random, k):
+    """Propose a point of the mixture, wherever the chain is."""
+    normals, spread = random.normals[k, 0], random.spreads[k]
+    draw_from_mixture(mixture, normals, spread, random.choices[k, 1], density.position)
+    copy_into(density.seeds, random.seeds[k, 0])
+    value = evaluate(density)
+    # The mixture takes the place of a surrogate's density.
+    log_alpha = log_surrogate_acceptance(
+        log_density,
+        value.log_density,
+        log_mixture_density(mixture, position),
+        log_mixture_density(mixture, density.position),
+    )
+    failed = 1 if value.failure != 0 else 0
+    stage = 1 if random.log_uniforms[k, 0] < log_alpha else 0
+    return _Move(stage, value, np.exp(log_alpha), 1, failed, value.failure)
+
+
+@_internal
+def _propose(density, log_density, state, settings, laws, random, k, is_free):
+    """Make the proposals of an iteration on a density."""
+    if is_free:
+        return _independence(density, log_density, state.position, laws.mixture, random, k)
+    return _delayed_rejection(density, log_density, state.position, laws.chol, settings, random, k)
+
+
+@_internal
 def _set_current(state, density, value, log_screen):
     """Take the point just evaluated, and its estimate, as the current state."""
     copy_into(state.position, density.position)
@@ -147,10 +191,10 @@ def _set_current(state, density, value, log_screen):
 
 
 @_internal
-def _move(settings, target, state, chol, random, k, counts):
+def _move(settings, target, state, laws, random, k, is_free, counts):
     """One iteration without a screen; the acceptance probability of its first proposal."""
     log_density = state.numbers[LOG_DENSITY]
-    move = _delayed_rejection(target, log_density, state.position, chol, settings, random, k)
+    move = _propose(target, log_density, state, settings, laws, random, k, is_free)
     if move.stage > 0:
         _set_current(state, target, move.value, 0.0)
     counts[STAGE], counts[N_EVALUATIONS] = move.stage, move.n_evaluations
@@ -160,10 +204,10 @@ def _move(settings, target, state, chol, random, k, counts):
 
 
 @_internal
-def _screened_move(settings, target, screen, state, chol, random, k, counts):
+def _screened_move(settings, target, screen, state, laws, random, k, is_free, counts):
     """One iteration on a screen; the probability of accepting its end point."""
     log_screen = state.numbers[LOG_SCREEN]
-    move = _delayed_rejection(screen, log_screen, state.position, chol, settings, random, k)
+    move = _propose(screen, log_screen, state, settings, laws, random, k, is_free)
     counts[STAGE], counts[N_EVALUATIONS] = 0, 0
     counts[N_FAILED], counts[FAILURE] = 0, RAISED if move.failure == RAISED else 0
     counts[N_SCREENED], counts[N_SCREEN_FAILED] = move.n_evaluations, move.n_failed
@@ -202,19 +246,23 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
     raised. The state is that after the last of them.
     """
     adapted = unpack(state.adaptation, state.position.size)
+    mixture = unpack_mixture(state.mixture, state.position.size)
+    laws = _Laws(adapted.chol, mixture)
     scaling = _scaling(adapted.chol)
     done = 0
     while done < n and control[PAUSE_REQUESTED] == 0:
         at, k = row + done, first + done
         counts, numbers = draws.counts[at], draws.numbers[at]
+        is_free = random.choices[k, 0] < mixture.numbers[SHARE]
         if settings.screened:
             acceptance = _screened_move(
-                settings, target, screen, state, adapted.chol, random, k, counts
+                settings, target, screen, state, laws, random, k, is_free, counts
             )
         else:
-            acceptance = _move(settings, target, state, adapted.chol, random, k, counts)
+            acceptance = _move(settings, target, state, laws, random, k, is_free, counts)
         if counts[FAILURE] == RAISED:
             break
+        counts[INDEPENDENT] = is_free
         copy_into(draws.positions[at], state.position)
         copy_into(draws.seeds[at], state.seeds)
         numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]
@@ -224,7 +272,14 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
             for i in range(state.position.size):
                 copy_into(draws.covs[at, i], adapted.cov[i])
         if settings.adapts:
-            learn(settings.adapt_every, settings.continuous, adapted, state.position, counts[STAGE])
+            learn(
+                settings.adapt_every,
+                settings.continuous,
+                adapted,
+                state.position,
+                counts[STAGE],
+                is_free,
+            )
             scaling = _scaling(adapted.chol)
         done += 1
         control[N_DONE] += 1

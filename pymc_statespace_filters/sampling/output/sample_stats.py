@@ -8,6 +8,7 @@ from pymc.stats.convergence import SamplerWarning
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
     FAILURE,
+    INDEPENDENT,
     LOG_DENSITY,
     N_EFFECTIVE,
     N_EVALUATIONS,
@@ -28,6 +29,7 @@ MODEL_LOGP, WARNING = "model_logp", "warning"
 _NUMBERS = {"accept": ACCEPTANCE, MODEL_LOGP: LOG_DENSITY, "scaling": SCALING}
 _COUNTS = {
     "stage": STAGE,
+    "independent": INDEPENDENT,
     "n_evaluations": N_EVALUATIONS,
     "n_failed": N_FAILED,
     "failure": FAILURE,

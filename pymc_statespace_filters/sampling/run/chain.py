@@ -14,6 +14,7 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     packed_size,
     start_adaptation,
 )
+from pymc_statespace_filters.sampling.kernel.independence import no_mixture
 from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_seeds
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
@@ -69,6 +70,7 @@ class Chain:
             np.zeros(n_noisy, dtype=np.int64),
             np.zeros(3),
             adaptation,
+            no_mixture(dim),
             self._density.carried,
             np.array(key),
         )

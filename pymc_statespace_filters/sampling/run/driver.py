@@ -87,6 +87,7 @@ def _run(
     with ExitStack() as stack:
         if checkpoints:
             _open_checkpoints(tasks, checkpoints, comm, stack)
+        _find_populations(tasks, comm, progressbar=bool(options.progressbar))
         run_chains(
             tasks,
             comm,
@@ -106,6 +107,19 @@ def _run(
 def _prepare(tasks: Sequence[ModelTask]) -> None:
     for task in tasks:
         task.prepare()
+
+
+def _find_populations(tasks: Sequence[ModelTask], comm: Communicator, *, progressbar: bool) -> None:
+    """Find points of each posterior on rank 0, for the chains of all ranks."""
+
+    def find() -> list:
+        if comm.rank > 0:
+            return []
+        return [task.find_population(progressbar=progressbar) for task in tasks]
+
+    found = comm.broadcast(comm.run_collectively(find))
+    for task, population in zip(tasks, found, strict=True):
+        task.population = population
 
 
 def _group_size(ranks_per_chain: int, n_ranks: int) -> int:

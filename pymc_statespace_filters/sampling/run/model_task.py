@@ -24,9 +24,12 @@ from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, cl
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.starts.population import find_population
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
+
+_STARTS = 2**32 - 1  # no chain has this number
 
 
 class ModelTask:
@@ -58,6 +61,7 @@ class ModelTask:
         self.model, self.request, self.name = model, request, name
         self._group = group
         self.checkpoint: Checkpoint | None = None
+        self.population: np.ndarray | None = None
         self._target: Target | None = None
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         self._began = self._ended = 0.0
@@ -101,7 +105,31 @@ class ModelTask:
             checkpoint=self.checkpoint,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
+            population=self.population,
         )
+
+    def find_population(self, *, progressbar: bool) -> np.ndarray | None:
+        """Points of the posterior, found once for all chains; None if starts are given otherwise.
+
+        Neither without warm-up, nor if ranks divide the particles or the noise is carried.
+        """
+        target, request = self.prepare(), self.request
+        if (
+            request.tune == 0
+            or request.initvals is not None
+            or not target.prior_draws.may_start
+            or target.carries_noise
+            or self.is_distributed
+        ):
+            return None
+        journal = None if self.checkpoint is None else self.checkpoint.journal("starts")
+        if journal is not None and (stored := journal.read()) is not None:
+            return stored.draws["population"]
+        rng = np.random.default_rng(np.random.SeedSequence(request.entropy, spawn_key=(_STARTS,)))
+        found = find_population(target, rng, progressbar=progressbar)
+        if journal is not None:
+            journal.append({"population": found}, {})
+        return found
 
     def cost(self) -> float:
         """Estimate the seconds that a chain takes: as many evaluations as iterations."""

@@ -1,11 +1,11 @@
-r"""Anneal a population from the prior to the posterior.
+r"""Anneal a population from one distribution to another, such as from prior to posterior.
 
-The points pass through the distributions :math:`p(x) L(x)^\beta`. Each inverse temperature
-:math:`\beta` is the one at which the effective number of points has fallen to half; the points are
-then resampled by :math:`L^{\beta' - \beta}` and moved by Metropolis steps (Del Moral, Doucet and
-Jasra 2006, "Sequential Monte Carlo samplers", J. R. Stat. Soc. B 68, 411-436). At the end they are
-distributed nearly as the posterior, over all modes that the population has met, in proportion to
-their mass.
+With the densities :math:`r` and :math:`r L` of the two, the points pass through the distributions
+:math:`r(x) L(x)^\beta`. Each inverse temperature :math:`\beta` is the one at which the effective
+number of points has fallen to half; the points are then resampled by :math:`L^{\beta' - \beta}` and
+moved by Metropolis steps (Del Moral, Doucet and Jasra 2006, "Sequential Monte Carlo samplers",
+J. R. Stat. Soc. B 68, 411-436). At the end they are distributed nearly as the second, over all
+modes that the population has met, in proportion to their mass.
 
 Half of the proposals are random walks with the covariance of the population, the others differences
 of two of its points (ter Braak 2006, Stat. Comput. 16, 239-249), which follow ridges and lead from
@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from pymc_statespace_filters.tempering import next_temperature
 
 _ESS_FRACTION = 0.5  # left by a step of the temperature
-_MOVES, _LAST_MOVES = 3, 9  # at each temperature, and at the posterior
+_MOVES = 3  # at each temperature
+N_SWEEPS = 3  # as many moves again and again, at the last temperature
 _ACCEPTANCE = 0.25  # of the moves
 _SCALES = 0.02, 2.0  # bounds for their length, relative to the optimum for a Gaussian
 _JUMPS, _JITTER = 0.1, 1e-3  # share of whole differences; normal noise on differences, in sd
@@ -34,36 +35,40 @@ LogDensities = Callable[[Array], tuple[Array, Array]]
 
 
 class Population(NamedTuple):
-    """Points (N, k) with their log priors and log-likelihoods (N,)."""
+    """Points (N, k), log-densities (N,) of the first distribution, and log-ratios to the second."""
 
     x: Array
-    log_prior: Array
-    log_likelihood: Array
+    log_first: Array
+    log_ratio: Array
 
     def at(self, index: NDArray[np.int64]) -> "Population":
         """Copies of the points with these indices."""
-        return Population(self.x[index], self.log_prior[index], self.log_likelihood[index])
+        return Population(self.x[index], self.log_first[index], self.log_ratio[index])
 
 
 def anneal(
     population: Population, log_densities: LogDensities, n: int, rng: np.random.Generator
-) -> Population:
-    """Lead draws of the prior to the posterior; ``n`` points are left.
+) -> Array:
+    """Lead draws of the first distribution to the second.
 
-    ``log_densities`` gives log prior and log-likelihood of points (m, k). At least one draw must
-    have a positive likelihood.
+    ``log_densities`` gives the log-density of the first and the log-ratio at points (m, k). At
+    least one draw must have a positive ratio. Gives N_SWEEPS times ``n`` points: the population
+    after every third of the last moves.
     """
     temperature, scale = 0.0, 1.0
     while temperature < 1.0:
-        log_likelihood = population.log_likelihood
-        raised = next_temperature(temperature, log_likelihood, _ESS_FRACTION)
-        weights = np.exp((raised - temperature) * (log_likelihood - log_likelihood.max()))
+        log_ratio = population.log_ratio
+        raised = next_temperature(temperature, log_ratio, _ESS_FRACTION)
+        weights = np.exp((raised - temperature) * (log_ratio - log_ratio.max()))
         temperature = raised
         population = population.at(_systematic(weights, n, rng))
-        for _ in range(_MOVES if temperature < 1.0 else _LAST_MOVES):
-            population, rate = _moved(population, temperature, scale, log_densities, rng)
-            scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
-    return population
+        sweeps = []
+        for _ in range(1 if temperature < 1.0 else N_SWEEPS):
+            for _ in range(_MOVES):
+                population, rate = _moved(population, temperature, scale, log_densities, rng)
+                scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
+            sweeps.append(population.x)
+    return np.concatenate(sweeps)
 
 
 def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -81,7 +86,7 @@ def _moved(
     rng: np.random.Generator,
 ) -> tuple[Population, float]:
     """Move every point by a Metropolis step; also the acceptance rate."""
-    x, log_prior, log_likelihood = population
+    x, log_first, log_ratio = population
     n, k = x.shape
     spread = x.std(axis=0)
     i, j = rng.integers(n, size=(2, n))
@@ -93,12 +98,12 @@ def _moved(
     by_walk = rng.random((n, 1)) < 0.5
     proposed = x + np.where(by_walk, walk, difference)
 
-    new_prior, new_likelihood = log_densities(proposed)
+    new_first, new_ratio = log_densities(proposed)
     with np.errstate(invalid="ignore"):  # zero density at both points: NaN, not accepted
-        log_ratio = new_prior - log_prior + temperature * (new_likelihood - log_likelihood)
-        accepted = np.log(rng.random(n)) < log_ratio
+        log_alpha = new_first - log_first + temperature * (new_ratio - log_ratio)
+        accepted = np.log(rng.random(n)) < log_alpha
     return Population(
         np.where(accepted[:, np.newaxis], proposed, x),
-        np.where(accepted, new_prior, log_prior),
-        np.where(accepted, new_likelihood, log_likelihood),
+        np.where(accepted, new_first, log_first),
+        np.where(accepted, new_ratio, log_ratio),
     ), float(accepted.mean())

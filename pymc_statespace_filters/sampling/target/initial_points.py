@@ -17,7 +17,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
-N_DRAWS = 200
+N_DRAWS = 256
 # Number of prior draws with finite log-density of which a chain starts at the best.
 N_COMPARED = 10
 
@@ -46,13 +46,17 @@ class PriorDraws:
     raveled : RaveledVariables
     default : mapping of str to ndarray
         The model's initial point.
+
+    Attributes
+    ----------
+    draws : ndarray, shape (n, d)
     """
 
     def __init__(self, model: Model, raveled: RaveledVariables, default: Mapping[str, np.ndarray]):
         rvs = [model.values_to_rvs[v] for v in raveled.variables]
         self._has_initvals = any(model.rvs_to_initial_values[rv] is not None for rv in rvs)
         self._default = raveled.ravel(default)
-        self._draws = _prior_draws(model, raveled)
+        self.draws, self._is_prior = _prior_draws(model, raveled)
 
     def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
         """List candidates for a start: draws from the prior, then the point of user or model.
@@ -61,18 +65,23 @@ class PriorDraws:
         """
         if self._has_initvals or not np.array_equal(start, self._default):
             return [start]
-        return [*rng.permutation(self._draws), start]
+        return [*rng.permutation(self.draws), start]
+
+    @property
+    def may_start(self) -> bool:
+        """Whether chains may start at a posterior found from the draws, as the user gave none."""
+        return self._is_prior and not self._has_initvals and len(self.draws) > 1
 
     def covariance(self) -> np.ndarray:
         """Give a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
         dim = self._default.size
-        variance = self._draws.var(axis=0) if len(self._draws) > 1 else np.ones(dim)
+        variance = self.draws.var(axis=0) if len(self.draws) > 1 else np.ones(dim)
         variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
         return np.diag(variance) * 2.38**2 / dim
 
 
-def _prior_draws(model: Model, raveled: RaveledVariables) -> np.ndarray:
-    """Draw from the prior, on the unconstrained space: finite rows, shape (n, d).
+def _prior_draws(model: Model, raveled: RaveledVariables) -> tuple[np.ndarray, bool]:
+    """Draw from the prior, on the unconstrained space: finite rows, shape (n, d), and True.
 
     The seed is fixed, so that the draws depend on the model alone; the generator of a chain chooses
     among them. A prior that cannot be drawn from, such as a flat one, is replaced by the model's
@@ -81,12 +90,12 @@ def _prior_draws(model: Model, raveled: RaveledVariables) -> np.ndarray:
     free = list(model.free_RVs)
     from_prior = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
     try:
-        points = [from_prior(seed) for seed in range(N_DRAWS)]
+        points, is_prior = [from_prior(seed) for seed in range(N_DRAWS)], True
     except NotImplementedError:
         jittered = make_initial_point_fn(model=model, jitter_rvs=set(free))
-        points = [jittered(seed) for seed in range(N_DRAWS)]
+        points, is_prior = [jittered(seed) for seed in range(N_DRAWS)], False
     table = np.array([raveled.ravel(point) for point in points])
-    return table[np.isfinite(table).all(axis=1)]
+    return table[np.isfinite(table).all(axis=1)], is_prior
 
 
 def best_initial_point(

@@ -18,6 +18,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
@@ -82,8 +83,8 @@ class LogDensity:
         others = [v for v in model.value_vars if v not in variables]
         self.others = tuple(v.name for v in others)
         density = model.logp() if graph is None else graph
-        outputs = [density, *health_outputs([density])]
-        self._n_healths = len(outputs) - 1
+        outputs = [density, model.logp(vars=model.free_RVs), *health_outputs([density])]
+        self._n_healths = len(outputs) - 2
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
         noise_inputs: list[Variable] = []
         noise: list[Variable] = []
@@ -109,7 +110,7 @@ class LogDensity:
         outputs, joined = join_nonshared_inputs(
             point, outputs, variables, shared_inputs=seed_inputs
         )
-        inputs = [joined, *others, *noise_inputs, *seed_inputs.values()]
+        inputs = [joined, *seed_inputs.values(), *others, *noise_inputs]
         self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
         self._n_seeds = len(seeds)
@@ -135,6 +136,16 @@ class LogDensity:
         with leader_errors(self._leader):
             self._native = NativeFunction(self._function, inputs)
         return self._native
+
+    def at_rows(self) -> ParallelMap:
+        """A function of positions (m, d) and m seeds of each noisy variable, in threads.
+
+        Columns of its results are the log-density and that of the prior.
+        """
+        seeds = np.zeros(self._n_seeds, dtype=np.int64)
+        inputs = self._inputs(self._start, self._others, np.zeros(()), self._first_normals(), seeds)
+        n = 1 + self._n_seeds
+        return ParallelMap(self._function, inputs[:n], inputs[n:])
 
     def bind(self) -> "BoundLogDensity":
         """Make the log-density callable from one thread, with separate arrays."""
@@ -169,7 +180,7 @@ class LogDensity:
         if self._has_callback:
             first = [np.zeros((), np.int64) if self._leader is None else self._leader.address]
         each_seed = [seeds[i : i + 1].reshape(()) for i in range(seeds.size)]
-        return [position, *others, *first, *normals, *each_seed]
+        return [position, *each_seed, *others, *first, *normals]
 
     def _first_normals(self) -> list[np.ndarray]:
         """The stored normals; none if ranks divide the particles, as each draws its part."""
@@ -216,21 +227,27 @@ class BoundLogDensity:
 
 
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:
-    """Graph of a cheap log-density: another filter's likelihood, tempered.
-
-    The screen replaces the filter of every StateSpace variable, and the power is the exponent of
-    the likelihoods of these variables; other terms, as priors, have exponent 1.
+    """Graph of a cheap log-density: `tempered_density` with the screen for all filters.
 
     Raises
     ------
     ModelError
         If the filter does not support a system.
     """
-    names = state_space_nodes(model)
-    total = sum(
-        pt.sum(term) * (power if name in names else 1.0) for name, term in log_density_terms(model)
-    )
     try:
-        return with_filter([total], model, dict.fromkeys(names, screen))[0]
+        return tempered_density(model, dict.fromkeys(state_space_nodes(model), screen), power)
     except ModelError as error:
         raise ModelError(f"screen={screen!r}: {error}") from error
+
+
+def tempered_density(model: Model, filters: Mapping[str, Any], power: float) -> TensorVariable:
+    """Graph of a model's log-density with other filters, whose likelihoods are tempered.
+
+    ``filters`` are given by the names of StateSpace variables, and the power is the exponent of the
+    likelihoods of these variables; other terms, as priors, have exponent 1.
+    """
+    total = sum(
+        pt.sum(term) * (power if name in filters else 1.0)
+        for name, term in log_density_terms(model)
+    )
+    return with_filter([total], model, filters)[0]

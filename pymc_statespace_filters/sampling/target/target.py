@@ -14,18 +14,25 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.pymc_model.graph_rewrites import pilot_filters
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_nodes
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import RandomBlock
 from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
 from pymc_statespace_filters.sampling.target.leader_follower import check_group
-from pymc_statespace_filters.sampling.target.log_density import LogDensity, screening_density
+from pymc_statespace_filters.sampling.target.log_density import (
+    LogDensity,
+    screening_density,
+    tempered_density,
+)
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
 from pymc_statespace_filters.sampling.target.variables import (
     RaveledVariables,
     check_noise_dependencies,
     continuous_value_vars,
 )
+
+PILOT_POWER = 0.5
 
 
 class Growth(NamedTuple):
@@ -97,9 +104,10 @@ class Target:
             self.first_cov = self.prior_draws.covariance()
         else:
             self.first_cov = checked_proposal_cov(proposal_cov, self.raveled.dim)
-        shared = (model, variables, default, seeds, compile_kwargs)
+        self._model = model
+        self._shared = (model, variables, default, seeds, compile_kwargs)
         self.density = LogDensity(
-            *shared,
+            *self._shared,
             fixed_noise=not settings.refresh_noise,
             correlation=settings.correlation,
             graph=graph,
@@ -113,7 +121,15 @@ class Target:
                     "a model without one"
                 )
             graph = screening_density(model, settings.screen, settings.screen_power)
-            self.screen = LogDensity(*shared, fixed_noise=settings.screen.noisy, graph=graph)
+            self.screen = LogDensity(*self._shared, fixed_noise=settings.screen.noisy, graph=graph)
+
+    def pilot_density(self) -> LogDensity | None:
+        """Prior times the square root of an `EKF`'s likelihood, if the filters are expensive."""
+        filters = pilot_filters(self._model)
+        if not filters:
+            return None
+        graph = tempered_density(self._model, filters, PILOT_POWER)
+        return LogDensity(*self._shared, fixed_noise=True, graph=graph)
 
     @property
     def carries_noise(self) -> bool:

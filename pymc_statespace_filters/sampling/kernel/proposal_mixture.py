@@ -1,0 +1,145 @@
+"""Fit the mixture of the independence proposals to draws of all chains, and choose its share.
+
+The mixture is fitted to a population before warm-up, and to the later half of the draws of all
+chains after each quarter of it. The number of components is the one under which held-out draws are
+likeliest. The share of the iterations that make independence proposals follows the squared jumps
+that they and the random walk have made for each evaluation, so that a mixture that does not fit
+costs little.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from pymc_statespace_filters.sampling.kernel.independence import (
+    CUMULATIVE,
+    LOG_FACTOR,
+    MEAN,
+    MOST_COMPONENTS,
+    N_COMPONENTS,
+    SHARE,
+    no_mixture,
+    unpack_mixture,
+)
+from pymc_statespace_filters.sampling.kernel.state import (
+    INDEPENDENT,
+    N_EVALUATIONS,
+    N_SCREENED,
+    Draws,
+)
+from pymc_statespace_filters.student_mixture import (
+    DEGREES_OF_FREEDOM,
+    StudentMixture,
+    fit_mixture,
+    place_components,
+)
+
+FIRST_SHARE = 0.5  # of a mixture not tried yet
+LEAST_SHARE, MOST_SHARE = 0.2, 0.8  # the least while tuning, so that it goes on being tried
+NO_SHARE = 0.05  # a smaller one is not worth its evaluations after warm-up
+MIN_GAIN = 0.02  # nats per held-out draw, to accept a further component
+FEWEST = 10  # different draws for each dimension, to fit at all
+MOST_FITTED = 2000  # draws, more take long
+
+Array = NDArray[np.float64]
+
+
+def warmup_parts(tune: int) -> tuple[int, ...]:
+    """Iterations after which the chains wait for each other and get a new mixture; last, all."""
+    return tuple(sorted({tune // 4, tune // 2, 3 * tune // 4, tune} - {0}))
+
+
+def improved_mixture(
+    packed: Array,
+    chains: Sequence[Draws],
+    begin: int,
+    end: int,
+    tune: int,
+    rng: np.random.Generator,
+) -> Array:
+    """The mixture for the iterations from ``end`` on, given the one since ``begin``."""
+    dim = chains[0].positions.shape[1]
+    share = next_share(packed[SHARE], chains, begin, end)
+    if end < tune:
+        share = max(share, LEAST_SHARE)
+    parts = [draws.positions[end // 2 : end] for draws in chains]
+    fitted = fitted_mixture(parts, rng)
+    new = packed.copy() if fitted is None else fitted
+    has_mixture = unpack_mixture(new, dim).numbers[N_COMPONENTS] > 0
+    new[SHARE] = share if has_mixture else 0.0
+    return new
+
+
+def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> float:
+    """The share, by the squared jumps for each evaluation in some iterations.
+
+    They are a and b for the two kinds of proposals, in standard deviations of the draws; the share
+    is a^2 / (a^2 + b^2). If one kind was not tried, it is `FIRST_SHARE`.
+    """
+    first = max(begin, 1)
+    jumps = [np.diff(draws.positions[first - 1 : end], axis=0) for draws in chains]
+    scales = np.concatenate([draws.positions[first:end] for draws in chains]).var(axis=0)
+    moved = scales > 0
+    squared = np.concatenate([(jump[:, moved] ** 2 / scales[moved]).sum(axis=1) for jump in jumps])
+    counts = np.concatenate([draws.counts[first:end] for draws in chains])
+    free = counts[:, INDEPENDENT] > 0
+    cost = counts[:, N_EVALUATIONS] + counts[:, N_SCREENED]
+    if not cost[free].sum() or not cost[~free].sum():
+        return FIRST_SHARE if share == 0.0 else share
+    a = squared[free].sum() / cost[free].sum()
+    b = squared[~free].sum() / cost[~free].sum()
+    found = a**2 / (a**2 + b**2) if a > 0 else 0.0
+    return min(found, MOST_SHARE) if found >= NO_SHARE else 0.0
+
+
+def fitted_mixture(parts: Sequence[Array], rng: np.random.Generator) -> Array | None:
+    """A packed mixture fitted to draws (n, d) of several chains.
+
+    None if they are few, or do not vary in every direction.
+    """
+    step = -(-sum(map(len, parts)) // MOST_FITTED)
+    parts = [part[::-step] for part in parts if len(part)]
+    draws = np.concatenate(parts)
+    dim = draws.shape[1]
+    if len(np.unique(draws, axis=0)) < FEWEST * dim:
+        return None
+    mean, cov = draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
+    try:
+        chol = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return None
+    whitened = [(part - mean) @ np.linalg.inv(chol).T for part in parts]
+    mixture = _likeliest(whitened, rng).with_defensive_component().affine(mean, chol)
+    return _packed(mixture)
+
+
+def _likeliest(parts: Sequence[Array], rng: np.random.Generator) -> StudentMixture:
+    """Fit the first halves of the parts with more and more components, compare on the second."""
+    first = np.concatenate([part[: len(part) // 2] for part in parts])
+    second = np.concatenate([part[len(part) // 2 :] for part in parts])
+    best, most = place_components(first, 1, rng), -np.inf
+    for n_components in range(1, MOST_COMPONENTS):
+        fitted = fit_mixture(first, place_components(first, n_components, rng))
+        held_out = float(fitted.log_density(second).mean())
+        if held_out < most + MIN_GAIN:
+            break
+        best, most = fitted, held_out
+    return fit_mixture(np.concatenate(parts), best)
+
+
+def _packed(mixture: StudentMixture) -> Array:
+    n, dim = mixture.means.shape
+    log_det = np.log(np.diagonal(mixture.chols, axis1=1, axis2=2)).sum(axis=1)
+    nu = DEGREES_OF_FREEDOM
+    constant = gammaln((nu + dim) / 2) - gammaln(nu / 2) - 0.5 * dim * math.log(nu * math.pi)
+    packed = no_mixture(dim)
+    numbers, components = unpack_mixture(packed, dim)
+    numbers[SHARE], numbers[N_COMPONENTS] = FIRST_SHARE, n
+    components[:n, CUMULATIVE] = np.cumsum(mixture.weights)
+    components[:n, LOG_FACTOR] = np.log(mixture.weights) - log_det + constant
+    components[:n, MEAN : MEAN + dim] = mixture.means
+    components[:n, MEAN + dim :] = mixture.chols.reshape(n, -1)
+    return packed

@@ -1,0 +1,107 @@
+"""A population of points of a posterior, from which chains start and learn their proposals.
+
+Draws of the prior are annealed to the posterior. If the filters are expensive and an extended
+Kalman filter exists, it leads the way: the population is first annealed to the prior times the
+square root of its likelihood, and from there to the posterior, which takes fewer evaluations. The
+square root, because the two likelihoods may differ by many nats.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.progress import row_progress
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
+from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
+from pymc_statespace_filters.sampling.target.target import Target
+
+N_POINTS = 256
+_TYPICAL_EVALUATIONS = 9000  # for the progress bar
+_FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
+
+Array = NDArray[np.float64]
+# From points (m, d) to log-densities (m,) of the prior and of the posterior.
+Densities = Callable[[Array], tuple[Array, Array]]
+
+
+def find_population(target: Target, rng: np.random.Generator, *, progressbar: bool) -> Array:
+    """Points (m, d) distributed nearly as the posterior.
+
+    Raises
+    ------
+    ModelError
+        If no draw of the prior has a positive likelihood.
+    """
+    x = target.prior_draws.draws
+    pilot = target.pilot_density()
+    if pilot is not None:
+        rows = pilot.at_rows()
+        cheap = _densities(rows, target, rng)
+        with row_progress(rows, enabled=progressbar) as announce:
+            announce("Finding starts by a pilot", _TYPICAL_EVALUATIONS)
+            found = _annealed(x, _from_prior(cheap), rng)
+        pilot = None if found is None else pilot
+    rows = target.density.at_rows()
+    full = _densities(rows, target, rng)
+    with row_progress(rows, enabled=progressbar) as announce:
+        announce("Finding starts", _TYPICAL_EVALUATIONS if pilot is None else N_POINTS * 9)
+        if pilot is not None:
+            led = _annealed(found, _from_pilot(cheap, full), rng)
+            if led is not None:
+                return led
+        found = _annealed(x, _from_prior(full), rng, fewest=1)
+    if found is None:
+        raise ModelError(
+            f"the likelihood is zero at all of {len(x)} draws of the prior: narrow the priors to "
+            "plausible values"
+        )
+    return found
+
+
+def _annealed(
+    x: Array, log_densities: Densities, rng: np.random.Generator, fewest: int = _FEWEST
+) -> Array | None:
+    """The points led to the second distribution; None if it is positive at too few of them."""
+    population = Population(x, *log_densities(x))
+    if np.isfinite(population.log_ratio).sum() < fewest:
+        return None
+    return anneal(population, log_densities, N_POINTS, rng)
+
+
+def _densities(rows: ParallelMap, target: Target, rng: np.random.Generator) -> Densities:
+    """Log-densities of prior and posterior; an estimate gets new noise, unless it is fixed."""
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        seeds = draw_seeds(rng, (len(x), len(target.seed_names)))
+        if not target.settings.refresh_noise:
+            seeds = np.broadcast_to(target.fixed_seeds, seeds.shape)
+        posterior, prior = rows(x, *seeds.T)[:, :2].T
+        return _number(prior), _number(posterior)
+
+    return evaluate
+
+
+def _from_prior(densities: Densities) -> Densities:
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        prior, posterior = densities(x)
+        with np.errstate(invalid="ignore"):
+            return prior, _number(posterior - prior)
+
+    return evaluate
+
+
+def _from_pilot(cheap: Densities, full: Densities) -> Densities:
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        first, second = cheap(x)[1], full(x)[1]
+        with np.errstate(invalid="ignore"):
+            return first, _number(second - first)
+
+    return evaluate
+
+
+def _number(values: Array) -> Array:
+    """The values, with minus infinity for NaN and plus infinity."""
+    return np.where(values < np.inf, values, -np.inf)

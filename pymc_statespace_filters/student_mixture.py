@@ -1,0 +1,110 @@
+"""Mixtures of multivariate Student-t distributions fitted to draws.
+
+The tails are heavier than those of most posteriors, as the density of an importance sample or of an
+independence proposal needs. A mixture is fitted by expectation-maximisation with fixed degrees of
+freedom (Peel and McLachlan 2000); the scale matrices are regularised towards the covariance of all
+draws, so that no component can shrink to a point. A wide defensive component bounds the weights in
+the tails (Hesterberg 1995).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+DEGREES_OF_FREEDOM = 5.0
+N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
+WIDE_WEIGHT, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StudentMixture:
+    """A mixture of J multivariate Student-t distributions in k dimensions."""
+
+    weights: Array  # (J,)
+    means: Array  # (J, k)
+    chols: Array  # (J, k, k), lower factors of the scale matrices
+
+    def log_density(self, x: Array) -> Array:
+        """Log-density at points x (m, k), shape (m,)."""
+        return np.asarray(logsumexp(self.log_joint(x), axis=0))
+
+    def log_joint(self, x: Array) -> Array:
+        """Log-density of each component times its weight at x (m, k), shape (J, m)."""
+        nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+        log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
+        constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
+        tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
+        return (np.log(self.weights) - log_det)[:, None] + constant - tail
+
+    def squared_distances(self, x: Array) -> Array:
+        """Squared Mahalanobis distances of x (m, k) from each component, shape (J, m)."""
+        z = np.linalg.inv(self.chols) @ np.swapaxes(x - self.means[:, None], 1, 2)
+        return np.asarray((z**2).sum(axis=1))
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw independent points, shape (count, k)."""
+        component = rng.choice(len(self.weights), size=count, p=self.weights)
+        normals = rng.standard_normal((count, self.means.shape[-1]))
+        spread = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        moves = np.einsum("mij,mj->mi", self.chols[component], normals)
+        return self.means[component] + spread[:, None] * moves
+
+    def with_defensive_component(self) -> "StudentMixture":
+        """Add a component wider than the standardised draws."""
+        k = self.means.shape[-1]
+        return StudentMixture(
+            np.append((1 - WIDE_WEIGHT) * self.weights, WIDE_WEIGHT),
+            np.concatenate([self.means, np.zeros((1, k))]),
+            np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
+        )
+
+    def affine(self, mean: Array, chol: Array) -> "StudentMixture":
+        """The distribution of mean + chol x."""
+        return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
+
+
+def place_components(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
+    """Place components at draws x (n, k) far from each other (k-means++ initialisation)."""
+    chosen = [x[rng.integers(len(x))]]
+    while len(chosen) < n_components:
+        nearest = np.min([((x - point) ** 2).sum(axis=1) for point in chosen], axis=0)
+        if not nearest.any():
+            break  # fewer distinct draws than components
+        chosen.append(x[rng.choice(len(x), p=nearest / nearest.sum())])
+    scale = np.eye(x.shape[-1]) * len(chosen) ** (-1 / x.shape[-1])
+    return StudentMixture(
+        np.full(len(chosen), 1 / len(chosen)), np.stack(chosen), np.tile(scale, (len(chosen), 1, 1))
+    )
+
+
+def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
+    """Fit to standardised draws x (n, k) by expectation-maximisation."""
+    reached = -np.inf
+    for _ in range(N_STEPS):
+        log_joint = mixture.log_joint(x)
+        log_density = logsumexp(log_joint, axis=0)
+        if log_density.mean() < reached + MIN_STEP:
+            break
+        reached = log_density.mean()
+        mixture = _m_step(mixture, x, np.exp(log_joint - log_density))
+    return mixture
+
+
+def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:
+    """Maximisation step of EM, given the responsibilities (J, n) of the components."""
+    nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+    # Draws in the tail of a component get little weight.
+    weighted = responsibilities * (nu + k) / (nu + mixture.squared_distances(x))
+    sizes = responsibilities.sum(axis=1)
+    means = (weighted @ x) / weighted.sum(axis=1, keepdims=True)
+    centred = x - means[:, None]
+    scatter = np.swapaxes(centred, 1, 2) @ (weighted[..., None] * centred)
+    # Regularise by k + 1 pseudo-draws of covariance one, that of all standardised draws.
+    scales = (scatter + (k + 1) * np.eye(k)) / (sizes + k + 1)[:, None, None]
+    weights = (sizes + 1) / (sizes + 1).sum()
+    return StudentMixture(weights, means, np.linalg.cholesky(scales))
