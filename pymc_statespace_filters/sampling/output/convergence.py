@@ -38,17 +38,20 @@ class Convergence(NamedTuple):
         )
 
 
-def convergence(chains: Sequence[np.ndarray]) -> Convergence | None:
+def convergence(chains: Sequence[np.ndarray], most_draws: int | None = None) -> Convergence | None:
     """Compute the diagnostics of chains, shape (n, d) each; None for fewer than four draws.
 
     Of chains of different lengths those are compared that Ctrl-C would return, cut to one length. A
-    single chain is compared with itself: R-hat is that of its two halves.
+    single chain is compared with itself: R-hat is that of its two halves. If they have more than
+    ``most_draws``, every second, third, ... draw is taken; the effective sample size is then a
+    little too small.
     """
     kept, n = most_iterations([len(positions) for positions in chains])
     if n < _FEWEST:
         return None
+    rows = slice(0, n, 1 if most_draws is None else -(-n // most_draws))
     elements = range(chains[0].shape[1])  # one by one, which takes the least memory
-    values = [_of_element(np.stack([chains[c][:n, i] for c in kept])) for i in elements]
+    values = [_of_element(np.stack([chains[c][rows, i] for c in kept])) for i in elements]
     return Convergence(*np.transpose(values))
 
 

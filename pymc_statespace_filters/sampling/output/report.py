@@ -1,10 +1,11 @@
 """The paragraph about a run that is logged at its end."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning, WarningType
+from pymc.stats.convergence import SamplerWarning
 
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
@@ -36,9 +37,8 @@ def closing_report(
     shortfalls: Sequence[Shortfall],
     found: Convergence | None,
     names: Sequence[str],
-    *,
-    level: str,
-) -> SamplerWarning:
+    until_ess: float | None,
+) -> str:
     """Describe a run in one paragraph, with what to do about it.
 
     ``statistics`` are those after the warm-up, by chain, ``names`` those of the elements of a
@@ -49,10 +49,9 @@ def closing_report(
         _acceptance(statistics),
         _failures(statistics),
         *(shortfall.described() + "." for shortfall in shortfalls),
-        _advice(statistics, shortfalls, found),
+        _advice(statistics, shortfalls, found, until_ess),
     ]
-    message = " ".join(sentence for sentence in sentences if sentence)
-    return SamplerWarning(WarningType.CONVERGENCE, message, level)
+    return " ".join(sentence for sentence in sentences if sentence)
 
 
 def until_ess_warning(
@@ -99,37 +98,42 @@ def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:
         for code, count in chain.failures:
             counts[code] = counts.get(code, 0) + count
     if not counts:
-        return f"None of {n_evaluations} evaluations failed."
+        return f"None of {n_evaluations} evaluations after the warm-up failed."
     by_count = sorted(counts.items(), key=lambda item: -item[1])
     reasons = "; ".join(f"{failure_reason(code)} ({count})" for code, count in by_count)
     n_failed = sum(counts.values())
-    return f"{n_failed} of {n_evaluations} evaluations failed and were rejected: {reasons}."
+    return (
+        f"{n_failed} of {n_evaluations} evaluations after the warm-up "
+        f"({_percent(n_failed / n_evaluations)} %) failed and were rejected: {reasons}."
+    )
 
 
 def _advice(
     statistics: Mapping[int, PhaseStatistics],
     shortfalls: Sequence[Shortfall],
     found: Convergence | None,
+    until_ess: float | None,
 ) -> str:
     if shortfalls:
         return (
-            "Start the chains in the posterior (initvals=psf.find_starts()), or tune longer: these "
-            "draws are not from one distribution."
+            "These draws are not from one distribution: start the chains in the posterior "
+            "(initvals=psf.find_starts()), or tune longer."
         )
     if min(chain.accept_rate for chain in statistics.values()) < MIN_ACCEPT_RATE:
         return (
-            "Tune longer, start elsewhere, give proposal_cov, or, if the likelihood is noisy, give "
-            "its filter more particles."
+            "Tune longer, start elsewhere (initvals), give proposal_cov, or, if the likelihood is "
+            "noisy, give its filter more particles."
         )
     if found is None:
         return ""
-    enough = _ENOUGH_PER_CHAIN * len(statistics)
+    enough = until_ess or _ENOUGH_PER_CHAIN * len(statistics)
     if found.reaches(enough):
         return "Nothing in these numbers speaks against the draws."
-    factor = max(2, int(np.ceil(enough / max(found.ess.min(), 1.0))))
+    how = f"until_ess={enough:g} does" if until_ess is None else "with a larger max_draws"
+    factor = max(2, math.ceil(enough / max(found.ess.min(), 1.0)))
     return (
-        f"Draw about {factor} times as many, or give until_ess={enough}; if R-hat stays above "
-        f"{MAX_RHAT}, tune longer or start elsewhere (psf.find_starts)."
+        f"Draw about {factor} times as many ({how}); if R-hat stays above {MAX_RHAT}, tune longer "
+        "or start elsewhere (psf.find_starts)."
     )
 
 

@@ -42,12 +42,10 @@ class ConvergenceDisplay:
         now = time.monotonic()
         self._next = now + max(_SECONDS, (now - began) / _SHARE)
 
-    def show(
-        self, model: int, task: ModelTask, running: Mapping[int, ChainTask] | None = None
-    ) -> None:
+    def show(self, model: int, task: ModelTask, running: Mapping[int, ChainTask]) -> None:
         """Show the diagnostics of a model, of its results and of chains that run here."""
         if not self._bars.shows_convergence:
             return
-        found = task.convergence(running)
+        found = task.convergence_so_far(running)
         if found is not None:
             self._bars.show_convergence(model, float(found.rhat.max()), float(found.ess.min()))

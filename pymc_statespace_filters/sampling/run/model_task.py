@@ -7,7 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning, log_warnings, run_convergence_checks
+from pymc.stats.convergence import (
+    SamplerWarning,
+    WarningType,
+    log_warnings,
+    run_convergence_checks,
+)
 from xarray import DataTree
 
 from pymc_statespace_filters.parallel.communicator import Communicator
@@ -37,6 +42,10 @@ from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
+
+# Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
+# takes a tenth of a second.
+_MOST_LIVE_DRAWS = 4000
 
 
 class ModelTask:
@@ -72,7 +81,7 @@ class ModelTask:
         self.n_iterations = request.n_iterations  # after which the chains end, for now
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the lengths of the chains that they are of.
-        self._convergence: tuple[dict[int, int], Convergence | None] = {}, None
+        self._convergence: tuple[list[int], Convergence | None] = [], None
         self._began = self._ended = 0.0
 
     @property
@@ -153,16 +162,24 @@ class ModelTask:
         self.n_iterations = request.tune + min(request.max_draws, draws + (draws + 1) // 2)
         return True
 
-    def convergence(self, running: Mapping[int, ChainTask] | None = None) -> Convergence | None:
-        """Diagnostics of the draws so far: of the results, and of chains that run here."""
+    def convergence(self) -> Convergence | None:
+        """Diagnostics of the results; computed once, as it takes long for many draws."""
+        positions = self._positions({})
+        lengths = [len(of_chain) for of_chain in positions]
+        if lengths != self._convergence[0]:
+            self._convergence = lengths, convergence(positions)
+        return self._convergence[1]
+
+    def convergence_so_far(self, running: Mapping[int, ChainTask]) -> Convergence | None:
+        """Diagnostics of the results and of chains that run here, from some of their draws."""
+        return convergence(self._positions(running), _MOST_LIVE_DRAWS)
+
+    def _positions(self, running: Mapping[int, ChainTask]) -> list[np.ndarray]:
+        """Draws after the warm-up of the chains that have results or run here."""
         tune = self.request.tune
         positions = {i: draws.positions[tune:] for i, (draws, _) in self._results.items()}
-        positions |= {i: chain.positions for i, chain in (running or {}).items()}
-        lengths = {i: len(of_chain) for i, of_chain in positions.items()}
-        if lengths != self._convergence[0]:
-            found = convergence([positions[i] for i in sorted(positions)]) if positions else None
-            self._convergence = lengths, found
-        return self._convergence[1]
+        positions |= {i: chain.positions for i, chain in running.items()}
+        return [positions[i] for i in sorted(positions)]
 
     def load_missing_results(self) -> None:
         """Load chains that never ran from the checkpoint, as after an interruption."""
@@ -230,8 +247,8 @@ class ModelTask:
             n_draws = self.n_iterations - request.tune
             messages.append(until_ess_warning(until_ess, n_draws, found, names))
         below = shortfalls(draws, request.tune)
-        report = closing_report(statistics, request.tune, below, found, names, level=report_level)
-        return [*messages, report]
+        text = closing_report(statistics, request.tune, below, found, names, until_ess)
+        return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
 
     def _measure_noise(
         self, target: Target, results: Sequence[tuple[Draws, ChainState]]

@@ -151,7 +151,7 @@ class _Manager:
         task = self._tasks[model]
         task.add_result(chain, draws, state)
         if task.is_complete and not self._is_stopping:
-            self._display.show(model, task)
+            self._display.show(model, task, {})
             self._go_on_or_end(model, task)
 
     def _go_on_or_end(self, model: int, task: ModelTask) -> None:
