@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from pymc.progress_bar import ProgressBarManager, create_simple_progress
 from pymc.progress_bar.rich_progress import RichProgressBackend
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
 from rich.theme import Theme
@@ -79,18 +79,26 @@ class ChainProgress(ProgressBarManager):
     ):
         super().__init__(n_chains, progressbar, theme)
         chains_per_bar = n_chains if self.combined_progress else 1
-        self._total, self._tune = chains_per_bar * (draws + tune), chains_per_bar * tune
+        self._tune = chains_per_bar * tune
+        self._totals = [draws + tune] * n_chains
         self._done = [0] * n_chains
+        self._convergence: dict[int, tuple[float, float]] = {}
         columns, stats = step_columns(n_chains)
         columns.append(_column("failed", "Fails", "d"))
         stats |= {"failed": [0] * n_chains, "draw": [0] * n_chains}
         stats["marker_pos"] = [self._tune] * n_chains
-        self._backend = self._create_backend(self._total, columns, stats)
+        self._backend = self._create_backend(self._total_of(0), columns, stats)
         if isinstance(self._backend, RichProgressBackend):
             # PyMC gives each column a fraction of the terminal's width, and cuts its text to it:
             # let the bar alone take what the texts leave.
             for column in self._backend._progress.columns[1:]:
                 column.get_table_column().ratio = None
+            self._add_last_line(self._backend._progress)
+
+    @property
+    def shows_convergence(self) -> bool:
+        """Whether the line of `show_convergence` is drawn."""
+        return self._show_progress and self.full_stats
 
     def begin(self, chain: int) -> None:
         """Start the clock of a chain; without this it starts at the first update."""
@@ -110,6 +118,7 @@ class ChainProgress(ProgressBarManager):
             How long the chain has run, once it has ended: PyMC's bar has no speed for what took
             less than a quarter of a second.
         """
+        done = min(done, self._totals[chain])  # of a checkpoint there may be more
         advance = done - self._done[chain]
         if not self._show_progress or advance <= 0:
             return
@@ -117,10 +126,39 @@ class ChainProgress(ProgressBarManager):
         count = sum(self._done) if self.combined_progress else done
         shown = stat_values(stats) | {"draw": count if count <= self._tune else count - self._tune}
         self._advance(chain, advance, shown)
-        if count == self._total:
+        if count == self._total_of(chain):
             if seconds > 0.0 and not self.combined_progress:
                 shown |= {"sampling_speed": done / seconds, "speed_unit": "draws/s"}
             self._advance(chain, 0, shown, is_last=True)
+
+    def extend(self, chain: int, total: int) -> None:
+        """Set the number of iterations of a chain that goes on after its end."""
+        self._totals[chain] = total
+        self._advance(chain, 0, {"failing": False})
+
+    def show_convergence(self, model: int, rhat: float, ess: float) -> None:
+        """Show a model's largest R-hat and smallest effective sample size: the worst of all models.
+
+        They belong to no single chain, so they are in a line below the bars.
+        """
+        self._convergence[model] = rhat, ess
+
+    def _add_last_line(self, progress: Any) -> None:
+        """Have rich draw a line below its table."""
+        tables = progress.get_renderables
+
+        def renderables() -> Iterator[RenderableType]:
+            yield from tables()
+            if self._convergence:
+                rhats, sizes = zip(*self._convergence.values(), strict=True)
+                text = f"largest R-hat {max(rhats):.2f}, smallest effective sample size "
+                yield f"  {text}{min(sizes):.0f}"
+
+        progress.get_renderables = renderables
+
+    def _total_of(self, chain: int) -> int:
+        """Iterations that the bar of a chain counts."""
+        return sum(self._totals) if self.combined_progress else self._totals[chain]
 
     def _advance(
         self, chain: int, advance: int, shown: dict[str, Any], is_last: bool = False
@@ -131,7 +169,7 @@ class ChainProgress(ProgressBarManager):
             failing=shown.pop("failing", False),
             stats=shown,
             is_last=is_last,
-            total=self._total,
+            total=self._total_of(chain),
         )
 
 

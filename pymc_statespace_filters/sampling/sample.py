@@ -32,6 +32,8 @@ def sample_dram(
     draws: int = 1000,
     tune: int = 1000,
     *,
+    until_ess: float | None = None,
+    max_draws: int | None = None,
     chains: int = 4,
     cores: int | None = None,
     model: Model | None = None,
@@ -57,6 +59,14 @@ def sample_dram(
     draws, tune : int
         Iterations of each chain that are kept, and of the warm-up before them, during which the
         proposals are adapted.
+    until_ess : float, optional
+        Go on until the bulk effective sample size of every parameter, over all chains, is at least
+        this and no R-hat is above 1.01. This is checked after ``draws`` iterations, and then
+        whenever there are half as many again. All chains end with the same number of draws, which
+        depends on the draws alone. Default: stop after ``draws``.
+    max_draws : int, optional
+        With ``until_ess``, the most draws of each chain, after which a warning says what was
+        reached. Default: 20 times ``draws``.
     chains : int
     cores : int, optional
         Threads on each rank. Default: the number of available processors, at most the number of
@@ -75,7 +85,11 @@ def sample_dram(
         pilot has missed is missed again. With ``checkpoint`` the pilot must be the same in each
         call; with ``comm`` all ranks pass it (``gather="all"``).
     progressbar : bool or str
-        As in ``pm.sample``.
+        As in ``pm.sample``. Beside what that shows, the largest R-hat and the smallest bulk
+        effective sample size so far, computed every two seconds, or as often as takes 1 % of the
+        time; with ``comm``, of the chains that run on rank 0 and those that have ended. Unless it
+        is False, a report on the run is logged at its end at level INFO, by the logger
+        "pymc.stats.convergence"; otherwise at level DEBUG.
     discard_tuned_samples : bool
         Whether to leave out the warm-up; otherwise it is in the groups ``warmup_posterior`` and
         ``warmup_sample_stats``.
@@ -136,7 +150,15 @@ def sample_dram(
     if not isinstance(model, Model):
         raise ModelError(f"model must be a pymc.Model, got {model!r}")
     request = sampling_request(
-        draws, tune, chains, random_seed, initvals, not discard_tuned_samples, dram_settings
+        draws,
+        tune,
+        chains,
+        random_seed,
+        initvals,
+        not discard_tuned_samples,
+        until_ess,
+        max_draws,
+        dram_settings,
     )
     if pilot is not None:
         adapts = not dram_settings.keys().isdisjoint({"adapt_every", "adaptation"})
@@ -165,6 +187,8 @@ def run_models(
     *,
     draws: int = 1000,
     tune: int = 1000,
+    until_ess: float | None = None,
+    max_draws: int | None = None,
     chains: int = 4,
     cores: int | None = None,
     random_seed: int | np.random.Generator | None = None,
@@ -186,9 +210,9 @@ def run_models(
     Parameters
     ----------
     models : mapping of str to pymc.Model
-    draws, tune, chains, cores, random_seed, initvals
+    draws, tune, until_ess, max_draws, chains, cores, random_seed, initvals
         As in `sample_dram`, for every model. A model's draws are those of `sample_dram` with the
-        same seed and do not depend on the other models.
+        same seed and do not depend on the other models; with ``until_ess`` each stops on its own.
     progressbar, discard_tuned_samples, compute_convergence_checks
         As in `sample_dram`.
     checkpoint : str or path, optional
@@ -232,7 +256,15 @@ def run_models(
         if not isinstance(model, Model):
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
     request = sampling_request(
-        draws, tune, chains, random_seed, initvals, not discard_tuned_samples, dram_settings
+        draws,
+        tune,
+        chains,
+        random_seed,
+        initvals,
+        not discard_tuned_samples,
+        until_ess,
+        max_draws,
+        dram_settings,
     )
     options = ExecutionOptions(
         cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather

@@ -7,6 +7,8 @@ from tests.mpi.launch import on_ranks
 from tests.sampling.test_sample_dram import state_space_model
 
 FILTERS = {"exact": [psf.EKF()], "noisy": [psf.BootstrapPF(20), psf.EKF()]}
+# Runs of one length, and runs that go on: the first model for longer.
+RULES = {"one round": {}, "rounds": {"until_ess": 400, "max_draws": 4000}}
 
 
 def draws_of_all(**settings):
@@ -35,16 +37,20 @@ def by_sizes(comm):
     sizes = {}
     for size in (2, 4):
         part = comm.Split(comm.rank // size)
-        sizes[size] = draws_of_all(comm=part, gather="all", cores=1)
+        for rule, settings in RULES.items():
+            sizes[size, rule] = draws_of_all(comm=part, gather="all", cores=1, **settings)
         part.Free()
     return sizes
 
 
 def test_draws_are_bitwise_equal_on_any_number_of_ranks():
-    expected = draws_of_all()
-    assert {"d0_seed", "phi"} <= {name for _, _, name in expected}
+    by_rule = {rule: draws_of_all(**settings) for rule, settings in RULES.items()}
+    assert {"d0_seed", "phi"} <= {name for _, _, name in by_rule["one round"]}
+    lengths = [by_rule["rounds"][model, "posterior", "phi"].shape[1] for model in FILTERS]
+    assert 150 < lengths[1] < lengths[0]
     for rank, sizes in enumerate(on_ranks(4, by_sizes)):
-        for size, found in sizes.items():
+        for (size, rule), found in sizes.items():
+            expected = by_rule[rule]
             assert found.keys() == expected.keys()
             for what, values in found.items():
                 np.testing.assert_array_equal(values, expected[what], f"{rank} {size} {what}")

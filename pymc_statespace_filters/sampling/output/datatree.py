@@ -68,7 +68,7 @@ def to_datatree(
     """
     skipped = 0 if keep_warmup else tune
     lengths = [len(positions) for positions, _ in chains]
-    longest, length = _most_iterations([length - skipped for length in lengths])
+    longest, length = most_iterations([length - skipped for length in lengths])
     if length <= 0:
         raise ModelError(
             f"the chains ended after {', '.join(map(str, lengths))} iterations, of which {tune} "
@@ -148,7 +148,7 @@ class _ChainTrace(IBaseTrace):
         return {name: array[idx] for name, array in self._values.items()}
 
 
-def _most_iterations(lengths: Sequence[int]) -> tuple[list[int], int]:
+def most_iterations(lengths: Sequence[int]) -> tuple[list[int], int]:
     """Choose chains and a common length that keep the most iterations, as ``pm.sample`` does."""
     by_length = sorted(range(len(lengths)), key=lambda i: -lengths[i])
     together = [(rank + 1) * lengths[i] for rank, i in enumerate(by_length)]

@@ -1,5 +1,6 @@
 """Statistics of a phase of a chain, and the warning about them when the chain ends."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
+    LOG_DENSITY,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
@@ -33,6 +35,10 @@ LONG_DWELL, LEAST_DWELL = 0.2, 100
 # Factor by which the proposals may be wider than the draws from the prior. With a proper prior they
 # are narrower; under a flat one draws around the model's initial point replace its draws.
 TOLERATED_GROWTH = 1e3
+
+# Nats, plus one for each dimension, by which the median log-density of a chain may lie below that
+# of another: the log-density of a Gaussian posterior has a standard deviation of (d / 2)^(1 / 2).
+TOLERATED_SHORTFALL = 10.0
 
 # Fraction of the draws whose particles may have collapsed: a rare surprise only costs mixing.
 TOLERATED_COLLAPSES = 0.5
@@ -114,6 +120,44 @@ def closing_warning(
         _mobility_problem(statistics) or _growth_problem(growth) or _failure_problem(statistics)
     )
     return None if message is None else sampler_warning(message)
+
+
+class Shortfall(NamedTuple):
+    """A chain whose log-density stayed far below that of the highest chain."""
+
+    chain: int
+    highest: int  # number of the highest chain
+    nats: float  # difference of their medians
+
+    def described(self) -> str:
+        """Name both chains and the difference."""
+        return (
+            f"Chain {self.chain} stayed {self.nats:.0f} nats below chain {self.highest} (median "
+            "log-density)"
+        )
+
+    def warning(self) -> SamplerWarning:
+        """Warn of the chain."""
+        return sampler_warning(
+            f"Chain {self.chain}: its log-density stayed {self.nats:.0f} nats below that of chain "
+            f"{self.highest} (median): it is in a lower mode, or has not yet left its start. Start "
+            "it in the posterior (initvals, psf.find_starts) or tune longer."
+        )
+
+
+def shortfalls(chains: Sequence[Draws], tune: int) -> list[Shortfall]:
+    """Find the chains that stayed far below the highest one after the warm-up."""
+    levels = {
+        i: float(np.median(draws.numbers[tune:, LOG_DENSITY]))
+        for i, draws in enumerate(chains)
+        if len(draws.positions) > tune
+    }
+    if not levels:
+        return []
+    highest = max(levels, key=lambda i: levels[i])
+    tolerated = TOLERATED_SHORTFALL + chains[0].positions.shape[1]
+    below = {i: levels[highest] - level for i, level in levels.items()}
+    return [Shortfall(i, highest, nats) for i, nats in below.items() if nats > tolerated]
 
 
 def sampler_warning(message: str) -> SamplerWarning:

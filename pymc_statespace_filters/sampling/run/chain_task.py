@@ -43,10 +43,13 @@ class ChainTask:
     target : Target
         Prepared.
     tune, draws : int
+        Iterations after which the chain ends; `extend` gives it more draws.
     candidates : callable
         From the chain's generator to the candidates for its start.
     seed : numpy.random.SeedSequence
         The chain's randomness.
+    max_draws : int, optional
+        Draws that it may have after `extend`. Default: ``draws``.
     index : int
         Number of the chain.
     name : str, optional
@@ -65,6 +68,7 @@ class ChainTask:
         candidates: Candidates,
         seed: np.random.SeedSequence,
         *,
+        max_draws: int | None = None,
         index: int = 0,
         name: str | None = None,
         checkpoint: Checkpoint | None = None,
@@ -76,11 +80,14 @@ class ChainTask:
         self._index, self._name = index, name or f"chain {index}"
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0
-        self.chain = Chain(target, draw_key(self._rng), self._n_iterations, n_covs)
+        # Pages of these arrays that are never written to take no memory.
+        n_rows = tune + (draws if max_draws is None else max_draws)
+        self.chain = Chain(target, draw_key(self._rng), n_rows, n_covs)
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             self.chain.restore(*stored)
         self._n_saved = self.n_done
+        self._is_resumed = self.n_done > 0
         self._saved_at = time.monotonic()
         self.seconds = 0.0  # duration of a finished chain; 0 if it was resumed from a checkpoint
         self._start_warning: SamplerWarning | None = None
@@ -90,6 +97,15 @@ class ChainTask:
         """Iterations made so far."""
         return int(self.chain.control[N_DONE])
 
+    @property
+    def positions(self) -> np.ndarray:
+        """Draws made so far, after the warm-up, shape (n, d)."""
+        return self.chain.draws.positions[self._tune : min(self.n_done, self._n_iterations)]
+
+    def extend(self, n_iterations: int) -> None:
+        """Let the chain, which has ended, run again, until it has made so many iterations."""
+        self._n_iterations = n_iterations
+
     def request_pause(self, stop: Event) -> None:
         """Have the chain return to Python if it is to stop or to be saved."""
         if stop.is_set() or self._must_save():
@@ -97,9 +113,9 @@ class ChainTask:
 
     def run(self, stop: Event) -> None:
         """Run to the end, or until the event is set."""
-        began, resumed = time.monotonic(), self.n_done > 0
+        began = time.monotonic()
         try:
-            failures = () if resumed else self._start()
+            failures = () if self.n_done > 0 else self._start()
             while self.n_done < self._n_iterations and not stop.is_set():
                 self.chain.control[PAUSE_REQUESTED] = 0  # the main thread repeats its request
                 self._advance()
@@ -110,7 +126,7 @@ class ChainTask:
                 if self._must_save():
                     self._save()
             self._save()
-            self.seconds = 0.0 if resumed else time.monotonic() - began
+            self.seconds = 0.0 if self._is_resumed else self.seconds + time.monotonic() - began
         except StopRequested:
             return
         except Exception as error:
@@ -118,8 +134,11 @@ class ChainTask:
             raise
 
     def result(self) -> tuple[Draws, ChainState]:
-        """Draws of the iterations made, and the state after them; the machine code is released."""
-        done = self.n_done
+        """Draws of the iterations made, and the state after them, without the machine code.
+
+        A chain from a checkpoint may be longer than it has to be so far: it is cut.
+        """
+        done = min(self.n_done, self._n_iterations)
         draws = {
             name: array if name == "covs" else array[:done]
             for name, array in self.chain.draws._asdict().items()
@@ -168,4 +187,5 @@ class ChainTask:
         if self._log is not None and self.n_done > self._n_saved:
             self._log.append(*self.chain.snapshot(self._n_saved))
             self._n_saved = self.n_done
+        self._is_resumed = self.n_done > 0
         self._saved_at = time.monotonic()

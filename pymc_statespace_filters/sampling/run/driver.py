@@ -99,7 +99,12 @@ def _run(
         if comm.rank > 0:
             return None
         check = options.compute_convergence_checks
-        return {task.name: task.to_datatree(check_convergence=check) for task in tasks}
+        # Who wants no progress bar wants no report on the screen either.
+        level = "info" if options.progressbar else "debug"
+        return {
+            task.name: task.to_datatree(check_convergence=check, report_level=level)
+            for task in tasks
+        }
 
     return comm.run_collectively(trees) if options.gather == "all" else trees()
 

@@ -1,26 +1,41 @@
 """All chains of one model: their starts, their results, and the DataTree made of them."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning, log_warnings, run_convergence_checks
+from pymc.stats.convergence import (
+    SamplerWarning,
+    WarningType,
+    log_warnings,
+    run_convergence_checks,
+)
 from xarray import DataTree
 
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
+from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
 from pymc_statespace_filters.sampling.output.datatree import to_datatree
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     is_measured,
     spread_at_highest_draw,
 )
+from pymc_statespace_filters.sampling.output.report import (
+    closing_report,
+    element_names,
+    until_ess_warning,
+)
 from pymc_statespace_filters.sampling.output.sample_stats import whole_chain
-from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
+from pymc_statespace_filters.sampling.output.warnings import (
+    PhaseStatistics,
+    closing_warning,
+    shortfalls,
+)
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
@@ -30,6 +45,9 @@ from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
 _STARTS = 2**32 - 1  # no chain has this number
+# Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
+# takes a tenth of a second.
+_MOST_LIVE_DRAWS = 4000
 
 
 class ModelTask:
@@ -63,7 +81,10 @@ class ModelTask:
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
         self._target: Target | None = None
+        self.n_iterations = request.n_iterations  # after which the chains end, for now
         self._results: dict[int, tuple[Draws, ChainState]] = {}
+        # The last diagnostics, and the lengths of the chains that they are of.
+        self._convergence: tuple[list[int], Convergence | None] = [], None
         self._began = self._ended = 0.0
 
     @property
@@ -97,9 +118,10 @@ class ModelTask:
         return ChainTask(
             target,
             request.tune,
-            request.draws,
+            self.n_iterations - request.tune,
             self._candidates[index],
             self._seeds[index],
+            max_draws=request.max_draws,
             index=index,
             name=f"chain {index} of model {self.name!r}" if self.name else None,
             checkpoint=self.checkpoint,
@@ -150,18 +172,55 @@ class ModelTask:
         self._results[index] = draws, state
         self._ended = time.monotonic()
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all chains have made ``n_iterations``."""
+        lengths = [len(draws.positions) for draws, _ in self._results.values()]
+        return lengths == [self.n_iterations] * self.request.chains
+
+    def extend(self) -> bool:
+        """Raise ``n_iterations`` by half the draws if complete chains are to go on."""
+        request = self.request
+        if request.until_ess is None or request.max_draws is None:
+            return False
+        found, draws = self.convergence(), self.n_iterations - request.tune
+        if draws >= request.max_draws or (found is not None and found.reaches(request.until_ess)):
+            return False
+        self.n_iterations = request.tune + min(request.max_draws, draws + (draws + 1) // 2)
+        return True
+
+    def convergence(self) -> Convergence | None:
+        """Diagnostics of the results; computed once, as it takes long for many draws."""
+        positions = self._positions({})
+        lengths = [len(of_chain) for of_chain in positions]
+        if lengths != self._convergence[0]:
+            self._convergence = lengths, convergence(positions)
+        return self._convergence[1]
+
+    def convergence_so_far(self, running: Mapping[int, ChainTask]) -> Convergence | None:
+        """Diagnostics of the results and of chains that run here, from some of their draws."""
+        return convergence(self._positions(running), _MOST_LIVE_DRAWS)
+
+    def _positions(self, running: Mapping[int, ChainTask]) -> list[np.ndarray]:
+        """Draws after the warm-up of the chains that have results or run here."""
+        tune = self.request.tune
+        positions = {i: draws.positions[tune:] for i, (draws, _) in self._results.items()}
+        positions |= {i: chain.positions for i, chain in running.items()}
+        return [positions[i] for i in sorted(positions)]
+
     def load_missing_results(self) -> None:
         """Load chains that never ran from the checkpoint, as after an interruption."""
         for index in set(range(self.request.chains)) - set(self._results):
             self._results[index] = self.chain_task(index).result()
 
-    def to_datatree(self, *, check_convergence: bool) -> DataTree:
-        """Make the DataTree of the results of all chains, and log warnings about them.
+    def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
+        """Make the DataTree of the results of all chains, log warnings and a report about them.
 
         Results are released one by one, so that the draws are in memory twice, but never three
         times.
         """
         target, request = self.prepare(), self.request
+        closing = self._closing_messages(check_convergence, report_level)
         results = [self._results.pop(index) for index in range(self.request.chains)]
         warnings = _chain_warnings(target, results, request.tune)
         attrs, noise_warnings = self._measure_noise(target, results)
@@ -189,10 +248,34 @@ class ModelTask:
                 np.errstate(invalid="ignore", divide="ignore"),  # chains that never moved
             ):
                 warnings += run_convergence_checks(tree, self.model)
+        warnings += closing
         if self.name:
             warnings = [replace(w, message=f"Model {self.name!r}: {w.message}") for w in warnings]
         log_warnings(warnings)
         return tree
+
+    def _closing_messages(self, check_convergence: bool, report_level: str) -> list[SamplerWarning]:
+        """The report, and a warning if ``max_draws`` ended the run."""
+        request, names = self.request, element_names(self.model, self.prepare().raveled)
+        draws = [self._results[i][0] for i in range(request.chains)]
+        statistics = {
+            i: PhaseStatistics.from_draws(of_chain, request.tune, len(of_chain.positions))
+            for i, of_chain in enumerate(draws)
+            if len(of_chain.positions) > request.tune
+        }
+        if not statistics:
+            return []
+        found, until_ess, messages = None, request.until_ess, []
+        with suppress(KeyboardInterrupt):
+            if check_convergence or until_ess is not None:
+                found = self.convergence()
+        reached = found is not None and until_ess is not None and found.reaches(until_ess)
+        if until_ess is not None and self.is_complete and not reached:
+            n_draws = self.n_iterations - request.tune
+            messages.append(until_ess_warning(until_ess, n_draws, found, names))
+        below = shortfalls(draws, request.tune)
+        text = closing_report(statistics, request.tune, below, found, names, until_ess)
+        return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
 
     def _measure_noise(
         self, target: Target, results: Sequence[tuple[Draws, ChainState]]
@@ -200,7 +283,7 @@ class ModelTask:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request = self.request
         lengths = {len(draws.positions) for draws, _ in results}
-        if self._measures_noise and lengths == {request.n_iterations}:
+        if self._measures_noise and lengths == {self.n_iterations}:
             with suppress(KeyboardInterrupt):
                 keys = [state.key for _, state in results]
                 spread, warning = spread_at_highest_draw(
@@ -217,7 +300,8 @@ class ModelTask:
 def _chain_warnings(
     target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
 ) -> list[SamplerWarning]:
-    """Warnings about single chains."""
+    """Warnings about single chains, at most one for each."""
+    below = {shortfall.chain: shortfall for shortfall in shortfalls([d for d, _ in results], tune)}
     warnings = []
     for i, (draws, state) in enumerate(results):
         statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
@@ -225,4 +309,6 @@ def _chain_warnings(
             warning = closing_warning(statistics, target.growth(state.proposal_cov))
             if warning is not None:
                 warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
+            elif i in below:
+                warnings.append(below[i].warning())
     return warnings

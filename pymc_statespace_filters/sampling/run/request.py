@@ -19,9 +19,10 @@ from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     model_fingerprint,
 )
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.system.checks import check_count, is_integer
+from pymc_statespace_filters.system.checks import check_count, check_positive, is_integer
 
 _GATHER = ("root", "all")
+_MAX_GROWTH = 20  # default of max_draws, in draws
 _FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
 
 
@@ -37,10 +38,12 @@ class SamplingRequest(NamedTuple):
     keeps_warmup: bool
     proposal_cov: Any
     settings: DRAMSettings
+    until_ess: float | None = None
+    max_draws: int | None = None  # a number if until_ess is
 
     @property
     def n_iterations(self) -> int:
-        """Iterations of a chain, warm-up included."""
+        """Iterations of a chain, warm-up included; the fewest with ``until_ess``."""
         return self.tune + self.draws
 
     def cache_key(self, model: Model, *, require_fingerprint: bool = True) -> dict[str, Any]:
@@ -63,6 +66,8 @@ class SamplingRequest(NamedTuple):
             "initvals": _json_value(self.initvals),
             "proposal_cov": _json_value(self.proposal_cov),
             "draws": int(self.draws),
+            "until_ess": self.until_ess,
+            "max_draws": self.max_draws,
             "tune": int(self.tune),
             "chains": int(self.chains),
             "discard_tuned_samples": not self.keeps_warmup,
@@ -103,6 +108,8 @@ def sampling_request(
     random_seed: Any,
     initvals: Any,
     keeps_warmup: bool,
+    until_ess: Any,
+    max_draws: Any,
     dram_settings: Mapping[str, Any],
 ) -> SamplingRequest:
     """Check the arguments of ``sample_dram`` that need no model, and make a request of them.
@@ -134,7 +141,30 @@ def sampling_request(
         keeps_warmup,
         proposal_cov,
         DRAMSettings.from_arguments(settings),
+        *_stopping_rule(draws, until_ess, max_draws),
     )
+
+
+def _stopping_rule(
+    draws: int, until_ess: Any, max_draws: Any
+) -> tuple[float, int] | tuple[None, None]:
+    """Check ``until_ess`` and ``max_draws``, and fill in the default of the latter."""
+    if until_ess is None:
+        if max_draws is not None:
+            raise ModelError(
+                f"max_draws needs until_ess, got max_draws={max_draws!r} alone; without until_ess "
+                "each chain makes as many draws as draws says"
+            )
+        return None, None
+    until_ess = check_positive("until_ess", until_ess)
+    check_count("draws with until_ess", draws, 1)
+    if max_draws is None:
+        return until_ess, _MAX_GROWTH * int(draws)
+    if not is_integer(max_draws) or max_draws < draws:
+        raise ModelError(
+            f"max_draws must be an integer of at least draws={draws}, got {max_draws!r}"
+        )
+    return until_ess, int(max_draws)
 
 
 def _entropy(random_seed: object) -> list[int]:

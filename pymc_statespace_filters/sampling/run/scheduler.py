@@ -4,6 +4,9 @@ All messages go between rank 0 and one other rank, from the main thread of each;
 threads and send nothing. A chain's draws depend on its model and number alone, not on the rank that
 runs it.
 
+With ``until_ess`` chains end more than once: rank 0 waits for all chains of a model, and lets them
+go on, each on the rank where it ran, or ends the model. What it decides depends on the draws alone.
+
 The last message of rank 0 says that the run is over, and no rank leaves before it. So every rank
 learns of an error on any other, and no message is left for the next user of the communicator.
 Interrupts are handled by rank 0.
@@ -13,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 
@@ -26,13 +30,14 @@ from pymc_statespace_filters.parallel.signals import deferred_interrupts, ignore
 from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from pymc_statespace_filters.sampling.run.convergence_display import ConvergenceDisplay
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 
 # Kinds of messages: to rank 0, ...
 _IDLE, _PROGRESS, _RESULT, _FAILED, _LEAVING = "idle", "progress", "result", "failed", "leaving"
 # ... and from it.
-_CHAIN, _NO_MORE, _STOP, _OVER = "chain", "no more", "stop", "over"
+_CHAIN, _GO_ON, _NO_MORE, _STOP, _OVER = "chain", "go on", "no more", "stop", "over"
 
 _ALONE_SECONDS = 0.1
 _LISTENING_SECONDS = 0.02
@@ -83,6 +88,11 @@ def _chain_task(tasks: Sequence[ModelTask], number: int) -> ChainTask:
     return tasks[model].chain_task(chain)
 
 
+def _may_go_on(tasks: Sequence[ModelTask]) -> bool:
+    """Whether chains that have ended are kept, to make more draws."""
+    return tasks[0].request.until_ess is not None
+
+
 class _Manager:
     """Rank 0."""
 
@@ -97,6 +107,8 @@ class _Manager:
         self._n_per_model = tasks[0].request.chains
         costs = [task.cost() if len(tasks) > 1 else 0.0 for task in tasks]
         self._n_unfinished = self._n_per_model * len(tasks)
+        self._is_stopping = False
+        self._rank_of: dict[int, int] = {}  # other ranks, by the chains that ended there
         # The longest first, so that none runs alone at the end.
         self._schedule = deque(
             sorted(range(self._n_unfinished), key=lambda i: -costs[i // self._n_per_model])
@@ -104,6 +116,7 @@ class _Manager:
         self._workers = set(range(1, comm.size))
         request = tasks[0].request
         self._bars = ChainProgress(self._n_unfinished, request.draws, request.tune, progressbar)
+        self._display = ConvergenceDisplay(self._bars, self._n_per_model)
 
     def run(self) -> None:
         """Run all chains, on this rank and the others."""
@@ -111,6 +124,7 @@ class _Manager:
             with self._bars, suppress(KeyboardInterrupt):
                 while self._n_unfinished and not interrupted.is_set():
                     self._continue()
+            self._is_stopping = True
             self._pool.stop()
             for number, task in self._pool.running.items():
                 self._add_result(number, *task.result())
@@ -134,8 +148,26 @@ class _Manager:
 
     def _add_result(self, number: int, draws: Draws, state: ChainState) -> None:
         model, chain = divmod(number, self._n_per_model)
-        self._tasks[model].add_result(chain, draws, state)
-        self._n_unfinished -= 1
+        task = self._tasks[model]
+        task.add_result(chain, draws, state)
+        if task.is_complete and not self._is_stopping:
+            self._display.show(model, task, {})
+            self._go_on_or_end(model, task)
+
+    def _go_on_or_end(self, model: int, task: ModelTask) -> None:
+        """Let all chains of a model make more draws, or none of them."""
+        n_iterations = task.n_iterations if task.extend() else None
+        if n_iterations is None:
+            self._n_unfinished -= self._n_per_model
+        if not _may_go_on(self._tasks):
+            return
+        for number in range(model * self._n_per_model, (model + 1) * self._n_per_model):
+            if n_iterations is not None:
+                self._bars.extend(number, n_iterations)
+            if number in self._rank_of:
+                self._comm.send(self._rank_of[number], _GO_ON, (number, n_iterations))
+            else:
+                self._pool.go_on(number, n_iterations)
 
     def _continue(self) -> None:
         while self._pool.is_idle and (number := self._next()) is not None:
@@ -143,9 +175,12 @@ class _Manager:
         seconds = _LISTENING_SECONDS if self._workers else _ALONE_SECONDS
         for number, task in self._pool.finished(seconds):
             self._show(number, task)
+            if _may_go_on(self._tasks):
+                self._pool.ended[number] = task
             self._add_result(number, *task.result())
         for number, task in self._pool.running.items():
             self._show(number, task)
+        self._display.refresh(self._tasks, self._pool.running)
         self._receive()
 
     def _show(self, number: int, task: ChainTask) -> None:
@@ -166,6 +201,7 @@ class _Manager:
                 number, layout, state = value
                 draws = Draws(**{name: np.empty(*of_array) for name, of_array in layout.items()})
                 self._comm.receive_arrays(source, draws)
+                self._rank_of[number] = source
                 self._add_result(number, draws, state)
             elif kind == _LEAVING:
                 self._workers.discard(source)
@@ -194,7 +230,8 @@ class _Worker:
         try:
             while not self._is_over:
                 self._continue()
-                if not (self._expects_more or self._pool.running or self._has_left):
+                has_chains = self._pool.running or self._pool.ended
+                if not (self._expects_more or has_chains or self._has_left):
                     self._comm.send(0, _LEAVING)
                     self._has_left = True
         except _StoppedByOthers as stopped:
@@ -215,16 +252,20 @@ class _Worker:
         for number, task in self._pool.finished(_LISTENING_SECONDS):
             self._report({number: task})
             self._send_result(number, task)
+            if _may_go_on(self._tasks):
+                self._pool.ended[number] = task
         if time.monotonic() - self._reported_at > _PROGRESS_SECONDS:
             self._report(self._pool.running)
             self._reported_at = time.monotonic()
         while (message := self._comm.receive()) is not None:
             self._handle(message.kind, message.value)
 
-    def _handle(self, kind: str, value: int | str | None) -> None:
-        if kind == _CHAIN and isinstance(value, int):
+    def _handle(self, kind: str, value: Any) -> None:
+        if kind == _CHAIN:
             self._has_asked = False
             self._pool.start(value, _chain_task(self._tasks, value))
+        elif kind == _GO_ON:
+            self._pool.go_on(*value)
         elif kind == _NO_MORE:
             self._expects_more = False
         elif kind == _OVER and isinstance(value, str):
@@ -234,6 +275,7 @@ class _Worker:
         elif kind == _STOP:  # the user has interrupted
             self._expects_more = False
             self._pool.stop()
+            self._pool.ended.clear()
             while self._pool.running:
                 self._send_result(*self._pool.running.popitem())
 

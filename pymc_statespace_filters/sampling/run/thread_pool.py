@@ -16,7 +16,8 @@ class ChainPool:
     """Threads that run chains; a context manager that stops them all on exit.
 
     All methods are called from one thread, the one that may be interrupted. ``running`` has the
-    chains that run, and those that were stopped, by number.
+    chains that run, wait for a thread, or were stopped, by number; ``ended`` is for chains that may
+    go on.
     """
 
     def __init__(self, n_threads: int):
@@ -25,6 +26,7 @@ class ChainPool:
         self._stop = Event()
         self._futures: dict[Future, int] = {}
         self.running: dict[int, ChainTask] = {}
+        self.ended: dict[int, ChainTask] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -42,6 +44,13 @@ class ChainPool:
         """Run a chain in an idle thread."""
         self.running[number] = task
         self._futures[self._pool.submit(task.run, self._stop)] = number
+
+    def go_on(self, number: int, n_iterations: int | None) -> None:
+        """Run an ended chain again, as soon as a thread is idle; with None release it."""
+        task = self.ended.pop(number)
+        if n_iterations is not None:
+            task.extend(n_iterations)
+            self.start(number, task)
 
     def finished(self, seconds: float = _REFRESH_SECONDS) -> Sequence[tuple[int, ChainTask]]:
         """Wait for chains to finish, for at most so many seconds, and remove those that have.

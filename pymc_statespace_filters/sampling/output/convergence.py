@@ -1,0 +1,67 @@
+"""R-hat and effective sample size of the chains of a model, for each element of their position."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from arviz_stats.base import array_stats
+
+from pymc_statespace_filters.sampling.output.datatree import most_iterations
+
+# Above this R-hat the chains disagree: the limit of `pm.sample` and of Vehtari and others (2021).
+MAX_RHAT = 1.01
+# Fewest draws of a chain from which ArviZ computes either.
+_FEWEST = 4
+
+
+class Convergence(NamedTuple):
+    """Diagnostics of all chains together, on the unconstrained space.
+
+    The effective sample size is ArviZ's "bulk", R-hat its "rank". Both are computed from ranks, and
+    the effective sample size is the same for a parameter as for its logarithm. R-hat is also that
+    of the distances from the median, which may differ there in the third decimal.
+    """
+
+    ess: np.ndarray  # (d,), 0 where no chain has moved
+    rhat: np.ndarray  # (d,), infinity where no chain has moved
+
+    def reaches(self, until_ess: float) -> bool:
+        """Whether every effective sample size is large enough, and no R-hat above `MAX_RHAT`."""
+        return bool(self.ess.min() >= until_ess and self.rhat.max() <= MAX_RHAT)
+
+    def described(self, names: Sequence[str]) -> str:
+        """Name the smallest effective sample size and the largest R-hat, and whose they are."""
+        least, most = int(self.ess.argmin()), int(self.rhat.argmax())
+        return (
+            f"the smallest bulk effective sample size is {self.ess[least]:.0f} ({names[least]}), "
+            f"the largest R-hat {self.rhat[most]:.3f} ({names[most]})"
+        )
+
+
+def convergence(chains: Sequence[np.ndarray], most_draws: int | None = None) -> Convergence | None:
+    """Compute the diagnostics of chains, shape (n, d) each; None for fewer than four draws.
+
+    Of chains of different lengths those are compared that Ctrl-C would return, cut to one length. A
+    single chain is compared with itself: R-hat is that of its two halves. If they have more than
+    ``most_draws``, every second, third, ... draw is taken; the effective sample size is then a
+    little too small.
+    """
+    kept, n = most_iterations([len(positions) for positions in chains])
+    if n < _FEWEST:
+        return None
+    rows = slice(0, n, 1 if most_draws is None else -(-n // most_draws))
+    elements = range(chains[0].shape[1])  # one by one, which takes the least memory
+    values = [_of_element(np.stack([chains[c][rows, i] for c in kept])) for i in elements]
+    return Convergence(*np.transpose(values))
+
+
+def _of_element(draws: np.ndarray) -> tuple[float, float]:
+    """Effective sample size and R-hat of draws of one number, shape (chains, n)."""
+    if np.ptp(draws) == 0.0:  # ArviZ takes these for independent draws
+        return 0.0, np.inf
+    halves = draws[0, : draws.shape[1] // 2 * 2].reshape(2, -1)
+    with np.errstate(invalid="ignore", divide="ignore"):  # chains that never moved
+        ess = array_stats.ess(draws, chain_axis=0, draw_axis=1, method="bulk")
+        compared = draws if len(draws) > 1 else halves
+        rhat = array_stats.rhat(compared, chain_axis=0, draw_axis=1, method="rank")
+    return float(ess), float(rhat)

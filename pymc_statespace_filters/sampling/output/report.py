@@ -1,0 +1,142 @@
+"""The paragraph about a run that is logged at its end."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from pymc.model import Model
+from pymc.stats.convergence import SamplerWarning
+
+from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
+from pymc_statespace_filters.sampling.kernel.state import failure_reason
+from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, Convergence
+from pymc_statespace_filters.sampling.output.warnings import (
+    PhaseStatistics,
+    Shortfall,
+    sampler_warning,
+)
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+
+# Effective draws of each chain below which PyMC takes neither diagnostic for reliable.
+_ENOUGH_PER_CHAIN = 100
+
+
+def element_names(model: Model, raveled: RaveledVariables) -> list[str]:
+    """Name each element of a position after its variable in the model, such as "theta[1]"."""
+    point = raveled.unravel(np.zeros(raveled.dim))
+    return [
+        model.values_to_rvs[v].name + (f"[{', '.join(map(str, index))}]" if index else "")
+        for v in raveled.variables
+        for index in np.ndindex(point[v.name].shape)
+    ]
+
+
+def closing_report(
+    statistics: Mapping[int, PhaseStatistics],
+    tune: int,
+    shortfalls: Sequence[Shortfall],
+    found: Convergence | None,
+    names: Sequence[str],
+    until_ess: float | None,
+) -> str:
+    """Describe a run in one paragraph, with what to do about it.
+
+    ``statistics`` are those after the warm-up, by chain, ``names`` those of the elements of a
+    position. ``found`` is None if convergence was not asked for, or there are too few draws.
+    """
+    sentences = [
+        _size(statistics, tune, found, names),
+        _acceptance(statistics),
+        _failures(statistics),
+        *(shortfall.described() + "." for shortfall in shortfalls),
+        _advice(statistics, shortfalls, found, until_ess),
+    ]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def until_ess_warning(
+    until_ess: float, draws: int, found: Convergence | None, names: Sequence[str]
+) -> SamplerWarning:
+    """Warn that chains ended at ``max_draws`` before they had reached ``until_ess``."""
+    reached = "" if found is None else f"; {found.described(names)}"
+    return sampler_warning(
+        f"until_ess={until_ess:g} was not reached with max_draws={draws} draws in each chain: it "
+        f"asks for that bulk effective sample size and R-hat of at most {MAX_RHAT} for every "
+        f"parameter{reached}. Give a larger max_draws, or make the chains mix better."
+    )
+
+
+def _size(
+    statistics: Mapping[int, PhaseStatistics],
+    tune: int,
+    found: Convergence | None,
+    names: Sequence[str],
+) -> str:
+    lengths = sorted({chain.iterations for chain in statistics.values()})
+    chains = "1 chain" if len(statistics) == 1 else f"{len(statistics)} chains"
+    draws = " to ".join(str(length) for length in dict.fromkeys((lengths[0], lengths[-1])))
+    found_text = "" if found is None else f"; {found.described(names)}"
+    return f"{chains} of {draws} draws after a warm-up of {tune}{found_text}."
+
+
+def _acceptance(statistics: Mapping[int, PhaseStatistics]) -> str:
+    rates = {i: chain.accept_rate for i, chain in statistics.items()}
+    ends = dict.fromkeys(_percent(rate) for rate in (min(rates.values()), max(rates.values())))
+    few = [
+        f" Chain {i} accepted one in only {_percent(rate)} % of its iterations."
+        for i, rate in rates.items()
+        if rate < MIN_ACCEPT_RATE
+    ]
+    text = f"The chains accepted a proposal in {' to '.join(ends)} % of their iterations."
+    return text + "".join(few)
+
+
+def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:
+    n_evaluations = sum(chain.evaluations for chain in statistics.values())
+    counts: dict[int, int] = {}
+    for chain in statistics.values():
+        for code, count in chain.failures:
+            counts[code] = counts.get(code, 0) + count
+    if not counts:
+        return f"None of {n_evaluations} evaluations after the warm-up failed."
+    by_count = sorted(counts.items(), key=lambda item: -item[1])
+    reasons = "; ".join(f"{failure_reason(code)} ({count})" for code, count in by_count)
+    n_failed = sum(counts.values())
+    return (
+        f"{n_failed} of {n_evaluations} evaluations after the warm-up "
+        f"({_percent(n_failed / n_evaluations)} %) failed and were rejected: {reasons}."
+    )
+
+
+def _advice(
+    statistics: Mapping[int, PhaseStatistics],
+    shortfalls: Sequence[Shortfall],
+    found: Convergence | None,
+    until_ess: float | None,
+) -> str:
+    if shortfalls:
+        return (
+            "These draws are not from one distribution: start the chains in the posterior "
+            "(initvals=psf.find_starts()), or tune longer."
+        )
+    if min(chain.accept_rate for chain in statistics.values()) < MIN_ACCEPT_RATE:
+        return (
+            "Tune longer, start elsewhere (initvals), give proposal_cov, or, if the likelihood is "
+            "noisy, give its filter more particles."
+        )
+    if found is None:
+        return ""
+    enough = until_ess or _ENOUGH_PER_CHAIN * len(statistics)
+    if found.reaches(enough):
+        return "Nothing in these numbers speaks against the draws."
+    how = f"until_ess={enough:g} does" if until_ess is None else "with a larger max_draws"
+    factor = max(2, math.ceil(enough / max(found.ess.min(), 1.0)))
+    return (
+        f"Draw about {factor} times as many ({how}); if R-hat stays above {MAX_RHAT}, tune longer "
+        "or start elsewhere (psf.find_starts)."
+    )
+
+
+def _percent(fraction: float) -> str:
+    """A fraction in percent, with a decimal if it is small."""
+    return f"{100.0 * fraction:.{1 if fraction < 0.0995 else 0}f}"

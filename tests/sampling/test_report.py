@@ -1,0 +1,133 @@
+"""The paragraph that ``sample_dram`` logs at its end."""
+
+import logging
+import re
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from tests.sampling.test_dram import nan_beyond, simple_model
+from tests.sampling.test_sample_dram import LOGGER, sample_dram
+
+
+@pytest.fixture
+def report_of(caplog):
+    """The report of a run, and all that it logged."""
+
+    def run(model, **settings):
+        caplog.clear()
+        with caplog.at_level(logging.DEBUG, logger=LOGGER):
+            tree = sample_dram(model, **settings)
+        records = [r for r in caplog.records if re.match(r"\d+ chains? of", r.message)]
+        assert len(records) == 1
+        assert records[0] is caplog.records[-1]  # after the warnings
+        return records[0], tree, list(caplog.messages)
+
+    return run
+
+
+def two_modes(gap, width=1.0):
+    """Modes at 0 and at 1000, the second so wide and so many nats lower."""
+    with pm.Model() as model:
+        x = pm.Flat("x")
+        second = -gap - 0.5 * ((x - 1000.0) / width) ** 2
+        pm.Potential("modes", pt.switch(x < 500.0, -0.5 * x**2, second))
+    return model
+
+
+IN_BOTH = {"tune": 0, "proposal_cov": [[4.0]], "initvals": [{"x": 0.0}, {"x": 1000.0}]}
+
+
+def test_a_good_run(report_of):
+    import arviz as az
+
+    record, tree, messages = report_of(simple_model(), draws=4000, tune=1000, chains=4)
+    text = record.message
+    assert text.startswith("4 chains of 4000 draws after a warm-up of 1000; ")
+    ess = az.ess(tree["posterior"].to_dataset())
+    least = min(ess.data_vars, key=lambda name: float(ess[name]))
+    assert f"smallest bulk effective sample size is {float(ess[least]):.0f} ({least})" in text
+    # On the unconstrained space, where that of sigma differs a little.
+    largest = max(float(value) for value in az.rhat(tree["posterior"].to_dataset()).values())
+    assert float(re.search(r"largest R-hat ([\d.]+) \(", text)[1]) == pytest.approx(
+        largest, abs=0.003
+    )
+    rates = tree["sample_stats"]["accepted"].mean("draw")
+    assert f"in {100 * rates.min():.0f} to {100 * rates.max():.0f} % of their iter" in text
+    assert "None of 16000 evaluations after the warm-up failed." in text
+    assert text.endswith("Nothing in these numbers speaks against the draws.")
+    assert "nats" not in text
+    assert messages == [text]
+
+
+def test_too_few_draws(report_of):
+    record, *_ = report_of(simple_model(), draws=200)
+    assert re.search(r"Draw about \d+ times as many \(until_ess=200 does\)", record.message)
+    record, *_ = report_of(simple_model(), draws=2)
+    assert "R-hat" not in record.message
+    record, *_ = report_of(simple_model(), draws=200, compute_convergence_checks=False)
+    assert "R-hat" not in record.message
+
+
+@pytest.mark.parametrize(("progressbar", "level"), [(False, "DEBUG"), (True, "INFO")])
+def test_it_is_for_those_who_watch(report_of, progressbar, level, capfd):
+    record, *_ = report_of(simple_model(), progressbar=progressbar)
+    assert (record.name, record.levelname) == (LOGGER, level)
+    assert "chains of" not in capfd.readouterr().out
+
+
+def test_a_chain_in_a_lower_mode_is_named(report_of):
+    record, _, messages = report_of(two_modes(1290.0), draws=500, **IN_BOTH)
+    assert "Chain 1 stayed 1290 nats below chain 0 (median log-density)." in record.message
+    assert "Chain 0 " not in record.message
+    assert "find_starts" in record.message
+    (warning,) = [text for text in messages if text.startswith("Chain 1: ")]
+    assert "1290 nats below that of chain 0" in warning
+
+
+def test_modes_of_one_height_are_no_shortfall(report_of):
+    record, _, messages = report_of(two_modes(5.0), draws=500, **IN_BOTH)
+    assert "nats" not in "".join(messages)
+    assert "times as many" in record.message  # R-hat says it
+
+
+def test_a_stuck_chain_is_named(report_of):
+    record, _, messages = report_of(two_modes(0.0, width=1e-6), draws=500, **IN_BOTH)
+    assert "Chain 1 accepted one in only 0.0 % of its iterations." in record.message
+    assert "Chain 0 accepted" not in record.message
+    assert "proposal_cov" in record.message
+    assert any("Chain 1: DRAM accepted 0 of 500 proposals" in text for text in messages)
+
+
+def test_a_chain_may_be_stuck_and_another_low(report_of):
+    record, *_ = report_of(two_modes(-50.0, width=1e-6), draws=500, **IN_BOTH)
+    assert "Chain 1 accepted one in only" in record.message
+    assert re.search(r"Chain 0 stayed 50 nats below chain 1", record.message)
+
+
+def test_failures_are_counted_with_their_reason(report_of):
+    record, tree, _ = report_of(nan_beyond(0.0), draws=500)
+    stats = tree["sample_stats"]
+    failed, made = int(stats["n_failed"].sum()), int(stats["n_evaluations"].sum())
+    assert failed
+    assert (
+        f"{failed} of {made} evaluations after the warm-up ({100 * failed / made:.0f} %) failed "
+        f"and were rejected: the log-density is NaN or plus infinity ({failed})."
+    ) in record.message
+
+
+def test_elements_of_vectors_are_named(report_of):
+    with pm.Model() as model:
+        pm.Normal("theta", sigma=np.array([1.0, 1.0]), shape=2)
+        pm.HalfNormal("scale")
+    record, *_ = report_of(model)
+    assert re.search(r"is \d+ \((theta\[[01]\]|scale)\)", record.message)
+
+
+def test_models_are_named(caplog):
+    with caplog.at_level(logging.DEBUG, logger=LOGGER):
+        psf.run_models({"one": simple_model()}, draws=50, tune=50, chains=2, progressbar=False)
+    assert any(text.startswith("Model 'one': 2 chains of 50 draws") for text in caplog.messages)
