@@ -132,8 +132,8 @@ class ChainProgress(ProgressBarManager):
             self._advance(chain, 0, shown, is_last=True)
 
     def extend(self, chain: int, total: int) -> None:
-        """Set the number of iterations of a chain that goes on after its end."""
-        self._totals[chain] = total
+        """Raise the number of iterations of a chain that goes on after its end."""
+        self._totals[chain] = max(total, self._totals[chain])
         self._advance(chain, 0, {"failing": False})
 
     def show_convergence(self, model: int, rhat: float, ess: float) -> None:

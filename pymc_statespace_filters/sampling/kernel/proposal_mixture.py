@@ -57,19 +57,17 @@ def improved_mixture(
     chains: Sequence[Draws],
     begin: int,
     end: int,
-    tune: int,
     rng: np.random.Generator,
+    *,
+    tuning: bool,
+    extra=(),
 ) -> Array:
-    """The mixture for the iterations from ``end`` on, given the one since ``begin``."""
-    dim = chains[0].positions.shape[1]
+    """The packed mixture for the iterations from ``end`` on, given the one since ``begin``."""
     share = next_share(packed[SHARE], chains, begin, end)
-    if end < tune:
-        share = max(share, LEAST_SHARE)
-    parts = [draws.positions[end // 2 : end] for draws in chains]
-    fitted = fitted_mixture(parts, rng)
+    fitted = fitted_mixture([*extra, *(draws.positions[end // 2 : end] for draws in chains)], rng)
     new = packed.copy() if fitted is None else fitted
-    has_mixture = unpack_mixture(new, dim).numbers[N_COMPONENTS] > 0
-    new[SHARE] = share if has_mixture else 0.0
+    if new[N_COMPONENTS] > 0:
+        new[SHARE] = max(share, LEAST_SHARE) if tuning else share
     return new
 
 

@@ -42,14 +42,19 @@ class ChainTask:
     ----------
     target : Target
         Prepared.
-    tune, draws : int
-        Iterations after which the chain ends; `extend` gives it more draws.
+    tune : int
+    n_iterations : int
+        Iterations after which the chain ends; `extend` gives it more.
     candidates : callable
         From the chain's generator to the candidates for its start.
     seed : numpy.random.SeedSequence
         The chain's randomness.
-    max_draws : int, optional
-        Draws that it may have after `extend`. Default: ``draws``.
+    n_rows : int
+        Iterations that it may have after `extend`.
+    mixture : ndarray
+        Packed, of the first proposals.
+    population : ndarray, shape (m, d), optional
+        Points of which the chain starts at one, instead of a candidate.
     index : int
         Number of the chain.
     name : str, optional
@@ -64,25 +69,29 @@ class ChainTask:
         self,
         target: Target,
         tune: int,
-        draws: int,
+        n_iterations: int,
         candidates: Candidates,
         seed: np.random.SeedSequence,
         *,
-        max_draws: int | None = None,
+        n_rows: int,
+        mixture: np.ndarray,
+        population: np.ndarray | None = None,
         index: int = 0,
         name: str | None = None,
         checkpoint: Checkpoint | None = None,
         keeps_warmup: bool = False,
         measures_noise: bool = False,
     ):
-        self._tune, self._n_iterations = tune, tune + draws
+        self._tune, self._n_iterations = tune, n_iterations
         self._candidates, self._measures_noise = candidates, measures_noise
+        if population is not None:
+            self._candidates = lambda rng: rng.permutation(population)[:1]
         self._index, self._name = index, name or f"chain {index}"
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0
         # Pages of these arrays that are never written to take no memory.
-        n_rows = tune + (draws if max_draws is None else max_draws)
         self.chain = Chain(target, draw_key(self._rng), n_rows, n_covs)
+        self.chain.state.mixture[:] = mixture
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             self.chain.restore(*stored)
@@ -102,8 +111,13 @@ class ChainTask:
         """Draws made so far, after the warm-up, shape (n, d)."""
         return self.chain.draws.positions[self._tune : min(self.n_done, self._n_iterations)]
 
-    def extend(self, n_iterations: int) -> None:
-        """Let the chain, which has ended, run again, until it has made so many iterations."""
+    def extend(self, n_iterations: int, mixture: np.ndarray) -> None:
+        """Let the chain, which has ended, run again, until it has made so many iterations.
+
+        A chain from a checkpoint that is further has this mixture, or a later one.
+        """
+        if self.n_done == self._n_iterations:
+            self.chain.state.mixture[:] = mixture
         self._n_iterations = n_iterations
 
     def request_pause(self, stop: Event) -> None:
@@ -176,7 +190,7 @@ class ChainTask:
         """Advance to the end of the block of random numbers, or of the phase."""
         done = self.n_done
         tune = done < self._tune
-        end = self._tune if tune else self._n_iterations
+        end = min(self._tune, self._n_iterations) if tune else self._n_iterations
         self.chain.advance(tune, done, done, end - done)
 
     def _must_save(self) -> bool:

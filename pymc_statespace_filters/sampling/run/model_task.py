@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from pymc.model import Model
@@ -17,6 +18,12 @@ from xarray import DataTree
 
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
+from pymc_statespace_filters.sampling.kernel.independence import no_mixture
+from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
+    fitted_mixture,
+    improved_mixture,
+    warmup_parts,
+)
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
@@ -44,7 +51,7 @@ from pymc_statespace_filters.sampling.target.initial_points import chain_candida
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
-_STARTS = 2**32 - 1  # no chain has this number
+_NO_CHAIN = 2**32 - 1
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
 _MOST_LIVE_DRAWS = 4000
@@ -81,7 +88,10 @@ class ModelTask:
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
         self._target: Target | None = None
-        self.n_iterations = request.n_iterations  # after which the chains end, for now
+        # Iterations after which the chains wait for each other, and the next of them.
+        self._stops = [*warmup_parts(request.tune), request.n_iterations]
+        self.n_iterations = self._stops[0]
+        self._mixture: np.ndarray | None = None
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the lengths of the chains that they are of.
         self._convergence: tuple[list[int], Convergence | None] = [], None
@@ -118,16 +128,17 @@ class ModelTask:
         return ChainTask(
             target,
             request.tune,
-            self.n_iterations - request.tune,
+            self.n_iterations,
             self._candidates[index],
             self._seeds[index],
-            max_draws=request.max_draws,
+            n_rows=request.tune + (request.max_draws or request.draws),
             index=index,
             name=f"chain {index} of model {self.name!r}" if self.name else None,
             checkpoint=self.checkpoint,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
             population=self.population,
+            mixture=self._first_mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
@@ -147,8 +158,7 @@ class ModelTask:
         journal = None if self.checkpoint is None else self.checkpoint.journal("starts")
         if journal is not None and (stored := journal.read()) is not None:
             return stored.draws["population"]
-        rng = np.random.default_rng(np.random.SeedSequence(request.entropy, spawn_key=(_STARTS,)))
-        found = find_population(target, rng, progressbar=progressbar)
+        found = find_population(target, self._generator(), progressbar=progressbar)
         if journal is not None:
             journal.append({"population": found}, {})
         return found
@@ -179,8 +189,15 @@ class ModelTask:
         return lengths == [self.n_iterations] * self.request.chains
 
     def extend(self) -> bool:
-        """Raise ``n_iterations`` by half the draws if complete chains are to go on."""
+        """Raise ``n_iterations`` if complete chains are to go on: after a part of the warm-up.
+
+        Or by half the draws, if the effective sample size is too small.
+        """
         request = self.request
+        if self.n_iterations < request.n_iterations:
+            self._improve_mixture()
+            self.n_iterations = min(stop for stop in self._stops if stop > self.n_iterations)
+            return True
         if request.until_ess is None or request.max_draws is None:
             return False
         found, draws = self.convergence(), self.n_iterations - request.tune
@@ -188,6 +205,33 @@ class ModelTask:
             return False
         self.n_iterations = request.tune + min(request.max_draws, draws + (draws + 1) // 2)
         return True
+
+    @cached_property
+    def _first_mixture(self) -> np.ndarray:
+        """The mixture of the chains' first part."""
+        fitted = None
+        if self.population is not None:
+            fitted = fitted_mixture([self.population], self._generator(0))
+        return no_mixture(self.prepare().raveled.dim) if fitted is None else fitted
+
+    @property
+    def mixture(self) -> np.ndarray:
+        """The packed mixture of the proposals, of the current part."""
+        return self._first_mixture if self._mixture is None else self._mixture
+
+    def _improve_mixture(self) -> None:
+        """Fit the mixture to the draws of all chains since the middle of the warm-up so far."""
+        end = self.n_iterations
+        begin = max((stop for stop in self._stops if stop < end), default=0)
+        chains = [self._results[i][0] for i in range(self.request.chains)]
+        self._mixture = improved_mixture(
+            self.mixture, chains, begin, end, self._generator(end), tuning=end < self.request.tune, extra=[] if self.population is None else [self.population[::3]]
+        )
+
+    def _generator(self, *key: int) -> np.random.Generator:
+        """A generator of the model's own random numbers, which are not those of a chain."""
+        seed = np.random.SeedSequence(self.request.entropy, spawn_key=(_NO_CHAIN, *key))
+        return np.random.default_rng(seed)
 
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""
@@ -283,7 +327,7 @@ class ModelTask:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request = self.request
         lengths = {len(draws.positions) for draws, _ in results}
-        if self._measures_noise and lengths == {self.n_iterations}:
+        if self._measures_noise and lengths == {max(self.n_iterations, request.n_iterations)}:
             with suppress(KeyboardInterrupt):
                 keys = [state.key for _, state in results]
                 spread, warning = spread_at_highest_draw(

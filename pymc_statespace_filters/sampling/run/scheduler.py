@@ -4,8 +4,9 @@ All messages go between rank 0 and one other rank, from the main thread of each;
 threads and send nothing. A chain's draws depend on its model and number alone, not on the rank that
 runs it.
 
-With ``until_ess`` chains end more than once: rank 0 waits for all chains of a model, and lets them
-go on, each on the rank where it ran, or ends the model. What it decides depends on the draws alone.
+Chains end more than once: after each part of the warm-up, and with ``until_ess``. Rank 0 waits for
+all chains of a model, fits the mixture that they draw proposals from, and lets them go on, each on
+the rank where it ran, or ends the model. What it decides depends on the draws alone.
 
 The last message of rank 0 says that the run is over, and no rank leaves before it. So every rank
 learns of an error on any other, and no message is left for the next user of the communicator.
@@ -88,11 +89,6 @@ def _chain_task(tasks: Sequence[ModelTask], number: int) -> ChainTask:
     return tasks[model].chain_task(chain)
 
 
-def _may_go_on(tasks: Sequence[ModelTask]) -> bool:
-    """Whether chains that have ended are kept, to make more draws."""
-    return tasks[0].request.until_ess is not None
-
-
 class _Manager:
     """Rank 0."""
 
@@ -156,18 +152,16 @@ class _Manager:
 
     def _go_on_or_end(self, model: int, task: ModelTask) -> None:
         """Let all chains of a model make more draws, or none of them."""
-        n_iterations = task.n_iterations if task.extend() else None
-        if n_iterations is None:
+        goal = (task.n_iterations, task.mixture) if task.extend() else None
+        if goal is None:
             self._n_unfinished -= self._n_per_model
-        if not _may_go_on(self._tasks):
-            return
         for number in range(model * self._n_per_model, (model + 1) * self._n_per_model):
-            if n_iterations is not None:
-                self._bars.extend(number, n_iterations)
+            if goal is not None:
+                self._bars.extend(number, task.n_iterations)
             if number in self._rank_of:
-                self._comm.send(self._rank_of[number], _GO_ON, (number, n_iterations))
+                self._comm.send(self._rank_of[number], _GO_ON, (number, goal))
             else:
-                self._pool.go_on(number, n_iterations)
+                self._pool.go_on(number, goal)
 
     def _continue(self) -> None:
         while self._pool.is_idle and (number := self._next()) is not None:
@@ -175,8 +169,7 @@ class _Manager:
         seconds = _LISTENING_SECONDS if self._workers else _ALONE_SECONDS
         for number, task in self._pool.finished(seconds):
             self._show(number, task)
-            if _may_go_on(self._tasks):
-                self._pool.ended[number] = task
+            self._pool.ended[number] = task
             self._add_result(number, *task.result())
         for number, task in self._pool.running.items():
             self._show(number, task)
@@ -252,8 +245,7 @@ class _Worker:
         for number, task in self._pool.finished(_LISTENING_SECONDS):
             self._report({number: task})
             self._send_result(number, task)
-            if _may_go_on(self._tasks):
-                self._pool.ended[number] = task
+            self._pool.ended[number] = task
         if time.monotonic() - self._reported_at > _PROGRESS_SECONDS:
             self._report(self._pool.running)
             self._reported_at = time.monotonic()

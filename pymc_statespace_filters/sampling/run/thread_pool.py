@@ -7,6 +7,8 @@ from contextlib import suppress
 from threading import Event
 from typing import Self
 
+import numpy as np
+
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 
 _REFRESH_SECONDS = 0.1
@@ -45,11 +47,14 @@ class ChainPool:
         self.running[number] = task
         self._futures[self._pool.submit(task.run, self._stop)] = number
 
-    def go_on(self, number: int, n_iterations: int | None) -> None:
-        """Run an ended chain again, as soon as a thread is idle; with None release it."""
+    def go_on(self, number: int, goal: tuple[int, np.ndarray] | None) -> None:
+        """Run an ended chain again, as soon as a thread is idle; with None release it.
+
+        The goal has the number of iterations, and the packed mixture of the proposals.
+        """
         task = self.ended.pop(number)
-        if n_iterations is not None:
-            task.extend(n_iterations)
+        if goal is not None:
+            task.extend(*goal)
             self.start(number, task)
 
     def finished(self, seconds: float = _REFRESH_SECONDS) -> Sequence[tuple[int, ChainTask]]:

@@ -48,7 +48,7 @@ class Population(NamedTuple):
 
 def anneal(
     population: Population, log_densities: LogDensities, n: int, rng: np.random.Generator
-) -> Array:
+) -> Population:
     """Lead draws of the first distribution to the second.
 
     ``log_densities`` gives the log-density of the first and the log-ratio at points (m, k). At
@@ -67,8 +67,8 @@ def anneal(
             for _ in range(_MOVES):
                 population, rate = _moved(population, temperature, scale, log_densities, rng)
                 scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
-            sweeps.append(population.x)
-    return np.concatenate(sweeps)
+            sweeps.append(population)
+    return Population(*(np.concatenate(parts) for parts in zip(*sweeps, strict=True)))
 
 
 def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

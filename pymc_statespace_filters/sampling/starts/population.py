@@ -20,6 +20,7 @@ from pymc_statespace_filters.sampling.target.target import Target
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 9000  # for the progress bar
+_DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 
 Array = NDArray[np.float64]
@@ -68,7 +69,18 @@ def _annealed(
     population = Population(x, *log_densities(x))
     if np.isfinite(population.log_ratio).sum() < fewest:
         return None
-    return anneal(population, log_densities, N_POINTS, rng)
+    return _without_stragglers(anneal(population, log_densities, N_POINTS, rng))
+
+
+def _without_stragglers(population: Population) -> Array:
+    """The points that have reached the second distribution, at least a quarter of them.
+
+    A point that no move has led out of a ridge lies many nats below all others, where there is next
+    to nothing of the distribution.
+    """
+    log_density = population.log_first + population.log_ratio
+    most = log_density.max() - _DEPTH - _DEPTH_PER_DIMENSION * population.x.shape[1]
+    return population.x[log_density >= min(most, float(np.quantile(log_density, 0.75)))]
 
 
 def _densities(rows: ParallelMap, target: Target, rng: np.random.Generator) -> Densities:
