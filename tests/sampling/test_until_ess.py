@@ -139,6 +139,22 @@ def test_the_bar_shows_what_the_draws_so_far_say(model, stopped, monkeypatch):
     assert len(shown) > 3
 
 
+def test_the_seconds_of_all_rounds_count(model, monkeypatch):
+    """They are the speed that the bar of a quick chain shows."""
+    ended, update = {}, ChainProgress.update
+
+    def watched(bars, number, done, stats, seconds):
+        ended.setdefault(number, []).append(seconds)
+        update(bars, number, done, stats, seconds)
+
+    monkeypatch.setattr(ChainProgress, "update", watched)
+    sample_dram(model, **RULE)
+    for seconds in ended.values():
+        lasting = [value for value in seconds if value > 0.0]
+        assert len(lasting) > 2
+        assert lasting == sorted(lasting)
+
+
 def test_without_a_bar_or_checks_nothing_is_computed(model, monkeypatch):
     monkeypatch.setattr(model_task, "convergence", None)
     run = {"compute_convergence_checks": False, "draws": 50}
