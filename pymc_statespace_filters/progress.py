@@ -97,7 +97,7 @@ class ChainProgress(ProgressBarManager):
 
     @property
     def shows_convergence(self) -> bool:
-        """Whether the line of `show_convergence` is drawn."""
+        """Whether `show_convergence` has an effect."""
         return self._show_progress and self.full_stats
 
     def begin(self, chain: int) -> None:
@@ -141,7 +141,8 @@ class ChainProgress(ProgressBarManager):
 
         They belong to no single chain, so they are in a line below the bars.
         """
-        self._convergence[model] = rhat, ess
+        if self.shows_convergence:
+            self._convergence[model] = rhat, ess
 
     def _add_last_line(self, progress: Any) -> None:
         """Have rich draw a line below its table."""

@@ -61,9 +61,10 @@ def sample_dram(
         proposals are adapted.
     until_ess : float, optional
         Go on until the bulk effective sample size of every parameter, over all chains, is at least
-        this and no R-hat is above 1.01. This is checked after ``draws`` iterations, and then
-        whenever there are half as many again. All chains end with the same number of draws, which
-        depends on the draws alone. Default: stop after ``draws``.
+        this and no R-hat is above 1.01, which takes four chains some 400 to 1000 effective draws.
+        Both are checked after ``draws`` iterations, and then whenever there are half as many again.
+        All chains end with the same number of draws, which depends on the draws alone. Default:
+        stop after ``draws``.
     max_draws : int, optional
         With ``until_ess``, the most draws of each chain, after which a warning says what was
         reached. Default: 20 times ``draws``.

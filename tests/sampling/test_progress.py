@@ -113,6 +113,36 @@ def test_values_are_legible_in_80_columns_in_the_bar_of_pm_sample():
     assert drawn.splitlines()[-2].count("\u2026") == 0
 
 
+@pytest.mark.parametrize("progressbar", FORMS)
+def test_the_worst_of_all_models_is_in_the_last_line(progressbar):
+    bars = ChainProgress(4, DRAWS, TUNE, progressbar)
+    screen = quiet(bars, width=80)
+    with bars:
+        bars.update(0, 500, STATS)
+        bars.show_convergence(0, 1.5, 90.0)
+        bars.show_convergence(1, 1.234, 56.7)
+        bars.show_convergence(0, 1.01, 100.0)
+    line = "  largest R-hat 1.23, smallest effective sample size 57"
+    assert (screen.getvalue().splitlines()[-1] == line) == bars.shows_convergence
+    assert bars.shows_convergence == (progressbar not in ("combined", "split"))
+
+
+@pytest.mark.parametrize("progressbar", FORMS)
+def test_chains_that_go_on(progressbar):
+    with ChainProgress(2, DRAWS, TUNE, progressbar) as bars:
+        for total in (1000, 1450):
+            for chain in range(2):
+                bars.extend(chain, total)
+                bars.update(chain, 3000, STATS)  # a checkpoint may have more
+        assert all(task.finished for task in tasks(bars))
+        of_each = 2 if "combined" in str(progressbar) else 1
+        assert {(task.completed, task.total) for task in tasks(bars)} == {
+            (of_each * 1450, of_each * 1450)
+        }
+        bars.extend(0, 2000)
+        assert not tasks(bars)[0].finished
+
+
 def test_the_speed_of_what_took_no_time():
     """PyMC's bar says 0 draws a second of a chain that ended within a quarter of a second."""
     with ChainProgress(2, DRAWS, TUNE, "split") as bars:

@@ -14,8 +14,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, convergence
-from pymc_statespace_filters.sampling.run import chain_task
+from pymc_statespace_filters.sampling.run import chain_task, convergence_display, model_task
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import LOGGER, assert_identical, sample_dram
@@ -116,6 +117,49 @@ def test_few_draws_of_many_say_nearly_the_same(stopped):
     chains = list(draws_of(stopped))
     few = convergence(chains, most_draws=len(chains[0]) // 3)
     assert 0.7 < few.ess.min() / convergence(chains).ess.min() < 1.1
+
+
+# While chains run.
+
+
+def test_the_bar_shows_what_the_draws_so_far_say(model, stopped, monkeypatch):
+    """In each round; at the end it is what ArviZ says of the draws that are returned."""
+    shown, show = [], ChainProgress.show_convergence
+
+    def watched(bars, number, rhat, ess):
+        shown.append((rhat, ess))
+        show(bars, number, rhat, ess)
+
+    monkeypatch.setattr(convergence_display, "_SECONDS", 0.0)
+    monkeypatch.setattr(convergence_display, "_SHARE", 1e9)
+    monkeypatch.setattr(ChainProgress, "show_convergence", watched)
+    assert_identical(sample_dram(model, **RULE | {"progressbar": True}), stopped)
+    found = convergence(list(draws_of(stopped)))
+    assert shown[-1] == (found.rhat.max(), found.ess.min())
+    assert len(shown) > 3
+
+
+def test_the_seconds_of_all_rounds_count(model, monkeypatch):
+    """They are the speed that the bar of a quick chain shows."""
+    ended, update = {}, ChainProgress.update
+
+    def watched(bars, number, done, stats, seconds):
+        ended.setdefault(number, []).append(seconds)
+        update(bars, number, done, stats, seconds)
+
+    monkeypatch.setattr(ChainProgress, "update", watched)
+    sample_dram(model, **RULE)
+    for seconds in ended.values():
+        lasting = [value for value in seconds if value > 0.0]
+        assert len(lasting) > 2
+        assert lasting == sorted(lasting)
+
+
+def test_without_a_bar_or_checks_nothing_is_computed(model, monkeypatch):
+    monkeypatch.setattr(model_task, "convergence", None)
+    run = {"compute_convergence_checks": False, "draws": 50}
+    for progressbar in (False, "split"):
+        sample_dram(model, progressbar=progressbar, **run)
 
 
 # Where it stops.

@@ -140,8 +140,8 @@ class Shortfall(NamedTuple):
         """Warn of the chain."""
         return sampler_warning(
             f"Chain {self.chain}: its log-density stayed {self.nats:.0f} nats below that of chain "
-            f"{self.highest} (median): it is in a lower mode, or has not yet left its start. Start "
-            "it in the posterior (initvals, psf.find_starts) or tune longer."
+            f"{self.highest} (median): it may be in a lower mode, or not have found the posterior. "
+            "Start it there (initvals, psf.find_starts) or tune longer."
         )
 
 

@@ -201,5 +201,4 @@ class ChainTask:
         if self._log is not None and self.n_done > self._n_saved:
             self._log.append(*self.chain.snapshot(self._n_saved))
             self._n_saved = self.n_done
-        self._is_resumed = self.n_done > 0
         self._saved_at = time.monotonic()

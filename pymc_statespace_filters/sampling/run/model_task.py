@@ -313,10 +313,10 @@ class ModelTask:
         with suppress(KeyboardInterrupt):
             if check_convergence or until_ess is not None:
                 found = self.convergence()
-        reached = found is not None and until_ess is not None and found.reaches(until_ess)
-        if until_ess is not None and self.is_complete and not reached:
-            n_draws = self.n_iterations - request.tune
-            messages.append(until_ess_warning(until_ess, n_draws, found, names))
+        n_draws = self.n_iterations - request.tune
+        if until_ess is not None and self.is_complete and n_draws == request.max_draws:
+            if found is None or not found.reaches(until_ess):
+                messages.append(until_ess_warning(until_ess, n_draws, found, names))
         below = shortfalls(draws, request.tune)
         text = closing_report(statistics, request.tune, below, found, names, until_ess)
         return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
