@@ -38,7 +38,7 @@ from pymc_statespace_filters.student_mixture import (
 )
 
 FIRST_SHARE = 0.5  # of a mixture not tried yet
-LEAST_SHARE, MOST_SHARE = 0.2, 0.8  # the least while tuning, so that it goes on being tried
+LEAST_SHARE, MOST_SHARE = 0.2, 0.65  # the least while tuning, so that it goes on being tried
 NO_SHARE = 0.05  # a smaller one is not worth its evaluations after warm-up
 MIN_GAIN = 0.02  # nats per held-out draw, to accept a further component
 FEWEST = 10  # different draws for each dimension, to fit at all
@@ -59,12 +59,17 @@ def improved_mixture(
     end: int,
     rng: np.random.Generator,
     *,
+    population: Array,
     tuning: bool,
-    extra=(),
 ) -> Array:
-    """The packed mixture for the iterations from ``end`` on, given the one since ``begin``."""
+    """The packed mixture for the iterations from ``end`` on, given the one since ``begin``.
+
+    It is fitted to the population (m, d), which may be empty, and the later half of the draws.
+    """
     share = next_share(packed[SHARE], chains, begin, end)
-    fitted = fitted_mixture([*extra, *(draws.positions[end // 2 : end] for draws in chains)], rng)
+    fitted = fitted_mixture(
+        [population, *(draws.positions[end // 2 : end] for draws in chains)], rng
+    )
     new = packed.copy() if fitted is None else fitted
     if new[N_COMPONENTS] > 0:
         new[SHARE] = max(share, LEAST_SHARE) if tuning else share

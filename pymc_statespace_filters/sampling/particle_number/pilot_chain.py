@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pymc_statespace_filters.sampling.kernel.independence import no_mixture
 from pymc_statespace_filters.sampling.kernel.state import LOG_DENSITY
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
@@ -44,9 +45,11 @@ def run_pilot(target: Target, start: np.ndarray, rng: np.random.Generator) -> Pi
         task = ChainTask(
             target,
             N_TUNE,
-            N_DRAWS,
+            N_TUNE + N_DRAWS,
             lambda rng: target.prior_draws.candidates(start, rng),
             seed,
+            n_rows=N_TUNE + N_DRAWS,
+            mixture=no_mixture(target.raveled.dim),
             index=i,
         )
         task.run(Event())

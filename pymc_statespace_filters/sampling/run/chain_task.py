@@ -85,7 +85,7 @@ class ChainTask:
         self._tune, self._n_iterations = tune, n_iterations
         self._candidates, self._measures_noise = candidates, measures_noise
         if population is not None:
-            self._candidates = lambda rng: rng.permutation(population)[:1]
+            self._candidates = lambda rng: list(rng.permutation(population)[:1])
         self._index, self._name = index, name or f"chain {index}"
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0

@@ -46,6 +46,7 @@ from pymc_statespace_filters.sampling.output.warnings import (
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
 from pymc_statespace_filters.sampling.starts.population import find_population
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
@@ -224,8 +225,17 @@ class ModelTask:
         end = self.n_iterations
         begin = max((stop for stop in self._stops if stop < end), default=0)
         chains = [self._results[i][0] for i in range(self.request.chains)]
+        population = np.empty((0, self.prepare().raveled.dim))
+        if self.population is not None:
+            population = self.population[::N_SWEEPS]
         self._mixture = improved_mixture(
-            self.mixture, chains, begin, end, self._generator(end), tuning=end < self.request.tune, extra=[] if self.population is None else [self.population[::3]]
+            self.mixture,
+            chains,
+            begin,
+            end,
+            self._generator(end),
+            population=population,
+            tuning=end < self.request.tune,
         )
 
     def _generator(self, *key: int) -> np.random.Generator:

@@ -1,24 +1,17 @@
 """``find_starts``: initial values of chains that lie in the posterior."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pymc.model import Model, modelcontext
 from pymc.pytensorf import compile as compile_pymc
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.density import ModelDensity
-from pymc_statespace_filters.pymc_model.prior import ModelPrior
-from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
+from pymc_statespace_filters.pymc_model.support import can_sample
+from pymc_statespace_filters.sampling.starts.population import N_POINTS, find_population
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.system.checks import check_count, check_random_seed
-
-_N_POINTS = 256
-_N_DRAWS = 8 * _N_POINTS  # most draws of the prior, if few have a positive likelihood
-_TYPICAL_STAGES = 15  # for the progress bar
-
-Array = NDArray[np.float64]
 
 
 def find_starts(
@@ -83,57 +76,32 @@ def find_starts(
     """
     model = modelcontext(model)
     check_count("chains", chains, 1)
-    if chains > _N_POINTS:
-        raise ModelError(f"chains must be at most {_N_POINTS}, got {chains}")
+    if chains > N_POINTS:
+        raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
-    density, prior = ModelDensity(model), ModelPrior(model)
-
-    def log_densities(x: Array) -> tuple[Array, Array]:
-        seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
-        log_prior = prior.log_density(x)
-        with np.errstate(invalid="ignore"):
-            log_likelihood = density.evaluate(x, seeds) - log_prior
-        return log_prior, np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
-
-    with row_progress(density.calls, enabled=progressbar) as announce:
-        announce("Finding starts", 3 * _N_POINTS * _TYPICAL_STAGES)
-        drawn = _drawn_population(prior, log_densities, rng)
-        population = anneal(drawn, log_densities, _N_POINTS, rng)
-    return _initial_values(model, population.x[rng.choice(_N_POINTS, chains, replace=False)])
-
-
-def _drawn_population(
-    prior: ModelPrior, log_densities: Any, rng: np.random.Generator
-) -> Population:
-    """Draws of the prior, more of them if few have a positive likelihood."""
-    x = prior.sample(_N_POINTS, rng)
-    population = Population(x, *log_densities(x))
-    while np.isfinite(population.log_likelihood).sum() < _N_POINTS // 4:
-        if len(population.x) >= _N_DRAWS:
-            break
-        x = prior.sample(_N_POINTS, rng)
-        parts = zip(population, Population(x, *log_densities(x)), strict=True)
-        population = Population(*map(np.concatenate, parts))
-    if not np.isfinite(population.log_likelihood).any():
+    if model.discrete_value_vars:
+        names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
+        raise ModelError(f"model must have continuous free variables only, got discrete {names}")
+    if improper := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
         raise ModelError(
-            f"the likelihood is zero at all of {len(population.x)} draws of the prior: narrow the "
-            "priors to plausible values"
+            f"the prior of {', '.join(improper)} is improper and cannot be sampled: "
+            "give it a proper prior"
         )
-    return population
+    target = Target(model, None, DRAMSettings())
+    target.prepare()
+    population = find_population(target, rng, progressbar=progressbar)
+    chosen = rng.choice(len(population), chains, replace=chains > len(population))
+    return _initial_values(model, [target.raveled.unravel(x) for x in population[chosen]])
 
 
-def _initial_values(model: Model, x: Array) -> list[dict[str, np.ndarray]]:
-    """The values of the free variables at unconstrained points (m, k)."""
+def _initial_values(
+    model: Model, points: Sequence[Mapping[str, np.ndarray]]
+) -> list[dict[str, np.ndarray]]:
+    """The values of the free variables at points of the unconstrained space."""
     values = [model.rvs_to_values[rv] for rv in model.free_RVs]
     outputs = model.replace_rvs_by_values(model.free_RVs)
     # Machine code would take seconds to compile.
     function = compile_pymc(values, outputs, mode="FAST_COMPILE")
-    shapes = [np.shape(model.initial_point()[value.name]) for value in values]
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
     names = [rv.name for rv in model.free_RVs]
-    starts = []
-    for point in x:
-        parts = zip(np.split(point, ends), shapes, strict=True)
-        found = function(*(part.reshape(shape) for part, shape in parts))
-        starts.append(dict(zip(names, map(np.asarray, found), strict=True)))
-    return starts
+    found = [function(*(point[value.name] for value in values)) for point in points]
+    return [dict(zip(names, map(np.asarray, of_point), strict=True)) for of_point in found]

@@ -21,6 +21,7 @@ from pymc_statespace_filters.sampling.target.target import Target
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 9000  # for the progress bar
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
+_MOST_BATCHES = 8  # of draws of the prior
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 
 Array = NDArray[np.float64]
@@ -36,37 +37,52 @@ def find_population(target: Target, rng: np.random.Generator, *, progressbar: bo
     ModelError
         If no draw of the prior has a positive likelihood.
     """
-    x = target.prior_draws.draws
+    found = None
     pilot = target.pilot_density()
     if pilot is not None:
         rows = pilot.at_rows()
-        cheap = _densities(rows, target, rng)
         with row_progress(rows, enabled=progressbar) as announce:
-            announce("Finding starts by a pilot", _TYPICAL_EVALUATIONS)
-            found = _annealed(x, _from_prior(cheap), rng)
-        pilot = None if found is None else pilot
+            announce("Finding starts by an EKF", _TYPICAL_EVALUATIONS)
+            cheap = _densities(rows, target, rng)
+            found = _annealed(_prior_population(target, _from_prior(cheap)), rng)
     rows = target.density.at_rows()
-    full = _densities(rows, target, rng)
     with row_progress(rows, enabled=progressbar) as announce:
-        announce("Finding starts", _TYPICAL_EVALUATIONS if pilot is None else N_POINTS * 9)
-        if pilot is not None:
-            led = _annealed(found, _from_pilot(cheap, full), rng)
-            if led is not None:
-                return led
-        found = _annealed(x, _from_prior(full), rng, fewest=1)
+        announce("Finding starts", _TYPICAL_EVALUATIONS)
+        full = _densities(rows, target, rng)
+        if found is not None:
+            found = _annealed(_population(found, _from_pilot(cheap, full)), rng)
+        if found is None:
+            drawn = _prior_population(target, _from_prior(full))
+            found = _annealed(drawn, rng, fewest=1)
     if found is None:
         raise ModelError(
-            f"the likelihood is zero at all of {len(x)} draws of the prior: narrow the priors to "
-            "plausible values"
+            f"the likelihood is zero at all of {len(drawn[0].x)} draws of the prior: narrow the "
+            "priors to plausible values"
         )
     return found
 
 
+def _population(x: Array, log_densities: Densities) -> tuple[Population, Densities]:
+    return Population(x, *log_densities(x)), log_densities
+
+
+def _prior_population(target: Target, log_densities: Densities) -> tuple[Population, Densities]:
+    """Draws of the prior, more of them if few have a positive likelihood."""
+    population, _ = _population(target.prior_draws.draws, log_densities)
+    for batch in range(1, _MOST_BATCHES):
+        if np.isfinite(population.log_ratio).sum() >= N_POINTS // 4:
+            break
+        more, _ = _population(target.prior_draws.batch(batch), log_densities)
+        pairs = zip(population, more, strict=True)
+        population = Population(*(np.concatenate(pair) for pair in pairs))
+    return population, log_densities
+
+
 def _annealed(
-    x: Array, log_densities: Densities, rng: np.random.Generator, fewest: int = _FEWEST
+    drawn: tuple[Population, Densities], rng: np.random.Generator, fewest: int = _FEWEST
 ) -> Array | None:
     """The points led to the second distribution; None if it is positive at too few of them."""
-    population = Population(x, *log_densities(x))
+    population, log_densities = drawn
     if np.isfinite(population.log_ratio).sum() < fewest:
         return None
     return _without_stragglers(anneal(population, log_densities, N_POINTS, rng))

@@ -50,13 +50,35 @@ class PriorDraws:
     Attributes
     ----------
     draws : ndarray, shape (n, d)
+        The first batch.
+    is_prior : bool
+        Whether all priors can be drawn from.
     """
 
     def __init__(self, model: Model, raveled: RaveledVariables, default: Mapping[str, np.ndarray]):
         rvs = [model.values_to_rvs[v] for v in raveled.variables]
         self._has_initvals = any(model.rvs_to_initial_values[rv] is not None for rv in rvs)
         self._default = raveled.ravel(default)
-        self.draws, self._is_prior = _prior_draws(model, raveled)
+        self._raveled, self.is_prior = raveled, True
+        free = list(model.free_RVs)
+        self._point = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
+        try:
+            self.draws = self.batch(0)
+        except NotImplementedError:
+            self.is_prior = False
+            self._point = make_initial_point_fn(model=model, jitter_rvs=set(free))
+            self.draws = self.batch(0)
+
+    def batch(self, index: int) -> np.ndarray:
+        """Draw from the prior, on the unconstrained space: finite rows, shape (n, d), n <= N_DRAWS.
+
+        The seeds are fixed, so that the draws depend on the model alone; the generator of a chain
+        chooses among them. A prior that cannot be drawn from, such as a flat one, is replaced by
+        the model's initial point plus U(-1, 1), as in PyMC's NUTS.
+        """
+        seeds = range(index * N_DRAWS, (index + 1) * N_DRAWS)
+        table = np.array([self._raveled.ravel(self._point(seed)) for seed in seeds])
+        return table[np.isfinite(table).all(axis=1)]
 
     def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
         """List candidates for a start: draws from the prior, then the point of user or model.
@@ -70,7 +92,7 @@ class PriorDraws:
     @property
     def may_start(self) -> bool:
         """Whether chains may start at a posterior found from the draws, as the user gave none."""
-        return self._is_prior and not self._has_initvals and len(self.draws) > 1
+        return self.is_prior and not self._has_initvals and len(self.draws) > 1
 
     def covariance(self) -> np.ndarray:
         """Give a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
@@ -78,24 +100,6 @@ class PriorDraws:
         variance = self.draws.var(axis=0) if len(self.draws) > 1 else np.ones(dim)
         variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
         return np.diag(variance) * 2.38**2 / dim
-
-
-def _prior_draws(model: Model, raveled: RaveledVariables) -> tuple[np.ndarray, bool]:
-    """Draw from the prior, on the unconstrained space: finite rows, shape (n, d), and True.
-
-    The seed is fixed, so that the draws depend on the model alone; the generator of a chain chooses
-    among them. A prior that cannot be drawn from, such as a flat one, is replaced by the model's
-    initial point plus U(-1, 1), as in PyMC's NUTS.
-    """
-    free = list(model.free_RVs)
-    from_prior = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
-    try:
-        points, is_prior = [from_prior(seed) for seed in range(N_DRAWS)], True
-    except NotImplementedError:
-        jittered = make_initial_point_fn(model=model, jitter_rvs=set(free))
-        points, is_prior = [jittered(seed) for seed in range(N_DRAWS)], False
-    table = np.array([raveled.ravel(point) for point in points])
-    return table[np.isfinite(table).all(axis=1)], is_prior
 
 
 def best_initial_point(
