@@ -1,24 +1,16 @@
 """``find_starts``: initial values of chains that lie in the posterior."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from pymc.model import Model, modelcontext
-from pymc.pytensorf import compile as compile_pymc
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.density import ModelDensity
-from pymc_statespace_filters.pymc_model.prior import ModelPrior
-from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
+from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
+from pymc_statespace_filters.pymc_model.factors import ModelFactors
+from pymc_statespace_filters.sampling.starts.population import N_POINTS, posterior_population
 from pymc_statespace_filters.system.checks import check_count, check_random_seed
 
-_N_POINTS = 256
-_N_DRAWS = 8 * _N_POINTS  # most draws of the prior, if few have a positive likelihood
 _TYPICAL_STAGES = 15  # for the progress bar
-
-Array = NDArray[np.float64]
 
 
 def find_starts(
@@ -83,57 +75,12 @@ def find_starts(
     """
     model = modelcontext(model)
     check_count("chains", chains, 1)
-    if chains > _N_POINTS:
-        raise ModelError(f"chains must be at most {_N_POINTS}, got {chains}")
+    if chains > N_POINTS:
+        raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
-    density, prior = ModelDensity(model), ModelPrior(model)
-
-    def log_densities(x: Array) -> tuple[Array, Array]:
-        seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
-        log_prior = prior.log_density(x)
-        with np.errstate(invalid="ignore"):
-            log_likelihood = density.evaluate(x, seeds) - log_prior
-        return log_prior, np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
-
-    with row_progress(density.calls, enabled=progressbar) as announce:
-        announce("Finding starts", 3 * _N_POINTS * _TYPICAL_STAGES)
-        drawn = _drawn_population(prior, log_densities, rng)
-        population = anneal(drawn, log_densities, _N_POINTS, rng)
-    return _initial_values(model, population.x[rng.choice(_N_POINTS, chains, replace=False)])
-
-
-def _drawn_population(
-    prior: ModelPrior, log_densities: Any, rng: np.random.Generator
-) -> Population:
-    """Draws of the prior, more of them if few have a positive likelihood."""
-    x = prior.sample(_N_POINTS, rng)
-    population = Population(x, *log_densities(x))
-    while np.isfinite(population.log_likelihood).sum() < _N_POINTS // 4:
-        if len(population.x) >= _N_DRAWS:
-            break
-        x = prior.sample(_N_POINTS, rng)
-        parts = zip(population, Population(x, *log_densities(x)), strict=True)
-        population = Population(*map(np.concatenate, parts))
-    if not np.isfinite(population.log_likelihood).any():
-        raise ModelError(
-            f"the likelihood is zero at all of {len(population.x)} draws of the prior: narrow the "
-            "priors to plausible values"
-        )
-    return population
-
-
-def _initial_values(model: Model, x: Array) -> list[dict[str, np.ndarray]]:
-    """The values of the free variables at unconstrained points (m, k)."""
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    outputs = model.replace_rvs_by_values(model.free_RVs)
-    # Machine code would take seconds to compile.
-    function = compile_pymc(values, outputs, mode="FAST_COMPILE")
-    shapes = [np.shape(model.initial_point()[value.name]) for value in values]
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
-    names = [rv.name for rv in model.free_RVs]
-    starts = []
-    for point in x:
-        parts = zip(np.split(point, ends), shapes, strict=True)
-        found = function(*(part.reshape(shape) for part, shape in parts))
-        starts.append(dict(zip(names, map(np.asarray, found), strict=True)))
-    return starts
+    factors = ModelFactors(model)
+    with row_progress(factors.density.calls, enabled=progressbar) as announce:
+        announce("Finding starts", 3 * N_POINTS * _TYPICAL_STAGES)
+        population = posterior_population(factors, rng)
+    values = ConstrainedValues(model)
+    return [values(x) for x in population.x[rng.choice(N_POINTS, chains, replace=False)]]
