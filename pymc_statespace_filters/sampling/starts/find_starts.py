@@ -81,6 +81,6 @@ def find_starts(
     factors = ModelFactors(model)
     with row_progress(factors.density.calls, enabled=progressbar) as announce:
         announce("Finding starts", 3 * N_POINTS * _TYPICAL_STAGES)
-        population = posterior_population(factors, rng)
+        population = posterior_population(factors.prior, lambda x: factors.evaluate(x, rng), rng)
     values = ConstrainedValues(model)
     return [values(x) for x in population.x[rng.choice(N_POINTS, chains, replace=False)]]
