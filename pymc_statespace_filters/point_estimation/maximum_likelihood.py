@@ -106,6 +106,10 @@ def maximum_likelihood(
     ...     )
     ...     found = psf.maximum_likelihood(random_seed=1)
     >>> found
+    Maximum likelihood: log-likelihood -155.5885
+               estimate  standard_error
+    parameter
+    a          0.578093        0.108064
     """
     if not isinstance(model, Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.evidence.estimators.maximum_likelihood import maximize_noisy
-from pymc_statespace_filters.evidence.estimators.newton import BatchFunction
-from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_independent
+from pymc_statespace_filters.evidence.estimators.newton import BatchFunction, EdgeError
+from pymc_statespace_filters.evidence.log_mean import log_mean_of_independent
 from pymc_statespace_filters.point_estimation.peak import (
     EDGE,
     HIDDEN,
@@ -29,8 +29,11 @@ from pymc_statespace_filters.sampling.starts.annealing import Population
 MIN_CURVATURE = 0.2  # below, a direction counts as one without curvature
 MAX_STEP = 2.0  # standard errors, from the centre of a round to the next
 NEAR = 0.5  # standard errors, of the last centre to its maximum
-N_LAST = 3  # most rounds with the settings of the last
+N_ROUNDS, N_LAST = 8, 3  # most rounds; with the settings of the last, at least
+MAX_LENGTH = 1.0  # of a scale, in standard deviations of the population
+SIGNIFICANT = 3.0  # standard errors, of a slope
 N_VALUING = 200  # fresh estimates at the maximum
+TOO_NOISY = 0.2  # nats, standard error of their mean: the log-likelihood has a variance above 2
 
 Array = NDArray[np.float64]
 
@@ -44,7 +47,7 @@ class _Round(NamedTuple):
     n_per_coefficient: int
 
 
-_FIRST, _LAST = _Round(1.0, 1, 200, 4), _Round(0.7, 4, 400, 8)
+_FIRST, _LAST = _Round(1.0, 1, 200, 4), _Round(0.6, 12, 240, 6)
 
 
 class _Surface(NamedTuple):
@@ -68,10 +71,20 @@ class _Surface(NamedTuple):
         return kept / curvature[curvature > MIN_CURVATURE] @ kept.T
 
     def maximum(self) -> tuple[Array, float]:
-        """Maximum (k,) in z, at most `MAX_STEP` away, and how far away it would be."""
-        step = self.inverse() @ self.slope
-        distance = float(np.linalg.norm(step))
-        return step / max(1.0, distance / MAX_STEP), distance
+        """Maximum (k,) in z, at most `MAX_STEP` away, and how far away it would be.
+
+        Along a direction without curvature it is `MAX_STEP` uphill, if the slope is significant.
+        """
+        curvature, directions = self.spectrum()
+        slopes = directions.T @ self.slope
+        k = len(slopes)
+        errors = np.sqrt(
+            np.diag(directions.T @ self.coefficient_cov[1 : k + 1, 1 : k + 1] @ directions)
+        )
+        uphill = np.where(np.abs(slopes) > SIGNIFICANT * errors, MAX_STEP * np.sign(slopes), 0.0)
+        steps = np.where(curvature > MIN_CURVATURE, slopes / np.abs(curvature), uphill)
+        distance = float(np.linalg.norm(steps))
+        return directions @ steps / max(1.0, distance / MAX_STEP), distance
 
     def maximum_cov(self, z: Array) -> Array:
         """Covariance (k, k) of the maximum z, from the errors of the coefficients."""
@@ -92,33 +105,43 @@ def maximize_estimated(
         lambda z: log_likelihood(mean + z @ spread.T), z, population.log_likelihood
     )
     point, scale = mean + spread @ best, spread
-    surface = None
-    for settings in (_FIRST, _FIRST, *[_LAST] * N_LAST):
-        surface = _fitted(log_likelihood, point, scale, settings, rng)
-        if surface is None:
+    settings = _FIRST
+    for remaining in reversed(range(N_ROUNDS)):
+        try:
+            surface = _fitted(log_likelihood, point, scale, settings, rng)
+        except EdgeError:
             return _unfitted(log_likelihood, point, scale)
         z, distance = surface.maximum()
-        if settings is _LAST and distance < NEAR:
+        if remaining == 0 or (settings is _LAST and distance < NEAR):
             break
+        if (distance < MAX_STEP and remaining < N_ROUNDS - 1) or remaining <= N_LAST:
+            settings = _LAST
         point = point + scale @ z
-        scale = rescaled(scale, *surface.spectrum(), spread)
-    assert surface is not None
+        scale = rescaled(scale, *surface.spectrum(), spread, MAX_LENGTH)
     return _peak(log_likelihood, surface)
 
 
 def _fitted(
     function: BatchFunction, centre: Array, scale: Array, settings: _Round, rng: np.random.Generator
-) -> _Surface | None:
-    """Fit a quadratic to estimates around a point; None if too many of them are zero."""
+) -> _Surface:
+    """Fit a quadratic to estimates around a point.
+
+    Raises
+    ------
+    EdgeError
+        If too many of the estimates are zero.
+    """
     k = len(centre)
     q = 1 + 2 * k + k * (k + 1) // 2
     count = max(settings.n_least, settings.n_per_coefficient * q)
     z = settings.sd * rng.standard_normal((count, k))
     estimates = function(np.repeat(centre + z @ scale.T, settings.n_averaged, axis=0))
-    values = np.array([log_mean(row) for row in estimates.reshape(count, -1)])
+    averages = [log_mean_of_independent(row) for row in estimates.reshape(count, -1)]
+    # the logarithm of an average is too small by half its relative variance
+    values = np.array([one.value + 0.5 * min(one.error, 1.0) ** 2 for one in averages])
     found = np.isfinite(values)
     if found.sum() < 2 * q:
-        return None
+        raise EdgeError
     features = _features(z[found])
     inverse = np.linalg.pinv(features.T @ features)
     coefficients = inverse @ (features.T @ values[found])
@@ -165,6 +188,11 @@ def _peak(function: BatchFunction, surface: _Surface) -> Peak:
     if distance > NEAR:
         notes.append(
             f"the search did not converge: its last step was {distance:.2g} standard errors long"
+        )
+    if value.error > TOO_NOISY:
+        notes.append(
+            "the likelihood is so noisy that the errors are too small: take more particles (see "
+            "suggest_particles)"
         )
     return Peak(
         point,

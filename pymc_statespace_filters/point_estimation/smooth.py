@@ -33,13 +33,14 @@ from pymc_statespace_filters.sampling.starts.annealing import Population
 N_STARTS = 5
 LENGTHS = 4.0 ** -np.arange(12)  # tried for a scale, relative to the population
 MAX_CHANGE = 1.0  # nats, of the log-likelihood along a scale
-STEP = 0.05  # of the fine differences, in standard errors; doubled for the coarse
+STEP = 0.02  # of the fine differences, in standard errors; doubled for the coarse
 N_REFINED, N_RESCALED = 10, 3  # most Newton steps of the refinement; those that change the scale
 SETTLED = 1e-6  # standard errors, of a Newton step
 RESCALING = 0.01, 1e4  # least and most curvature that a rescaling trusts
 MAX_LENGTH = 3.0  # of a scale, in standard deviations of the population
 MIN_CURVATURE = 0.3  # below, a direction is probed
 PROBES, MIN_FALL = (1.0, 2.0, 4.0), 0.01  # distances in scales; nats
+N_MOVES, MIN_GAIN = 5, 1e-10  # most moves towards a bound; nats, of a move that is worth it
 MAX_DECREMENT = 0.01  # standard errors, of the Newton step that remains
 RIVAL_NATS, RIVAL_DISTANCE = 2.0, 5.0  # below the maximum; standard errors from it
 MAX_RUGGEDNESS = 0.1  # change of the curvature by a doubled step
@@ -96,11 +97,16 @@ def population_scale(x: Array) -> Array:
     return np.linalg.cholesky(covariance + 1e-6 * np.diag(variance))
 
 
-def rescaled(scale: Array, curvature: Array, directions: Array, spread: Array) -> Array:
-    """Columns along the directions of curvature, one standard error long, within limits."""
+def rescaled(
+    scale: Array, curvature: Array, directions: Array, spread: Array, longest: float = MAX_LENGTH
+) -> Array:
+    """Columns along the directions of curvature, one standard error long, within limits.
+
+    ``longest`` is in standard deviations of the population.
+    """
     scale = scale @ directions / np.sqrt(np.clip(np.abs(curvature), *RESCALING))
     length = np.linalg.norm(np.linalg.solve(spread, scale), axis=0)
-    return scale * np.minimum(1.0, MAX_LENGTH / length)
+    return scale * np.minimum(1.0, longest / length)
 
 
 def _starts(population: Population, spread: Array) -> Array:
@@ -133,10 +139,16 @@ def _fitting(function: BatchFunction, point: Array, scale: Array) -> Array:
 
 
 def _peak(function: BatchFunction, point: Array, spread: Array) -> Peak:
-    """Refine a maximum, and find the directions along which it has no curvature."""
-    local, edges = _refined_inside(function, point, spread)
+    """Refine a maximum, and find the directions along which it has no curvature.
+
+    Where the function levels off towards a bound, the maximum is moved on as long as that gains.
+    """
+    for _ in range(N_MOVES):
+        local, edges = _refined_inside(function, point, spread)
+        lost, point, gain = _without_curvature(function, local)
+        if gain < MIN_GAIN:
+            break
     curvature, directions = local.spectrum()
-    lost = dict(_without_curvature(function, local, curvature, directions))
     kept = [i for i in range(len(curvature)) if i not in lost]
     basis = local.scale @ directions[:, kept] / np.sqrt(curvature[kept])
     return Peak(
@@ -211,19 +223,26 @@ def _derivatives_at(function: BatchFunction, point: Array, scale: Array) -> _Loc
 
 
 def _without_curvature(
-    function: BatchFunction, local: _Local, curvature: Array, directions: Array
-) -> list[tuple[int, Lost]]:
-    """The directions along which the function does not fall, by their numbers."""
-    lost = []
+    function: BatchFunction, local: _Local
+) -> tuple[dict[int, Lost], Array, float]:
+    """The directions along which the function does not fall, by their numbers.
+
+    Also the best point met on the way, and its gain.
+    """
+    curvature, directions = local.spectrum()
+    lost, best, gain = {}, local.point, 0.0
     for i in np.flatnonzero(curvature < MIN_CURVATURE):
         direction = local.scale @ directions[:, i]
-        moves = np.multiply.outer((*PROBES, *(-t for t in PROBES)), direction)
-        falls = (local.value - function(local.point + moves)).reshape(2, -1)
-        if (falls < -MIN_FALL).any() or curvature[i] <= -MIN_CURVATURE:
-            lost.append((int(i), Lost(direction, INCREASING)))
-        elif (falls < MIN_FALL).all(axis=1).any() or curvature[i] <= 0:
-            lost.append((int(i), Lost(direction, LEVEL)))
-    return lost
+        probes = local.point + np.multiply.outer((*PROBES, *(-t for t in PROBES)), direction)
+        gains = function(probes) - local.value
+        level = (gains > -MIN_FALL).reshape(2, -1).all(axis=1).any()
+        if gains.max() > MIN_FALL or curvature[i] <= -MIN_CURVATURE:
+            lost[int(i)] = Lost(direction, INCREASING)
+        elif level or curvature[i] <= 0:
+            lost[int(i)] = Lost(direction, LEVEL)
+        if gains.max() > gain:
+            best, gain = probes[gains.argmax()], float(gains.max())
+    return lost, best, gain
 
 
 def _doubts(local: _Local, curvature: Array, directions: Array) -> list[str]:

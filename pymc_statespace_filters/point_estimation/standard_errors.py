@@ -11,7 +11,8 @@ from pymc_statespace_filters.point_estimation.estimate import flattened
 from pymc_statespace_filters.point_estimation.peak import EDGE, HIDDEN, INCREASING, Peak
 
 STEP = 1e-3  # of the differences, in standard deviations of the population
-INVOLVED = 0.05  # standard errors, of a move along a direction that changes a parameter
+# Standard errors, of a move along a direction that changes a parameter; with noisy directions.
+INVOLVED, INVOLVED_NOISY = 0.05, 0.5
 AT_BOUND = 0.02  # standard deviations of the population: smaller moves end at a bound
 
 Array = NDArray[np.float64]
@@ -38,7 +39,8 @@ def errors_of(
     covariance = along @ along.T
     directions = np.array([lost.direction for lost in peak.lost]).reshape(-1, len(peak.point))
     moves = np.abs(jacobian @ directions.T)
-    involved = moves >= INVOLVED * np.linalg.norm(along, axis=1, keepdims=True)
+    least = [INVOLVED_NOISY if lost.kind == HIDDEN else INVOLVED for lost in peak.lost]
+    involved = moves >= np.multiply.outer(np.linalg.norm(along, axis=1), least)
     reasons = {}
     for i in np.flatnonzero(involved.any(axis=1)):
         which = int(np.where(involved[i], moves[i], -1.0).argmax())
@@ -47,6 +49,8 @@ def errors_of(
         reasons[labels[i]] = _reason(peak.lost[which].kind, names, at_bound=bool(small))
         covariance[i], covariance[:, i] = np.nan, np.nan
     simulation = np.sqrt(np.einsum("ik,kl,il->i", jacobian, peak.simulation_cov, jacobian))
+    if peak.value_se > 0:
+        simulation[np.isnan(np.diag(covariance))] = np.nan
     return Errors(covariance, simulation, reasons)
 
 

@@ -70,11 +70,11 @@ def test_shares_and_a_potential():
 class TestAutoregression:
     """The exact likelihood is Kalman's."""
 
-    observed = simulated(STEPS, 1, 0.8, 0.5)
+    observed = simulated(STEPS, 1, 0.8, 0.5, observation_noise=0.2)
 
     def exact_log_likelihood(self, parameters):
         phi, spread = parameters
-        arguments = [[[phi]], [[spread**2]], [[1.0]], [[0.4]], [0.0], [[1.0]]]
+        arguments = [[[phi]], [[spread**2]], [[1.0]], [[0.2]], [0.0], [[1.0]]]
         return kalman_log_likelihood(
             *map(np.array, arguments), observed=self.observed[:, None], steps=STEPS
         ).sum()
@@ -97,7 +97,8 @@ class TestAutoregression:
         with pm.Model() as model:
             pm.Uniform("phi", 0.0, 1.0)
             pm.HalfNormal("spread", 1.0)
-            psf.StateSpace("d", autoregression(), filter, steps=STEPS, observed=self.observed)
+            system = autoregression(observation_noise=[[0.2]])
+            psf.StateSpace("d", system, filter, steps=STEPS, observed=self.observed)
         return model
 
     def test_exact_likelihood(self):
