@@ -75,9 +75,11 @@ def maximum_likelihood(
     bound counts as known for the errors of the others.
 
     The population costs 3000 to 16 000 evaluations of the likelihood, in threads; Newton's method
-    about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000. If the likelihood has several
-    maxima, the largest need not be where the posterior has any mass; it is then not found. Maxima
-    less than two nats lower are named in the notes.
+    about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000. GridFilter is slow far from
+    the posterior: under wide priors expect minutes.
+
+    If the likelihood has several maxima, the largest need not be where the posterior has any mass;
+    it is then not found. Maxima less than two nats lower are named in the notes.
 
     References
     ----------

@@ -82,7 +82,9 @@ def maximize_smooth(log_likelihood: BatchFunction, population: Population) -> Pe
 def _rivals(found: list[tuple[float, Array]], peak: Peak) -> Iterator[tuple[Array, float]]:
     """Other maxima that are nearly as high, each once, best first."""
     known = [peak.point]
-    pseudo_inverse = np.linalg.pinv(peak.basis)
+    # Distances count along the directions with curvature alone.
+    directions = np.column_stack([peak.basis, *(lost.direction for lost in peak.lost)])
+    pseudo_inverse = np.linalg.pinv(directions)[: peak.basis.shape[1]]
     for value, point in sorted(found, key=lambda one: -one[0]):
         distances = np.linalg.norm((np.array(known) - point) @ pseudo_inverse.T, axis=1)
         if value > peak.value - RIVAL_NATS and distances.min() > RIVAL_DISTANCE:

@@ -187,6 +187,7 @@ def test_a_scale_of_zero_has_no_standard_error():
     assert found.standard_errors["mu"] == pytest.approx(1 / np.sqrt(6), rel=1e-5)
     assert found.log_likelihood == pytest.approx(norm.logpdf(y, y.mean(), 1.0).sum(), abs=1e-8)
     assert list(found.reasons) == ["tau"]
+    assert found.notes == ()  # the other searches ended at the same bound
     assert "at a bound of its support" in found.summary().loc["tau", "reason"]
     assert "at a bound of its support" in repr(found)
 
@@ -216,6 +217,7 @@ def test_parameters_that_the_data_do_not_determine():
     assert found.estimate["a"] + found.estimate["b"] == pytest.approx(2.0, abs=1e-6)
     assert found.standard_errors["c"] == pytest.approx(0.5, rel=1e-5)
     assert set(found.reasons) == {"a", "b"}
+    assert found.notes == ()
     for name in "ab":
         assert np.isnan(found.standard_errors[name])
         assert found.reasons[name].endswith("level as a, b change together")
