@@ -12,7 +12,7 @@ PACKAGE = psf.__name__
 GROUPS = {
     "Systems and records": ("system",),
     "Filters": ("filters", "evaluation"),
-    "In a PyMC model": ("pymc_model", "sampling"),
+    "In a PyMC model": ("pymc_model", "sampling", "point_estimation"),
     "States, forecasts, diagnostics": ("states", "diagnostics"),
     "Evidence and model choice": ("evidence",),
     "Plots": ("plots",),
@@ -23,6 +23,7 @@ GROUPS = {
 MEMBERS = {
     "DimensionCorrection": "log_prior",
     "Evidence": "prior_note",
+    "MaximumLikelihoodEstimate": "summary",
     "PFEnKF": "density_method",
     "StateSpace": "dist",
 }

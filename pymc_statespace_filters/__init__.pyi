@@ -39,6 +39,7 @@ from .plots import (
     plot_prior_sensitivity,
     plot_states,
 )
+from .point_estimation import MaximumLikelihoodEstimate, maximum_likelihood
 from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, smoothed_states
@@ -65,6 +66,7 @@ __all__ = [
     "GridFilter",
     "GuidedPF",
     "LoweringError",
+    "MaximumLikelihoodEstimate",
     "ModelError",
     "PFEnKF",
     "ParallelError",
@@ -88,6 +90,7 @@ __all__ = [
     "leave_future_out",
     "log_likelihood",
     "marginal_modes",
+    "maximum_likelihood",
     "nearest_steps",
     "plot_average",
     "plot_evidence",

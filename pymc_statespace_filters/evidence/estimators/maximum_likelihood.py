@@ -57,7 +57,7 @@ def max_log_likelihood(posterior: Posterior, rng: np.random.Generator) -> Maximu
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
     log_prior = posterior.required_prior.log_density(draws).reshape(posterior.log_density.shape)
     at_draws = log_likelihood_of(posterior.log_density, log_prior)
-    maximize = _maximize_noisy if posterior.is_noisy else _maximize_deterministic
+    maximize = maximize_noisy if posterior.is_noisy else _maximize_deterministic
     value, z = maximize(log_likelihood, coordinates.whitened(draws), at_draws)
     return MaximumLikelihood(value, coordinates.unconstrained(z[np.newaxis])[0])
 
@@ -71,11 +71,11 @@ def _maximize_deterministic(
     largest = max(maxima, key=lambda maximum: maximum.value)
     found = [(largest.value, largest.point), (float(at_draws.ravel()[best[0]]), draws[best[0]])]
     if largest.at_edge:
-        found.append(_maximize_along_edge(log_likelihood, largest.point))
+        found.append(maximize_along_edge(log_likelihood, largest.point))
     return max(found, key=lambda candidate: candidate[0])
 
 
-def _maximize_along_edge(log_likelihood: BatchFunction, start: Array) -> tuple[float, Array]:
+def maximize_along_edge(log_likelihood: BatchFunction, start: Array) -> tuple[float, Array]:
     """Nelder and Mead's simplex search, which needs no derivatives."""
     k = len(start)
     ended = minimize(
@@ -91,7 +91,7 @@ def _maximize_along_edge(log_likelihood: BatchFunction, start: Array) -> tuple[f
     return -float(ended.fun), ended.x
 
 
-def _maximize_noisy(
+def maximize_noisy(
     log_likelihood: BatchFunction, draws: Array, at_draws: Array
 ) -> tuple[float, Array]:
     """A point near the maximum of a noisy likelihood, with the log mean of fresh estimates."""

@@ -1,16 +1,11 @@
 """``find_starts``: initial values of chains that lie in the posterior."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 from pymc.model import Model, modelcontext
-from pymc.pytensorf import compile as compile_pymc
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.support import can_sample
-from pymc_statespace_filters.sampling.starts.population import N_POINTS, find_population
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
+from pymc_statespace_filters.sampling.starts.population import N_POINTS, population_of
 from pymc_statespace_filters.system.checks import check_count, check_random_seed
 
 
@@ -55,8 +50,10 @@ def find_starts(
     Notes
     -----
     The cost is 3000 to 16 000 evaluations of the log-density, in threads: more, the narrower the
-    posterior is. With an expensive filter, find the starts with the same model and a cheaper one,
-    such as `EKF`.
+    posterior is. If the filters are expensive and the systems allow an `EKF`, the population is
+    first led to the prior times the square root of its likelihood.
+
+    `sample_dram` finds starts in this way itself.
 
     References
     ----------
@@ -79,29 +76,7 @@ def find_starts(
     if chains > N_POINTS:
         raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
-    if model.discrete_value_vars:
-        names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
-        raise ModelError(f"model must have continuous free variables only, got discrete {names}")
-    if improper := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
-        raise ModelError(
-            f"the prior of {', '.join(improper)} is improper and cannot be sampled: "
-            "give it a proper prior"
-        )
-    target = Target(model, None, DRAMSettings())
-    target.prepare()
-    population = find_population(target, rng, progressbar=progressbar)
+    population = population_of(model, rng, progressbar=progressbar)
     chosen = rng.choice(len(population), chains, replace=chains > len(population))
-    return _initial_values(model, [target.raveled.unravel(x) for x in population[chosen]])
-
-
-def _initial_values(
-    model: Model, points: Sequence[Mapping[str, np.ndarray]]
-) -> list[dict[str, np.ndarray]]:
-    """The values of the free variables at points of the unconstrained space."""
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    outputs = model.replace_rvs_by_values(model.free_RVs)
-    # Machine code would take seconds to compile.
-    function = compile_pymc(values, outputs, mode="FAST_COMPILE")
-    names = [rv.name for rv in model.free_RVs]
-    found = [function(*(point[value.name] for value in values)) for point in points]
-    return [dict(zip(names, map(np.asarray, of_point), strict=True)) for of_point in found]
+    values = ConstrainedValues(model)
+    return [values(x) for x in population[chosen]]

@@ -10,12 +10,15 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from pymc.model import Model
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.progress import row_progress
+from pymc_statespace_filters.pymc_model.support import can_sample
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
 N_POINTS = 256
@@ -27,6 +30,28 @@ _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 Array = NDArray[np.float64]
 # From points (m, d) to log-densities (m,) of the prior and of the posterior.
 Densities = Callable[[Array], tuple[Array, Array]]
+
+
+def population_of(model: Model, rng: np.random.Generator, *, progressbar: bool) -> Array:
+    """Points (m, d) distributed nearly as a model's posterior, on the unconstrained space.
+
+    Raises
+    ------
+    ModelError
+        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive
+        likelihood.
+    """
+    if model.discrete_value_vars:
+        names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
+        raise ModelError(f"model must have continuous free variables only, got discrete {names}")
+    if improper := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
+        raise ModelError(
+            f"the prior of {', '.join(improper)} is improper and cannot be sampled: "
+            "give it a proper prior"
+        )
+    target = Target(model, None, DRAMSettings())
+    target.prepare()
+    return find_population(target, rng, progressbar=progressbar)
 
 
 def find_population(target: Target, rng: np.random.Generator, *, progressbar: bool) -> Array:

@@ -1,0 +1,113 @@
+"""The result `MaximumLikelihoodEstimate`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class MaximumLikelihoodEstimate:
+    """A maximum of the likelihood with standard errors, as `maximum_likelihood` finds it.
+
+    Attributes
+    ----------
+    estimate : dict of str to ndarray
+        The free variables by name, in the model's units and shapes. It can be an entry of
+        ``initvals`` for `sample_dram` and ``pm.sample``.
+    log_likelihood : float
+        The natural logarithm of everything in the model except the priors of the free variables,
+        Potentials included. If the likelihood is a random estimate, the logarithm of the mean of
+        200 fresh ones.
+    log_likelihood_se : float
+        Its standard error due to the noise of the likelihood; 0 if the likelihood is deterministic.
+    standard_errors : dict of str to ndarray
+        Of `estimate`, from the curvature of the log-likelihood (the observed information), in the
+        same units and shapes. NaN for the scalars in `reasons`.
+    reasons : dict of str to str
+        Why a scalar of a free variable has no standard error, by its label.
+    simulation_errors : dict of str to ndarray
+        Standard deviations by which the noise of the likelihood displaces `estimate`; 0 if it is
+        deterministic, NaN for the scalars in `reasons` otherwise. `standard_errors` do not include
+        them.
+    covariance : pandas.DataFrame
+        Covariance of the estimate in the model's units, by the labels of all scalars, variable
+        after variable, flattened in C order. Its diagonal are the squares of `standard_errors`.
+    unconstrained : ndarray (k,)
+        The estimate on the unconstrained space: the value variables in the order of
+        ``model.free_RVs``, each flattened in C order.
+    hessian : ndarray (k, k)
+        Second derivatives of the log-likelihood at `unconstrained`, in its order. NaN for
+        parameters at the edge of a support without a transform.
+    notes : tuple of str
+        What limits the accuracy; empty if nothing does.
+    n_evaluations : int
+        Of the likelihood, in all.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> with pm.Model():
+    ...     mu = pm.Normal("mu", 0, 100)
+    ...     y = pm.Normal("y", mu, 0.2, observed=[1.2, 1.1, 1.3, 1.2])
+    ...     found = psf.maximum_likelihood(random_seed=1)
+    >>> isinstance(found, psf.MaximumLikelihoodEstimate)
+    True
+    >>> found.covariance.round(6)
+            mu
+    mu    0.01
+    """
+
+    estimate: Mapping[str, np.ndarray]
+    log_likelihood: float
+    log_likelihood_se: float
+    standard_errors: Mapping[str, np.ndarray]
+    reasons: Mapping[str, str]
+    simulation_errors: Mapping[str, np.ndarray]
+    covariance: pd.DataFrame
+    unconstrained: np.ndarray
+    hessian: np.ndarray
+    notes: tuple[str, ...]
+    n_evaluations: int
+
+    def summary(self) -> pd.DataFrame:
+        """A row for each scalar: estimate, its errors, and why there is no standard error.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Index ``parameter``; columns ``estimate``, ``standard_error``, ``simulation_error`` (if
+            the likelihood is noisy) and ``reason``.
+        """
+        columns = {"estimate": self.estimate, "standard_error": self.standard_errors}
+        if self.log_likelihood_se > 0:
+            columns["simulation_error"] = self.simulation_errors
+        labels = self.covariance.index
+        table = pd.DataFrame(
+            {name: flattened(values) for name, values in columns.items()},
+            index=pd.Index(labels, name="parameter"),
+        )
+        return table.assign(reason=[self.reasons.get(label, "") for label in labels])
+
+    def _headline(self) -> str:
+        error = f" ± {self.log_likelihood_se:.2g}" if self.log_likelihood_se > 0 else ""
+        return f"Maximum likelihood: log-likelihood {self.log_likelihood:.4f}{error}"
+
+    def _shown(self) -> pd.DataFrame:
+        """The summary, without a column of reasons if there are none."""
+        return self.summary() if self.reasons else self.summary().drop(columns="reason")
+
+    def __repr__(self) -> str:
+        notes = [f"Note: {note}." for note in self.notes]
+        return "\n".join([self._headline(), self._shown().to_string(), *notes])
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<p>Note: {note}.</p>" for note in self.notes)
+        return f"<p>{self._headline()}</p>{self._shown().to_html()}{notes}"
+
+
+def flattened(values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """All scalars of named arrays, (n,): array after array, in C order."""
+    return np.concatenate([np.ravel(value) for value in values.values()]).astype(np.float64)

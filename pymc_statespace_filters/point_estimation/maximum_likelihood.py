@@ -1,0 +1,174 @@
+"""``maximum_likelihood``: the parameters under which the data are most probable."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pymc.model import Model, modelcontext
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.point_estimation.estimate import MaximumLikelihoodEstimate
+from pymc_statespace_filters.point_estimation.noisy import maximize_estimated
+from pymc_statespace_filters.point_estimation.peak import Peak
+from pymc_statespace_filters.point_estimation.smooth import maximize_smooth
+from pymc_statespace_filters.point_estimation.standard_errors import errors_of, scalar_labels
+from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
+from pymc_statespace_filters.pymc_model.factors import ModelFactors
+from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS, Population
+from pymc_statespace_filters.sampling.starts.population import population_of
+from pymc_statespace_filters.system.checks import check_random_seed
+
+Array = NDArray[np.float64]
+
+
+def maximum_likelihood(
+    model: Model | None = None, *, random_seed: int | np.random.Generator | None = None
+) -> MaximumLikelihoodEstimate:
+    r"""Find the parameters of largest likelihood, with standard errors.
+
+    No draws are needed, and no start: 256 draws of the prior are led to the posterior, as in
+    `find_starts`, and the searches start from there. The priors say only where to look. They have
+    no part in the maximum.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        Default: the model of the ``with`` block. Its free variables must be continuous, and their
+        priors proper.
+    random_seed : int or numpy.random.Generator, optional
+
+    Returns
+    -------
+    MaximumLikelihoodEstimate
+        Its ``estimate`` and ``standard_errors`` hold the free variables by name, in the model's
+        units and shapes, and ``summary()`` is a table of them. ``log_likelihood`` is the logarithm
+        of everything in the model except the priors of free variables. ``covariance`` is that of
+        the estimate in the model's units, and ``hessian`` (k, k) the curvature on the unconstrained
+        space.
+
+    Raises
+    ------
+    ModelError
+        If an argument is not as described, the model has no observed variable and no Potential, a
+        free variable is discrete, a prior cannot be drawn from (as ``pm.Flat``), or no draw of the
+        prior has a positive likelihood.
+
+    Notes
+    -----
+    A deterministic likelihood (EKF, UKF, IPLF, GridFilter, PyMC's own) is maximised by Newton's
+    method with finite differences, from up to five points of the population that lie far apart. The
+    largest maximum found counts. It is refined until a Newton step is shorter than 1e-6 standard
+    errors.
+
+    If the likelihood is estimated (EnKF, BootstrapPF, GuidedPF, PFEnKF), quadratics are fitted to
+    estimates around the maximum [1]_. This finds the maximum of the expected likelihood with the
+    errors ``simulation_errors`` and ``log_likelihood_se``, which decrease with more particles; the
+    notes give their size in standard errors. They contain no misfit of the quadratic, which is
+    fitted over 0.6 standard errors; by it the standard errors differ from those of the exact
+    likelihood by 10 to 20 %.
+
+    Standard errors are from the observed information, the Hessian H of the log-likelihood on the
+    unconstrained space: :math:`\sqrt{\operatorname{diag}(-J H^{-1} J^\top)}`, with the Jacobian J
+    of the parameters in the model's units. At a maximum that is the inverse information in these
+    units. They hold for long records [2]_. A parameter has none at a bound, such as a scale of
+    zero, and if the likelihood does not determine it: ``reasons`` says which. A parameter at a
+    bound counts as known for the errors of the others.
+
+    The population costs 3000 to 16 000 evaluations of the likelihood, in threads; Newton's method
+    about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000.
+
+    If the likelihood has several maxima, the largest need not be where the posterior has any mass;
+    it is then not found. Maxima less than two nats lower are named in the notes.
+
+    References
+    ----------
+    .. [1] E. L. Ionides, C. Breto, J. Park, R. A. Smith and A. A. King (2017). Monte Carlo profile
+       confidence intervals for dynamic systems. Journal of the Royal Society Interface 14,
+       20170126.
+    .. [2] O. E. Barndorff-Nielsen and D. R. Cox (1994). Inference and Asymptotics. Chapman & Hall,
+       section 3.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> walk = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> record = psf.simulate(walk, {"a": 0.8}, steps=range(100), random_seed=1)
+    >>> with pm.Model():
+    ...     a = pm.Uniform("a", 0, 1)
+    ...     d = psf.StateSpace(
+    ...         "d", walk, psf.EKF(), steps=range(100), observed=record["observations"]
+    ...     )
+    ...     found = psf.maximum_likelihood(random_seed=1)
+    >>> found
+    Maximum likelihood: log-likelihood -155.5885
+               estimate  standard_error
+    parameter
+    a          0.578093        0.108064
+    """
+    if not isinstance(model, Model | None):
+        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
+    model = modelcontext(model)
+    if not (model.observed_RVs or model.potentials):
+        raise ModelError("model must have an observed variable or a Potential, got neither")
+    rng = check_random_seed(random_seed)
+    factors, n_evaluations = ModelFactors(model), 0
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        nonlocal n_evaluations
+        n_evaluations += len(x)
+        return factors.evaluate(x, rng)
+
+    x = population_of(model, rng, progressbar=False)[::N_SWEEPS]
+    population = Population(x, *evaluate(x))
+    if factors.is_noisy:
+        peak = maximize_estimated(lambda x: evaluate(x)[1], population, rng)
+    else:
+        peak = maximize_smooth(lambda x: evaluate(x)[1], population)
+    return _described(model, peak, population.x, n_evaluations)
+
+
+def _described(
+    model: Model, peak: Peak, population: Array, n_evaluations: int
+) -> MaximumLikelihoodEstimate:
+    """The maximum in the model's units."""
+    values = ConstrainedValues(model)
+    estimate = values(peak.point)
+    labels = scalar_labels(model, estimate)
+    covariance, simulation, reasons = errors_of(values, peak, population, labels)
+    ends = np.cumsum([value.size for value in estimate.values()])[:-1]
+
+    def named(flat: Array) -> dict[str, np.ndarray]:
+        parts = zip(estimate.items(), np.split(flat, ends), strict=True)
+        return {name: part.reshape(value.shape) for (name, value), part in parts}
+
+    return MaximumLikelihoodEstimate(
+        estimate=estimate,
+        log_likelihood=peak.value,
+        log_likelihood_se=peak.value_se,
+        standard_errors=named(np.sqrt(np.diag(covariance))),
+        reasons=reasons,
+        simulation_errors=named(simulation),
+        covariance=pd.DataFrame(covariance, index=labels, columns=labels),
+        unconstrained=peak.point,
+        hessian=peak.hessian,
+        notes=(*peak.notes, *_notes_on_rivals(peak, values)),
+        n_evaluations=n_evaluations,
+    )
+
+
+def _notes_on_rivals(peak: Peak, values: ConstrainedValues) -> Iterator[str]:
+    for point, value in peak.rivals:
+        named = ", ".join(
+            f"{name} = {np.array2string(found, precision=4)}"
+            for name, found in values(point).items()
+        )
+        yield f"another maximum, {peak.value - value:.2f} nats lower, is at {named}"

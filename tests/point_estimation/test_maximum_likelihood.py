@@ -1,0 +1,268 @@
+"""`maximum_likelihood`: exact maxima and standard errors, and reasons where there are none."""
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import chi2, multinomial, norm
+
+import pymc_statespace_filters as psf
+from benchmarks.posteriors import HARDENING, narrow
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model.factors import ModelFactors
+from pymc_statespace_filters.testing import kalman_log_likelihood
+from tests.sampling.autoregression import autoregression, simulated
+
+STEPS = np.arange(1, 81)
+
+
+def test_regression_by_least_squares_whatever_the_prior():
+    """The prior of the coefficients is ten standard errors away from them."""
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((60, 3)) @ [[1.0, 0.9, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 5.0]]
+    y = x @ [1.0, -2.0, 0.5] + 0.7 * rng.standard_normal(60)
+    with pm.Model(coords={"column": ["one", "two", "three"]}):
+        beta = pm.Normal("beta", 3.0, 0.5, dims="column")
+        sigma = pm.HalfNormal("sigma", 5.0)
+        pm.Normal("y", x @ beta, sigma, observed=y)
+        found = psf.maximum_likelihood(random_seed=1)
+
+    exact = np.linalg.lstsq(x, y)[0]
+    spread = np.sqrt(((y - x @ exact) ** 2).mean())
+    covariance = spread**2 * np.linalg.inv(x.T @ x)
+    np.testing.assert_allclose(found.estimate["beta"], exact, atol=1e-7)
+    assert found.estimate["sigma"] == pytest.approx(spread, abs=1e-7)
+    np.testing.assert_allclose(
+        found.standard_errors["beta"], np.sqrt(np.diag(covariance)), rtol=1e-5
+    )
+    assert found.standard_errors["sigma"] == pytest.approx(spread / np.sqrt(120), rel=1e-5)
+    assert found.log_likelihood == pytest.approx(norm.logpdf(y, x @ exact, spread).sum(), abs=1e-9)
+    assert list(found.covariance) == ["beta[one]", "beta[two]", "beta[three]", "sigma"]
+    np.testing.assert_allclose(found.covariance.values[:3, :3], covariance, rtol=1e-5)
+    # value variables: beta, log sigma; the information of log sigma is 2 n
+    np.testing.assert_allclose(found.hessian[:3, :3], -np.linalg.inv(covariance), rtol=1e-5)
+    assert found.hessian[3, 3] == pytest.approx(-120, rel=1e-5)
+    assert found.unconstrained[3] == pytest.approx(np.log(spread), abs=1e-7)
+    assert (found.log_likelihood_se, found.notes, dict(found.reasons)) == (0.0, (), {})
+    assert not found.simulation_errors["beta"].any()
+
+
+def test_shares_and_a_potential():
+    """Three shares on two unconstrained dimensions; a Potential is a part of the likelihood."""
+    counts = np.array([30, 50, 120])
+    with pm.Model() as model:
+        shares = pm.Dirichlet("p", [8.0, 1.0, 1.0])
+        pm.Multinomial("n", 150, shares, observed=[20, 40, 90])
+        pm.Potential("more", (pt.log(shares) * [10, 10, 30]).sum())
+    found = psf.maximum_likelihood(model, random_seed=1)
+    p = counts / 200
+    np.testing.assert_allclose(found.estimate["p"], p, atol=1e-8)
+    np.testing.assert_allclose(
+        found.covariance, (np.diag(p) - np.outer(p, p)) / 200, rtol=1e-5, atol=1e-9
+    )
+    exact = multinomial.logpmf([20, 40, 90], 150, p) + np.log(p) @ [10, 10, 30]
+    # PyMC has the factorials in single precision
+    assert found.log_likelihood == pytest.approx(exact, abs=1e-4)
+    assert found.hessian.shape == (2, 2)
+
+
+class TestAutoregression:
+    """The exact likelihood is Kalman's."""
+
+    observed = simulated(STEPS, 1, 0.8, 0.5, observation_noise=0.2)
+
+    def exact_log_likelihood(self, parameters):
+        phi, spread = parameters
+        arguments = [[[phi]], [[spread**2]], [[1.0]], [[0.2]], [0.0], [[1.0]]]
+        return kalman_log_likelihood(
+            *map(np.array, arguments), observed=self.observed[:, None], steps=STEPS
+        ).sum()
+
+    def exact(self):
+        """Maximum and covariance by SciPy, in the model's units."""
+        settings = {"method": "Nelder-Mead", "options": {"xatol": 1e-9, "fatol": 1e-13}}
+        point = minimize(lambda p: -self.exact_log_likelihood(p), [0.8, 0.5], **settings).x
+        h, information = 1e-3, np.empty((2, 2))
+        for i, j in np.ndindex(2, 2):
+            moves = h * np.eye(2)[i], h * np.eye(2)[j]
+            corners = [
+                s * t * self.exact_log_likelihood(point + s * moves[0] + t * moves[1])
+                for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            ]
+            information[i, j] = -sum(corners) / (4 * h**2)
+        return point, np.linalg.inv(information)
+
+    def model(self, filter):
+        with pm.Model() as model:
+            pm.Uniform("phi", 0.0, 1.0)
+            pm.HalfNormal("spread", 1.0)
+            system = autoregression(observation_noise=[[0.2]])
+            psf.StateSpace("d", system, filter, steps=STEPS, observed=self.observed)
+        return model
+
+    def test_exact_likelihood(self):
+        found = psf.maximum_likelihood(self.model(psf.EKF()), random_seed=1)
+        point, covariance = self.exact()
+        assert found.estimate["phi"] == pytest.approx(point[0], abs=1e-6)
+        assert found.estimate["spread"] == pytest.approx(point[1], abs=1e-6)
+        np.testing.assert_allclose(found.covariance, covariance, rtol=1e-3)
+        assert found.log_likelihood == pytest.approx(self.exact_log_likelihood(point), abs=1e-9)
+
+    def test_estimated_likelihood(self):
+        """The noise has a standard deviation of one; three seeds, six displacements."""
+        model, (point, covariance) = self.model(psf.BootstrapPF(60)), self.exact()
+        errors, chi_square = np.sqrt(np.diag(covariance)), 0.0
+        for seed in (1, 2, 3):
+            found = psf.maximum_likelihood(model, random_seed=seed)
+            at = np.array([found.estimate["phi"], found.estimate["spread"]])
+            simulation = np.array([*found.simulation_errors.values()])
+            assert (simulation < 0.2 * errors).all()
+            chi_square += (((at - point) / simulation) ** 2).sum()
+            np.testing.assert_allclose([*found.standard_errors.values()], errors, rtol=0.3)
+            assert 0.01 < found.log_likelihood_se < 0.3
+            difference = found.log_likelihood - self.exact_log_likelihood(at)
+            assert abs(difference) < 4 * found.log_likelihood_se
+            assert "quadratic" in found.notes[0]
+        assert "simulation_error" in found.summary()
+        assert chi_square < chi2(6).ppf(0.9999)
+
+
+def test_a_narrow_oscillator():
+    """Its likelihood has many ridges; the search from the truth knows the right one."""
+    model = narrow(HARDENING)
+    found = psf.maximum_likelihood(model, random_seed=1)
+    factors, rng = ModelFactors(model), np.random.default_rng(1)
+    logarithmic = [np.log(HARDENING[n]) for n in ("c", "k", "sigma", "sensor")]
+    truth = [*logarithmic, HARDENING["k3"], np.log(HARDENING["gain"]), HARDENING["x0"]]
+    near = minimize(
+        lambda x: -float(factors.evaluate(x[None], rng)[1][0]),
+        truth,
+        method="Nelder-Mead",
+        options={"xatol": 1e-6, "fatol": 1e-9, "maxfev": 20_000, "adaptive": True},
+    )
+    assert found.log_likelihood == pytest.approx(-near.fun, abs=1e-5)
+    for name, value in HARDENING.items():
+        assert abs(found.estimate[name] - value) < 4 * found.standard_errors[name]
+
+
+def test_of_two_modes_the_higher():
+    """The higher mode has a third of the mass, and both are 500 times narrower than the prior."""
+    with pm.Model() as model:
+        x = pm.Normal("x", 0.0, 10.0, shape=2)
+        modes = [
+            pt.log(w) + pm.logp(pm.Normal.dist(m, sd), x).sum()
+            for w, m, sd in ((2.0, -4.0, 0.04), (1.0, 4.0, 0.02))
+        ]
+        pm.Potential("likelihood", pt.logaddexp(*modes))
+    for seed in (1, 2):
+        found = psf.maximum_likelihood(model, random_seed=seed)
+        np.testing.assert_allclose(found.estimate["x"], 4.0, atol=1e-7)
+        np.testing.assert_allclose(found.standard_errors["x"], 0.02, rtol=1e-5)
+
+
+def test_another_maximum_as_high_is_reported():
+    with pm.Model() as model:
+        x = pm.Normal("x", 0.0, 3.0)
+        pm.Normal("y", x**2, 0.1, observed=4.0)
+    found = psf.maximum_likelihood(model, random_seed=1)
+    assert abs(found.estimate["x"]) == pytest.approx(2.0, abs=1e-7)
+    (note,) = found.notes
+    assert "another maximum, 0.00 nats lower" in note
+    assert f"x = {-2.0 if found.estimate['x'] > 0 else 2.0:.0f}." in note
+
+
+def test_a_scale_of_zero_has_no_standard_error():
+    """The data scatter less than their errors explain."""
+    y = np.array([0.3, -0.5, 0.8, 0.1, -0.2, 0.4])
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 10.0)
+        tau = pm.HalfNormal("tau", 1.0)
+        pm.Normal("y", mu, pt.sqrt(1 + tau**2), observed=y)
+    found = psf.maximum_likelihood(model, random_seed=1)
+    assert found.estimate["tau"] == pytest.approx(0.0, abs=1e-4)
+    assert np.isnan(found.standard_errors["tau"])
+    assert np.isnan(found.covariance.loc["tau", "mu"])
+    assert found.estimate["mu"] == pytest.approx(y.mean(), abs=1e-7)
+    assert found.standard_errors["mu"] == pytest.approx(1 / np.sqrt(6), rel=1e-5)
+    assert found.log_likelihood == pytest.approx(norm.logpdf(y, y.mean(), 1.0).sum(), abs=1e-8)
+    assert list(found.reasons) == ["tau"]
+    assert found.notes == ()  # the other searches ended at the same bound
+    assert "at a bound of its support" in found.summary().loc["tau", "reason"]
+    assert "at a bound of its support" in repr(found)
+
+
+@pytest.mark.parametrize("settings", [{}, {"default_transform": None}])
+def test_upper_bounds(settings):
+    """With and without a transform."""
+    y = np.array([1.9, 2.2, 2.0])
+    with pm.Model() as model:
+        share = pm.Uniform("share", 0.0, 1.0, **settings)
+        other = pm.Normal("other", 0.0, 10.0)
+        pm.Normal("y", pt.stack([share, other]), 0.5, observed=np.stack([y, y], axis=1))
+    found = psf.maximum_likelihood(model, random_seed=1)
+    assert found.estimate["share"] == pytest.approx(1.0, abs=1e-3)
+    assert found.estimate["other"] == pytest.approx(y.mean(), abs=1e-6)
+    assert found.standard_errors["other"] == pytest.approx(0.5 / np.sqrt(3), rel=1e-5)
+    assert np.isnan(found.standard_errors["share"])
+    where = "at the edge of its support" if settings else "at a bound of its support"
+    assert where in found.reasons["share"]
+
+
+def test_parameters_that_the_data_do_not_determine():
+    with pm.Model() as model:
+        a, b, c = (pm.Normal(name, 0.0, 3.0) for name in "abc")
+        pm.Normal("y", pt.stack([a + b, c]), 0.5, observed=[2.0, 1.0])
+    found = psf.maximum_likelihood(model, random_seed=1)
+    assert found.estimate["a"] + found.estimate["b"] == pytest.approx(2.0, abs=1e-6)
+    assert found.standard_errors["c"] == pytest.approx(0.5, rel=1e-5)
+    assert set(found.reasons) == {"a", "b"}
+    assert found.notes == ()
+    for name in "ab":
+        assert np.isnan(found.standard_errors[name])
+        assert found.reasons[name].endswith("level as a, b change together")
+
+
+def test_results_depend_on_the_seed_alone():
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 10.0)
+        pm.Normal("y", mu, 1.0, observed=[1.0, 1.3])
+    first, again = (psf.maximum_likelihood(model, random_seed=1) for _ in range(2))
+    assert first.estimate == again.estimate
+    assert first.n_evaluations == again.n_evaluations
+
+
+class TestRefusals:
+    def refused(self, message, **arguments):
+        with pytest.raises(ModelError, match=message):
+            psf.maximum_likelihood(**arguments)
+
+    def test_discrete_variables(self):
+        with pm.Model() as model:
+            n = pm.Poisson("n", 3)
+            pm.Normal("y", n, 1.0, observed=2.0)
+        self.refused("discrete", model=model)
+
+    def test_improper_priors(self):
+        with pm.Model() as model:
+            mu = pm.Flat("mu")
+            pm.Normal("y", mu, 1.0, observed=2.0)
+        self.refused("prior of mu is improper", model=model)
+
+    def test_nothing_observed(self):
+        with pm.Model() as model:
+            pm.Normal("mu", 0.0, 1.0)
+        self.refused("must have an observed variable or a Potential", model=model)
+
+    def test_impossible_data(self):
+        with pm.Model() as model:
+            x = pm.Normal("x", 0.0, 1.0)
+            pm.Potential("never", pt.switch(x > 100.0, 0.0, -np.inf))
+        self.refused("zero at all of 2048 draws", model=model)
+
+    def test_other_arguments(self):
+        self.refused("model must be a pymc.Model, got str", model="model")
+        with pm.Model() as model:
+            mu = pm.Normal("mu", 0.0, 1.0)
+            pm.Normal("y", mu, 1.0, observed=2.0)
+        self.refused("random_seed must be", model=model, random_seed="one")
