@@ -7,9 +7,9 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pymc.pytensorf import collect_default_updates, reseed_rngs
 from pymc.pytensorf import compile as compile_pymc
-from pymc.pytensorf import reseed_rngs
-from pytensor.tensor.random.type import RandomType
+from pytensor.compile import SharedVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.density import RowFunction
@@ -50,8 +50,7 @@ class ModelPrior:
                 f"the prior of {', '.join(restricted)} cannot be sampled: its transform excludes "
                 "a part of the distribution's support, and the density is not normalised"
             )
-        draw = self._draw
-        generators = [v for v in draw.get_shared() if isinstance(v.type, RandomType)]
+        draw, generators = self._draw
         reseed_rngs(generators, int(rng.integers(2**31)))
         try:
             draws = [np.concatenate(draw()) for _ in range(count)]
@@ -67,12 +66,13 @@ class ModelPrior:
         return found
 
     @cached_property
-    def _draw(self) -> Any:
-        """A function that draws all free variables jointly, on the unconstrained space."""
+    def _draw(self) -> tuple[Any, list[SharedVariable]]:
+        """A function that draws all free variables, unconstrained, and its generators."""
         mapped = []
         for rv in self._model.free_RVs:
             transform = self._model.rvs_to_transforms[rv]
             value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
             mapped.append(pt.flatten(value))
         # Machine code would take seconds to compile and halve the time of a draw, about 0.1 ms.
-        return compile_pymc([], mapped, mode="FAST_COMPILE")
+        draw = compile_pymc([], mapped, mode="FAST_COMPILE")
+        return draw, list(collect_default_updates(inputs=[], outputs=mapped))

@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from tests.evidence.analytic import pilot, autoregressive, gaussian, half_normal
+from tests.evidence.analytic import autoregressive, gaussian, half_normal, pilot
 from tests.evidence.targets import Banana, Regression, TwoModes
 
 LOG_EVIDENCE = -3.7  # of `gaussian`

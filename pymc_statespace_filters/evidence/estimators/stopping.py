@@ -58,7 +58,7 @@ def shortfall(
     """
     if target_se is None or math.hypot(se_draws, se_evaluations) <= target_se:
         return ""
-    if se_evaluations > RATIO * se_draws:
+    if se_evaluations > se_draws:
         return f"{se_evaluations:.2g} nats come from the evaluations: {remedy}"
     needed = n_draws * (1 + RATIO**2) * (se_draws / target_se) ** 2
     return (
