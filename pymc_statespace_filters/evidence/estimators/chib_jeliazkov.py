@@ -55,6 +55,7 @@ from pymc_statespace_filters.evidence.estimators.stopping import (
     FEWEST,
     check_target,
     is_small,
+    ratio_of_errors,
     shortfall,
 )
 from pymc_statespace_filters.evidence.log_mean import (
@@ -222,7 +223,8 @@ def estimate_in_one_block(
         log_density = np.append(log_density, posterior.evaluate(proposals, rng))
         check_overlap(log_density)
         denominator = log_mean_of_independent(proposal.log_alpha_from_center(log_density))
-        if is_small(target_se, numerator.error, denominator.error):
+        ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
+        if is_small(target_se, numerator.error, denominator.error, ratio):
             break
         if n_proposals >= MOST_PROPOSALS // 2:
             break

@@ -17,7 +17,7 @@ from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, NormalProposals
-from pymc_statespace_filters.evidence.estimators.stopping import RATIO
+from pymc_statespace_filters.evidence.estimators.stopping import ratio_of_errors
 from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
@@ -92,25 +92,26 @@ def plan_proposal(
     The draws must not be those to be averaged: a plan fitted to them would bias the estimate. By
     default the number of proposals is that for which the denominator's error is a third of the
     numerator's, or negligible, and at most ``most``. With a target it is that for which the whole
-    error is a little below ``target_se``; if the numerator does not allow this, the denominator's
-    error is half of the numerator's. ``pilot`` has proposals fitted to the draws.
+    error is a little below ``target_se``, or the numerator's dominates. ``pilot`` has proposals
+    fitted to the draws.
     """
     candidates = _candidates(posterior, rng)
     log_evidence = _pilot(posterior, pilot)
-    ratio, enough = (
-        (MAX_ERROR_RATIO, NEGLIGIBLE) if target_se is None else (RATIO, MARGIN * target_se)
-    )
+    enough = NEGLIGIBLE if target_se is None else MARGIN * target_se
 
     def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
-        left = enough**2 - (0.0 if target_se is None else numerator)
+        if target_se is None:
+            ratio, left = MAX_ERROR_RATIO, enough**2
+        else:
+            ratio, left = ratio_of_errors(target_se, numerator**0.5), enough**2 - numerator
         allowed = max(ratio**2 * numerator, left)
         count = n_proposals or int(np.clip(relative / allowed, MIN_PROPOSALS, most))
         return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
     best = min(map(planned, candidates), key=lambda plan: plan.se).proposal
     plans = [planned(replace(best, scale=scale)) for scale in SCALES]
-    return min(plans, key=lambda plan: (max(plan.se, enough), plan.n_proposals))
+    return min(plans, key=lambda plan: (max(plan.se, enough), plan.n_proposals, plan.se))
 
 
 def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal]:

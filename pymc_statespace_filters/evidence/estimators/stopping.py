@@ -7,7 +7,8 @@ log-variance two, the rule then shifts the estimate by a tenth of its standard e
 than a twentieth with log-variance one.
 
 An error with two sources, the draws and the evaluations, is not reduced beyond the point where the
-evaluations contribute half as much as the draws: without them it would be a tenth smaller.
+evaluations contribute half as much as the draws: without them it would be a tenth smaller. If the
+draws' error alone exceeds the target, whatever the evaluations, they stop at its size.
 """
 
 import math
@@ -42,11 +43,19 @@ def totals(posterior: Posterior, target_se: float | None, most: int = MOST) -> I
     yield most
 
 
-def is_small(target_se: float | None, se_draws: float, se_evaluations: float) -> bool:
+def is_small(
+    target_se: float | None, se_draws: float, se_evaluations: float, ratio: float = RATIO
+) -> bool:
     """Whether the error has reached the target, or further evaluations can hardly reduce it."""
     if target_se is None:
         return True
-    return math.hypot(se_draws, se_evaluations) <= target_se or se_evaluations <= RATIO * se_draws
+    se = math.hypot(se_draws, se_evaluations)
+    return se <= target_se or se_evaluations <= ratio * se_draws
+
+
+def ratio_of_errors(target_se: float, se_draws: float) -> float:
+    """The `ratio` of `is_small` if evaluations leave the draws' error as it is."""
+    return RATIO if se_draws < target_se else 1.0
 
 
 def shortfall(
