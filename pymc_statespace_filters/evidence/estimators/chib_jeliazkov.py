@@ -55,7 +55,7 @@ from pymc_statespace_filters.evidence.estimators.stopping import (
     FEWEST,
     check_target,
     is_small,
-    ratio_of_errors,
+    limits,
     shortfall,
 )
 from pymc_statespace_filters.evidence.log_mean import (
@@ -96,7 +96,7 @@ class ChibJeliazkov:
     target_se : float, optional
         Standard error to be reached, with one block and without `n_proposals`. The number of
         proposals is the one predicted to do so, doubled while it does not, from 1000 to at most
-        20 000, or until the error of the draws dominates.
+        20 000. It is at most the number of draws if their error alone exceeds the target.
     """
 
     name: ClassVar[str] = "chib_jeliazkov"
@@ -130,7 +130,12 @@ class ChibJeliazkov:
         if n_blocks == 1:
             single = [
                 estimate_in_one_block(
-                    p.proposal, half, p.n_proposals, target_se=self._target_of_half, rng=rng
+                    p.proposal,
+                    half,
+                    p.n_proposals,
+                    most=self._most_proposals(posterior) // 2,
+                    target_se=self._target_of_half,
+                    rng=rng,
                 )
                 for p, half in pairs
             ]
@@ -204,12 +209,14 @@ def estimate_in_one_block(
     posterior: Posterior,
     n_proposals: int,
     *,
+    most: int = MOST_PROPOSALS,
     target_se: float | None = None,
     rng: np.random.Generator,
 ) -> OneBlockEstimate:
     """Estimate the log-evidence with a proposal fitted to other draws.
 
-    With ``target_se`` the number of proposals is doubled while more of them help to reach it.
+    With ``target_se`` the number of proposals is doubled while more of them help to reach it, up to
+    ``most``.
     """
     # Numerator: the draws, with the log-densities stored by the chain.
     numerator = log_mean_of_chains(
@@ -217,18 +224,19 @@ def estimate_in_one_block(
     )
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
+    ratio = 0.0
+    if target_se is not None:
+        ratio, most = limits(target_se, numerator.error, posterior.log_density.size, most)
     log_density = np.empty(0)
     while True:
         proposals = proposal.sample(n_proposals - len(log_density), rng)
         log_density = np.append(log_density, posterior.evaluate(proposals, rng))
         check_overlap(log_density)
         denominator = log_mean_of_independent(proposal.log_alpha_from_center(log_density))
-        ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
-        if is_small(target_se, numerator.error, denominator.error, ratio):
+        small = is_small(target_se, numerator.error, denominator.error, ratio)
+        if small or n_proposals >= most:
             break
-        if n_proposals >= MOST_PROPOSALS // 2:
-            break
-        n_proposals = min(2 * n_proposals, MOST_PROPOSALS // 2)
+        n_proposals = min(2 * n_proposals, most)
     log_evidence = proposal.log_density - numerator.value + denominator.value
     zero_density = float(np.isneginf(log_density).mean())
     return OneBlockEstimate(

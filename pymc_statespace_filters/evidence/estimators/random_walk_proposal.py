@@ -9,6 +9,7 @@ candidate is averaged over fresh estimates and candidates in holes are discarded
 the smallest predicted error of the evidence is chosen, then the width.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, NormalProposals
-from pymc_statespace_filters.evidence.estimators.stopping import ratio_of_errors
+from pymc_statespace_filters.evidence.estimators.stopping import limits
 from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
@@ -33,6 +34,7 @@ MAX_LOG = 200.0  # avoids overflow of a useless relative variance
 MIN_PROPOSALS = 500  # of the default
 MAX_ERROR_RATIO = 1 / 3  # error of the denominator over that of the numerator
 NEGLIGIBLE = 0.01  # nats, an error that needs no more evaluations
+ROUNDING = 1e-9
 MARGIN = 0.9  # of the target, because the error is only predicted
 
 Array = NDArray[np.float64]
@@ -101,17 +103,21 @@ def plan_proposal(
 
     def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
-        if target_se is None:
-            ratio, left = MAX_ERROR_RATIO, enough**2
-        else:
-            ratio, left = ratio_of_errors(target_se, numerator**0.5), enough**2 - numerator
+        ratio, left, limit = MAX_ERROR_RATIO, enough**2, most
+        if target_se is not None:
+            n_draws = posterior.log_density.size
+            ratio, limit = limits(target_se, numerator**0.5, n_draws, most)
+            left -= numerator
         allowed = max(ratio**2 * numerator, left)
-        count = n_proposals or int(np.clip(relative / allowed, MIN_PROPOSALS, most))
+        count = n_proposals or max(MIN_PROPOSALS, math.ceil(min(relative / allowed, limit)))
         return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
-    best = min(map(planned, candidates), key=lambda plan: plan.se).proposal
-    plans = [planned(replace(best, scale=scale)) for scale in SCALES]
-    return min(plans, key=lambda plan: (max(plan.se, enough), plan.n_proposals, plan.se))
+    def rank(plan: ProposalPlan) -> tuple[float, int, float]:
+        """Of errors that are small enough, the one of the fewest proposals."""
+        return max(plan.se, (1 + ROUNDING) * enough), plan.n_proposals, plan.se
+
+    best = min(map(planned, candidates), key=rank).proposal
+    return min((planned(replace(best, scale=scale)) for scale in SCALES), key=rank)
 
 
 def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal]:

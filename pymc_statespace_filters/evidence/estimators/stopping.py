@@ -8,7 +8,8 @@ than a twentieth with log-variance one.
 
 An error with two sources, the draws and the evaluations, is not reduced beyond the point where the
 evaluations contribute half as much as the draws: without them it would be a tenth smaller. If the
-draws' error alone exceeds the target, whatever the evaluations, they stop at its size.
+draws' error alone exceeds the target, whatever the evaluations, they stop at its size, and at the
+number of draws.
 """
 
 import math
@@ -19,6 +20,7 @@ from pymc_statespace_filters.system.checks import check_positive
 
 FEWEST, MOST = 1000, 16_000  # evaluations with a target
 MOST_WITHOUT_TARGET = 10_000
+DOMINANT = 1.5  # ratio of errors at which the evaluations are to blame
 RATIO = 0.5  # of the evaluations' error to that of the draws, below which more hardly help
 
 
@@ -53,9 +55,12 @@ def is_small(
     return se <= target_se or se_evaluations <= ratio * se_draws
 
 
-def ratio_of_errors(target_se: float, se_draws: float) -> float:
-    """The `ratio` of `is_small` if evaluations leave the draws' error as it is."""
-    return RATIO if se_draws < target_se else 1.0
+def limits(target_se: float, se_draws: float, n_draws: int, most: int) -> tuple[float, int]:
+    """The `ratio` of `is_small`, and the most evaluations, if they leave the draws' error as it is.
+
+    Without a chance to reach the target, evaluations are no more than the draws.
+    """
+    return (RATIO, most) if se_draws < target_se else (1.0, min(n_draws, most))
 
 
 def shortfall(
@@ -67,7 +72,7 @@ def shortfall(
     """
     if target_se is None or math.hypot(se_draws, se_evaluations) <= target_se:
         return ""
-    if se_evaluations > se_draws:
+    if se_evaluations > DOMINANT * se_draws:
         return f"{se_evaluations:.2g} nats come from the evaluations: {remedy}"
     needed = n_draws * (1 + RATIO**2) * (se_draws / target_se) ** 2
     return (
