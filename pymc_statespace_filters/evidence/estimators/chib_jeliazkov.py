@@ -55,7 +55,7 @@ from pymc_statespace_filters.evidence.estimators.stopping import (
     FEWEST,
     check_target,
     is_small,
-    limits,
+    ratio_of_errors,
     shortfall,
 )
 from pymc_statespace_filters.evidence.log_mean import (
@@ -95,8 +95,8 @@ class ChibJeliazkov:
         Number of parameter blocks.
     target_se : float, optional
         Standard error to be reached, with one block and without `n_proposals`. The number of
-        proposals is the one predicted to do so, doubled while it does not, from 1000 to at most
-        20 000. It is at most the number of draws if their error alone exceeds the target.
+        proposals is the one predicted to do so, doubled while it does not, from 1000 to the number
+        of draws, at most 20 000: with fewer draws than proposals, more draws help more.
     """
 
     name: ClassVar[str] = "chib_jeliazkov"
@@ -179,8 +179,6 @@ class ChibJeliazkov:
         return math.sqrt(2) * self.target_se
 
     def _most_proposals(self, posterior: Posterior) -> int:
-        if self._target_of_half is not None:
-            return MOST_PROPOSALS
         return self.n_proposals or min(max(posterior.log_density.size, 1000), MOST_PROPOSALS)
 
     def _proposals_of_run(self, posterior: Posterior) -> int:
@@ -224,9 +222,7 @@ def estimate_in_one_block(
     )
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
-    ratio = 0.0
-    if target_se is not None:
-        ratio, most = limits(target_se, numerator.error, posterior.log_density.size, most)
+    ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
     log_density = np.empty(0)
     while True:
         proposals = proposal.sample(n_proposals - len(log_density), rng)

@@ -18,7 +18,7 @@ from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, NormalProposals
-from pymc_statespace_filters.evidence.estimators.stopping import limits
+from pymc_statespace_filters.evidence.estimators.stopping import ratio_of_errors
 from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
@@ -103,13 +103,11 @@ def plan_proposal(
 
     def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
-        ratio, left, limit = MAX_ERROR_RATIO, enough**2, most
+        ratio, left = MAX_ERROR_RATIO, enough**2
         if target_se is not None:
-            n_draws = posterior.log_density.size
-            ratio, limit = limits(target_se, numerator**0.5, n_draws, most)
-            left -= numerator
+            ratio, left = ratio_of_errors(target_se, numerator**0.5), enough**2 - numerator
         allowed = max(ratio**2 * numerator, left)
-        count = n_proposals or max(MIN_PROPOSALS, math.ceil(min(relative / allowed, limit)))
+        count = n_proposals or math.ceil(np.clip(relative / allowed, MIN_PROPOSALS, most))
         return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
     def rank(plan: ProposalPlan) -> tuple[float, int, float]:

@@ -8,8 +8,7 @@ than a twentieth with log-variance one.
 
 An error with two sources, the draws and the evaluations, is not reduced beyond the point where the
 evaluations contribute half as much as the draws: without them it would be a tenth smaller. If the
-draws' error alone exceeds the target, whatever the evaluations, they stop at its size, and at the
-number of draws.
+draws' error alone exceeds the target, whatever the evaluations, they stop at its size.
 """
 
 import math
@@ -55,12 +54,9 @@ def is_small(
     return se <= target_se or se_evaluations <= ratio * se_draws
 
 
-def limits(target_se: float, se_draws: float, n_draws: int, most: int) -> tuple[float, int]:
-    """The `ratio` of `is_small`, and the most evaluations, if they leave the draws' error as it is.
-
-    Without a chance to reach the target, evaluations are no more than the draws.
-    """
-    return (RATIO, most) if se_draws < target_se else (1.0, min(n_draws, most))
+def ratio_of_errors(target_se: float, se_draws: float) -> float:
+    """The `ratio` of `is_small` if evaluations leave the draws' error as it is."""
+    return RATIO if se_draws < target_se else 1.0
 
 
 def shortfall(
