@@ -142,10 +142,8 @@ def evidences(models: dict, results: dict, args: argparse.Namespace) -> dict:
     """Estimate the evidence of every model by two estimators."""
     found = {}
     for name, idata in results.items():
-        # Both estimators evaluate the likelihood up to once for each draw. Neighbouring draws of a
-        # chain are alike: every eighth has nearly all the information, for an eighth of the time.
         found[name] = psf.estimate_evidence(
-            idata.isel(draw=slice(None, None, 8)),
+            idata,
             models[name],
             random_seed=args.seed,
             progressbar=args.progressbar,

@@ -25,8 +25,10 @@ class Agreement:
     ----------
     p_value : float
         Of Cochran's chi-square test of homogeneity, which treats the estimates as independent.
-        Estimates from the same draws have correlated errors, so that the test is conservative for
-        them. 1 if fewer than two estimates have a standard error.
+        Estimates from the same draws, or of the same proposals as those of "bridge" and
+        "warp_bridge", have correlated errors: they differ by less than independent ones, and the
+        test is conservative. An error that they have in common is part of the standard error of
+        each, and no difference shows it. 1 if fewer than two estimates have a standard error.
     difference : float
         Largest minus smallest estimate, in nats.
     diagnosis : str

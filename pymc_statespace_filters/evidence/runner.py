@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 from zlib import crc32
 
@@ -29,6 +30,7 @@ from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, 
 from pymc_statespace_filters.pymc_model.support import Support
 
 MAXIMUM = "maximum likelihood"
+SHARED = "shared proposals"
 
 
 def run_estimators(
@@ -61,7 +63,8 @@ def run_estimators(
         *check_convergence(posterior),
         *check_discretisation(density.model, idata, posterior.draws),
     )
-    entropy = np.random.default_rng(random_seed).integers(2**63, size=2)
+    entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
+    posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
 
     def stream(name: str) -> np.random.Generator:
         """An estimator's random numbers, independent of which others run."""
@@ -84,6 +87,9 @@ def run_estimators(
             f"log-evidence {number} is less certain than its standard error suggests",
             estimate.doubts,
         )
+        if estimate.shortfall:
+            error = f"has a standard error of {estimate.se:.2g}, above target_se"
+            _warn(f"log-evidence {number} {error}", [estimate.shortfall])
         doubts = "; ".join((*common, *estimate.doubts))
         found[name] = Evidence(estimate.log_evidence, estimate.se, name, doubts=doubts, **of_model)
         if extend_inferencedata:

@@ -3,10 +3,11 @@
 import numpy as np
 from scipy.stats import multivariate_normal
 
+from pymc_statespace_filters.evidence.estimators.normal_proposals import NormalProposals
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.targets import Regression, autoregressive
 
-__all__ = ["Regression", "autoregressive", "gaussian", "half_normal"]
+__all__ = ["Regression", "autoregressive", "gaussian", "half_normal", "pilot"]
 
 
 def gaussian(k, shape, rng, *, correlation=0.0, noise_sd=0.0, log_evidence=-3.7):
@@ -38,3 +39,8 @@ def half_normal(shape, rng):
         return np.where(x[:, 0] > 0, -0.5 * x[:, 0] ** 2, -np.inf)
 
     return Posterior(draws, -0.5 * draws[..., 0] ** 2, evaluate)
+
+
+def pilot(posterior):
+    """The proposals from which Chib and Jeliazkov's plan is made."""
+    return NormalProposals(posterior, [40])

@@ -13,7 +13,7 @@ from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import (
 )
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import plan_proposal
 from pymc_statespace_filters.evidence.log_mean import log_mean_of_chains, log_mean_of_independent
-from tests.evidence.analytic import Regression, gaussian, half_normal
+from tests.evidence.analytic import Regression, gaussian, half_normal, pilot
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
 
@@ -105,7 +105,9 @@ def test_the_gap_between_halves_is_in_units_of_its_error(monkeypatch):
 def test_proposals_without_density_count_as_zeros():
     rng = np.random.default_rng(13)
     posterior = half_normal((4, 5000), rng)
-    proposal = plan_proposal(posterior, n_proposals=5000, most=5000, rng=rng).proposal
+    proposal = plan_proposal(
+        posterior, pilot(posterior), n_proposals=5000, most=5000, rng=rng
+    ).proposal
     found = estimate_in_one_block(replace(proposal, scale=2.0), posterior, 5000, rng=rng)
     assert found.se < 0.03
     assert abs(found.log_evidence - 0.5 * np.log(np.pi / 2)) < 4 * found.se
@@ -136,7 +138,9 @@ class TestNoisyLikelihood:
     def test_the_constant_at_the_centre_does_not_matter(self, shift):
         rng = np.random.default_rng(15)
         posterior = self.posterior(rng)
-        proposal = plan_proposal(posterior, n_proposals=10_000, most=10_000, rng=rng).proposal
+        proposal = plan_proposal(
+            posterior, pilot(posterior), n_proposals=10_000, most=10_000, rng=rng
+        ).proposal
         shifted = replace(proposal, log_density=proposal.log_density + shift)
         found = estimate_in_one_block(shifted, posterior, 10_000, rng=rng)
         assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
@@ -144,7 +148,9 @@ class TestNoisyLikelihood:
     def test_two_constants_would_matter(self):
         rng = np.random.default_rng(15)
         posterior = self.posterior(rng)
-        one = plan_proposal(posterior, n_proposals=10_000, most=10_000, rng=rng).proposal
+        one = plan_proposal(
+            posterior, pilot(posterior), n_proposals=10_000, most=10_000, rng=rng
+        ).proposal
         other = replace(one, log_density=one.log_density + 1.0)
         numerator = log_mean_of_chains(
             other.log_alpha_to_center(posterior.log_density) + other.log_q(posterior.draws)
@@ -173,7 +179,9 @@ def test_two_separate_modes_are_centred_in_one_of_them():
         evaluate=lambda x, rng: log_density(x),
     )
     found = ChibJeliazkov(5000).estimate(posterior, rng=rng)
-    point = plan_proposal(posterior, n_proposals=5000, most=10_000, rng=rng).proposal.point
+    point = plan_proposal(
+        posterior, pilot(posterior), n_proposals=5000, most=10_000, rng=rng
+    ).proposal.point
     assert abs(point[0]) > 3
     assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.4
 

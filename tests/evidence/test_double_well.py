@@ -16,7 +16,7 @@ def estimates(n_draws, estimators):
         n_draws, tune=1000, chains=4, model=model, random_seed=2, progressbar=False
     )
     return psf.estimate_evidence(
-        idata, model, estimators=estimators, random_seed=3, progressbar=False
+        idata, model, estimators=estimators, target_se=0.1, random_seed=3, progressbar=False
     )
 
 

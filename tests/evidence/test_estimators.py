@@ -45,10 +45,13 @@ def test_every_estimator_meets_the_truth(found):
         if name == "laplace":  # exact, for this posterior is a Gaussian
             assert np.isnan(evidence.se)
             assert evidence.log_evidence == pytest.approx(REGRESSION.log_evidence, abs=1e-4)
+        elif name == "prior_monte_carlo":  # rests on one or two draws, and says so
+            assert "draws of the prior, fewer than 100" in evidence.doubts
         else:
-            assert 0 < evidence.se < (2.0 if name == "prior_monte_carlo" else 0.3)
+            assert 0 < evidence.se < 0.3
             assert abs(evidence.log_evidence - REGRESSION.log_evidence) < 4 * evidence.se
-    assert found.agreement
+    others = {name: e for name, e in found.items() if name != "prior_monte_carlo"}
+    assert EvidenceEstimates(others).agreement
 
 
 def test_all_are_stored_beside_the_draws(found, idata):
@@ -59,8 +62,11 @@ def test_all_are_stored_beside_the_draws(found, idata):
 
 
 def test_an_estimate_does_not_depend_on_its_company(found, idata, model):
-    alone = psf.chib_jeliazkov(idata, model, random_seed=5, extend_inferencedata=False)
-    assert alone.log_evidence == found["chib_jeliazkov"].log_evidence
+    for name in ("chib_jeliazkov", "bridge", "warp_bridge", "importance"):
+        alone = psf.estimate_evidence(
+            idata, model, estimators=name, random_seed=5, extend_inferencedata=False
+        )
+        assert alone[name] == found[name]
 
 
 def test_a_single_name_will_do(idata, model):

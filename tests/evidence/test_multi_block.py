@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from tests.evidence.analytic import autoregressive, gaussian, half_normal
+from tests.evidence.analytic import autoregressive, gaussian, half_normal, pilot
 from tests.evidence.targets import Banana, Regression, TwoModes
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
@@ -130,7 +130,9 @@ class TestNoisyLikelihood:
     def test_the_constant_at_the_centre_does_not_matter(self, shift):
         rng = np.random.default_rng(25)
         posterior = self.posterior(rng)
-        proposal = plan_proposal(posterior, n_proposals=1000, most=1000, rng=rng).proposal
+        proposal = plan_proposal(
+            posterior, pilot(posterior), n_proposals=1000, most=1000, rng=rng
+        ).proposal
         shifted = replace(proposal, log_density=proposal.log_density + shift)
         found = estimate_in_blocks(shifted, posterior, n_blocks=2, n_proposals=4000, rng=rng)
         assert agrees(found, LOG_EVIDENCE, se=0.08)
@@ -304,7 +306,9 @@ def test_walkers_that_hardly_move_are_a_doubt():
 def test_no_density_at_the_centre_of_a_block():
     rng = np.random.default_rng(36)
     posterior = gaussian(2, (4, 500), rng)
-    proposal = plan_proposal(posterior, n_proposals=500, most=500, rng=rng).proposal
+    proposal = plan_proposal(
+        posterior, pilot(posterior), n_proposals=500, most=500, rng=rng
+    ).proposal
     nowhere = replace(posterior, evaluate=lambda x, rng: np.full(len(x), -np.inf))
     with pytest.raises(DataMismatchError, match="n_blocks=1"):
         estimate_in_blocks(proposal, nowhere, n_blocks=2, n_proposals=500, rng=rng)

@@ -6,7 +6,7 @@ import pytest
 from pymc_statespace_filters.evidence.estimators import random_walk_proposal as _proposal
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from tests.evidence.analytic import gaussian
+from tests.evidence.analytic import gaussian, pilot
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
 
@@ -39,7 +39,9 @@ def test_the_pilot_meets_the_evidence_roughly(noise_sd):
     rng = np.random.default_rng(71)
     posterior = gaussian(3, (4, 1000), rng, noise_sd=noise_sd)
     # Of 500 proposals, whose weights have a standard deviation of 1.3 with noise: an error of 0.06.
-    assert abs(_proposal._pilot(posterior, rng) - LOG_EVIDENCE) < 0.01 + 0.25 * noise_sd
+    assert (
+        abs(_proposal._pilot(posterior, pilot(posterior)) - LOG_EVIDENCE) < 0.01 + 0.25 * noise_sd
+    )
 
 
 def test_no_centre_lies_in_the_hole_of_a_ring():
@@ -73,7 +75,7 @@ def test_the_constant_of_a_noisy_likelihood_is_an_average():
 def test_the_error_is_the_promised_one():
     rng = np.random.default_rng(74)
     posterior = gaussian(4, (4, 5000), rng)
-    plan = plan_proposal(posterior, n_proposals=2000, most=2000, rng=rng)
+    plan = plan_proposal(posterior, pilot(posterior), n_proposals=2000, most=2000, rng=rng)
     assert plan.n_proposals == 2000
     numerator, denominator = _proposal._predicted_variances(plan.proposal, posterior, LOG_EVIDENCE)
     assert plan.se == pytest.approx((numerator + denominator / 2000) ** 0.5, rel=0.05)

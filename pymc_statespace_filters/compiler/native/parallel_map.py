@@ -68,6 +68,10 @@ class ParallelMap:
         n_threads = min(available_cores(), max(1, len(rows)))
         ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
         control = np.zeros((n_threads, 2), dtype=np.int64)
+        if len(rows) == 1:  # as in a search; a thread would take a millisecond
+            self._call_part(rows, results, control[0])
+            self.on_progress(1)
+            return results
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
         with ThreadPoolExecutor(n_threads) as pool:
             futures = [

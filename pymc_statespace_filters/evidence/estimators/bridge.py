@@ -39,7 +39,7 @@ draw has the noise of the chain, its image fresh noise.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,8 +50,18 @@ from scipy.optimize import brentq
 from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
+from pymc_statespace_filters.evidence.estimators.normal_proposals import (
+    NormalProposals,
+    normal_proposals,
+)
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.whitening import moments
+from pymc_statespace_filters.evidence.estimators.stopping import (
+    check_target,
+    is_small,
+    shortfall,
+    totals,
+)
+from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
     LogMean,
@@ -60,7 +70,6 @@ from pymc_statespace_filters.evidence.log_mean import (
 )
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 
-FEWEST_TERMS, MOST_TERMS = 1000, 10_000  # proposals, or mirror images of draws, in both halves
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # the error of `MIN_EFFECTIVE` terms of relative variance one
 MAX_GAP = 4.0
 
@@ -71,23 +80,28 @@ Array = NDArray[np.float64]
 class Bridge:
     """Bridge sampling to a normal distribution fitted to the draws (Meng and Wong 1996).
 
-    The number of proposals is that of the draws, within 1000 to 10 000: beyond that the error of
-    the draws usually dominates.
-
     Parameters
     ----------
     warped : bool
         Whether to reflect the posterior about its mean at random (warp-III, Meng and Schilling
         2002). This suits skewed posteriors and takes three times as many evaluations.
+    target_se : float, optional
+        Standard error to be reached. The number of proposals is doubled from 1000 to at most 16 000
+        until it is, or until the error of the draws dominates. By default it is the number of
+        draws, within 1000 to 10 000. Warped, as many draws are reflected.
 
     Examples
     --------
     >>> from pymc_statespace_filters.evidence.estimators.bridge import Bridge
     >>> Bridge(warped=True)
-    Bridge(warped=True)
+    Bridge(warped=True, target_se=None)
     """
 
     warped: bool = False
+    target_se: float | None = None
+
+    def __post_init__(self) -> None:
+        check_target(self.target_se)
 
     @property
     def name(self) -> str:
@@ -95,21 +109,28 @@ class Bridge:
         return "warp_bridge" if self.warped else "bridge"
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """One per proposal; warped, also one per mirror image."""
-        return _n_terms(posterior) * (3 if self.warped else 1)
+        """One per proposal; warped, also one per mirror image. With a target, the fewest."""
+        return next(totals(posterior, self.target_se)) * (3 if self.warped else 1)
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from the draws and further log-density evaluations."""
-        n_proposals = _n_terms(posterior) // 2
         pooled = moments(posterior.draws)
-        first, second = posterior.halves()
-        folds = [
-            self._estimate_fold(fitted, averaged, pooled, n_proposals, rng=rng)
-            for fitted, averaged in ((first, second), (second, first))
+        proposals = normal_proposals(posterior, rng)
+        halves = reversed(posterior.halves())  # those to be averaged
+        samples = [
+            (_Warped if self.warped else _Plain)(q, averaged, pooled)
+            for q, averaged in zip(proposals, halves, strict=True)
         ]
-        common = math.prod(fold.common for fold in folds)
-        se_draws = math.sqrt(sum(fold.draws.error**2 for fold in folds) + 2 * common) / 2
-        se_proposals = math.hypot(*(fold.proposals.error for fold in folds)) / 2
+        for n_proposals in totals(posterior, self.target_se):
+            folds = [sample.bridged(n_proposals // 2, rng) for sample in samples]
+            se_draws, se_proposals = _errors(folds)
+            if is_small(self.target_se, se_draws, se_proposals):
+                break
+        return self._summary(folds, posterior.log_density.size, 2 * (n_proposals // 2))
+
+    def _summary(self, folds: Sequence["_Fold"], n_draws: int, n_proposals: int) -> Estimate:
+        """The average of both folds."""
+        se_draws, se_proposals = _errors(folds)
         se = math.hypot(se_draws, se_proposals)
         gap = abs(folds[0].log_evidence - folds[1].log_evidence) / (2 * se)
         n_effective = sum(fold.n_effective for fold in folds)
@@ -117,56 +138,77 @@ class Bridge:
             log_evidence=float(np.mean([fold.log_evidence for fold in folds])),
             se=se,
             settings={
-                "n_draws": posterior.log_density.size,
-                "n_proposals": 2 * n_proposals,
+                "n_draws": n_draws,
+                "n_proposals": n_proposals,
                 "n_effective_draws": n_effective,
                 "se_draws": se_draws,
                 "se_proposals": se_proposals,
                 "zero_density": float(np.mean([fold.zero_density for fold in folds])),
             },
             doubts=tuple(_check(n_effective, se_draws, se_proposals, gap)),
+            shortfall=shortfall(
+                self.target_se,
+                se_draws,
+                se_proposals,
+                n_draws,
+                "reparametrise towards a Gaussian posterior, or use importance sampling",
+            ),
         )
 
-    def _estimate_fold(
-        self,
-        fitted: Posterior,
-        averaged: Posterior,
-        pooled: tuple[Array, Array],
-        n_proposals: int,
-        *,
-        rng: np.random.Generator,
-    ) -> "_Fold":
-        """Bridge from the averaged draws to the normal distribution fitted to the other half."""
-        mean, chol = moments(fitted.draws)
-        q = _normal(mean, chol)
-        proposals = q.rvs(n_proposals, random_state=rng).reshape(n_proposals, -1)
-        at_proposals = averaged.evaluate(proposals, rng)
-        if self.warped:
-            averaged = averaged.thinned(MOST_TERMS // 2)
-            pooled = (mean, pooled[1])  # the reflection was about this mean
-        at_proposals = self._warp(averaged, proposals, at_proposals, mean, rng)
-        check_overlap(at_proposals)
-        draws = averaged.draws.reshape(-1, len(mean))
-        at_draws = self._warp(averaged, draws, averaged.log_density.ravel(), mean, rng)
-        shape = averaged.log_density.shape
+
+class _Plain:
+    """One half of the draws, and proposals fitted to the other half, evaluated as needed."""
+
+    def __init__(self, q: NormalProposals, averaged: Posterior, pooled: Whitening) -> None:
+        self._q, self._averaged, self._pooled = q, averaged, pooled
+
+    def bridged(self, n_proposals: int, rng: np.random.Generator) -> "_Fold":
+        """Bridge from the draws to the first proposals."""
         return _bridge(
-            (at_draws - q.logpdf(draws)).reshape(shape),
-            at_proposals - q.logpdf(proposals),
-            pooled=(at_draws - _normal(*pooled).logpdf(draws)).reshape(shape),
+            self._averaged.draws,
+            self._averaged.log_density,
+            *self._q.first(n_proposals),
+            q=self._q.moments,
+            pooled=self._pooled,
         )
 
-    def _warp(
-        self,
-        posterior: Posterior,
-        x: Array,
-        log_density: Array,
-        mean: Array,
-        rng: np.random.Generator,
-    ) -> Array:
-        """Average the density of x (m, k) with that of its mirror image, if warped."""
-        if not self.warped:
-            return log_density
-        return np.logaddexp(log_density, posterior.evaluate(2 * mean - x, rng)) - math.log(2)
+
+class _Warped:
+    """The same with the average of the posterior and its mirror image about the mean of q."""
+
+    def __init__(self, q: NormalProposals, averaged: Posterior, pooled: Whitening) -> None:
+        self._q, self._averaged = q, averaged
+        self._pooled = pooled._replace(mean=q.moments.mean)  # the reflection was about this mean
+        self._image_of_draw = np.full(averaged.log_density.shape, np.nan)
+        self._image_of_proposal = np.empty(0)
+
+    def bridged(self, n_proposals: int, rng: np.random.Generator) -> "_Fold":
+        """Bridge from about as many draws, thinned evenly, to the first proposals."""
+        proposals, at_proposals = self._q.first(n_proposals)
+        known = len(self._image_of_proposal)
+        images = self._evaluate_images(proposals[known:], rng)
+        self._image_of_proposal = np.append(self._image_of_proposal, images)
+
+        # Powers of two: the draws of a longer step are among those of a shorter one.
+        step = 1
+        while self._averaged.log_density.size > 1.1 * step * n_proposals:
+            step *= 2
+        chosen = np.zeros(self._image_of_draw.shape, dtype=bool)
+        chosen[:, ::step] = True
+        new = chosen & np.isnan(self._image_of_draw)
+        self._image_of_draw[new] = self._evaluate_images(self._averaged.draws[new], rng)
+        at_draws = self._averaged.log_density[:, ::step]
+        return _bridge(
+            self._averaged.draws[:, ::step],
+            np.logaddexp(at_draws, self._image_of_draw[:, ::step]) - math.log(2),
+            proposals,
+            np.logaddexp(at_proposals, self._image_of_proposal) - math.log(2),
+            q=self._q.moments,
+            pooled=self._pooled,
+        )
+
+    def _evaluate_images(self, x: Array, rng: np.random.Generator) -> Array:
+        return self._averaged.evaluate(2 * self._q.moments.mean - x, rng)
 
 
 @dataclass(frozen=True)
@@ -181,7 +223,39 @@ class _Fold:
     zero_density: float  # fraction of the proposals
 
 
-def _bridge(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
+def _errors(folds: Sequence[_Fold]) -> tuple[float, float]:
+    """Errors of the average, from the draws and from the proposals."""
+    common = math.prod(fold.common for fold in folds)
+    se_draws = math.sqrt(sum(fold.draws.error**2 for fold in folds) + 2 * common) / 2
+    return se_draws, math.hypot(*(fold.proposals.error for fold in folds)) / 2
+
+
+def _bridge(
+    draws: Array,
+    log_density: Array,
+    proposals: Array,
+    at_proposals: Array,
+    *,
+    q: Whitening,
+    pooled: Whitening,
+) -> _Fold:
+    """Bridge from draws (chain, draw, k) to proposals (m, k), given their log-densities.
+
+    `pooled` is the normal distribution fitted to all draws.
+    """
+    check_overlap(at_proposals)
+    normal = _normal(q)
+    flat = draws.reshape(-1, draws.shape[-1])
+    log_q = normal.logpdf(flat).reshape(log_density.shape)
+    log_pooled = _normal(pooled).logpdf(flat).reshape(log_density.shape)
+    return _bridge_ratios(
+        log_density - log_q,
+        at_proposals - normal.logpdf(proposals),
+        pooled=log_density - log_pooled,
+    )
+
+
+def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
     """Bridge from log-ratios l = f - ln q at draws (chain, draw) to those at proposals (m,).
 
     `pooled` is what `at_draws` would be under the q fitted to all draws.
@@ -224,12 +298,8 @@ def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float
     return float(brentq(excess, least, most, xtol=1e-9))
 
 
-def _normal(mean: Array, chol: Array) -> Any:
-    return multivariate_normal(mean, Covariance.from_cholesky(chol))
-
-
-def _n_terms(posterior: Posterior) -> int:
-    return min(max(posterior.log_density.size, FEWEST_TERMS), MOST_TERMS)
+def _normal(fitted: Whitening) -> Any:
+    return multivariate_normal(fitted.mean, Covariance.from_cholesky(fitted.chol))
 
 
 def _check(n_effective: float, se_draws: float, se_proposals: float, gap: float) -> Iterator[str]:

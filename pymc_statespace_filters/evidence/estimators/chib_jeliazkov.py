@@ -44,11 +44,19 @@ from pymc_statespace_filters.evidence.estimators.block_ordinates import (
     BlockEstimate,
     estimate_in_blocks,
 )
+from pymc_statespace_filters.evidence.estimators.normal_proposals import normal_proposals
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import (
     Proposal,
     ProposalPlan,
     plan_proposal,
+)
+from pymc_statespace_filters.evidence.estimators.stopping import (
+    FEWEST,
+    check_target,
+    is_small,
+    ratio_of_errors,
+    shortfall,
 )
 from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
@@ -67,6 +75,7 @@ MIN_MOVES = 10  # accepted by a walker, to be independent of its starting point
 MANY_PARAMETERS = 10
 TOLERABLE = 0.1  # nats, predicted error up to which one block is used
 BLOCK_SIZE = 10
+REMEDY = "draw more, set n_proposals, or reparametrise towards a Gaussian posterior"
 
 
 @dataclass(frozen=True)
@@ -84,22 +93,28 @@ class ChibJeliazkov:
         Evaluations per mean, both halves together.
     n_blocks : int, optional
         Number of parameter blocks.
+    target_se : float, optional
+        Standard error to be reached, with one block and without `n_proposals`. The number of
+        proposals is the one predicted to do so, doubled while it does not, from 1000 to the number
+        of draws, at most 20 000: with fewer draws than proposals, more draws help more.
     """
 
     name: ClassVar[str] = "chib_jeliazkov"
     n_proposals: int | None = None
     n_blocks: int | None = None
+    target_se: float | None = None
 
     def __post_init__(self) -> None:
+        check_target(self.target_se)
         for name, least in (("n_proposals", MIN_PROPOSALS), ("n_blocks", 1)):
             given = getattr(self, name)
             if given is not None:
                 check_count(name, given, least)
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """An upper bound with one block; the approximate number with several."""
+        """An upper bound with one block, or the fewest with a target; roughly with several."""
         if self.n_blocks is None or self.n_blocks == 1:
-            return self._most_proposals(posterior)
+            return FEWEST if self._target_of_half else self._most_proposals(posterior)
         return (3 * self.n_blocks - 2) * self._proposals_of_run(posterior)
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
@@ -109,17 +124,24 @@ class ChibJeliazkov:
             raise ModelError(
                 f"n_blocks must be at most the number of parameters, {k}, got {self.n_blocks}"
             )
-        halves = posterior.halves()
-        given = None if self.n_proposals is None else self.n_proposals // 2
-        most = self._most_proposals(posterior) // 2
-        plans = [plan_proposal(half, n_proposals=given, most=most, rng=rng) for half in halves]
+        plans = self._plans(posterior, rng)
         n_blocks = self.n_blocks or _choose_n_blocks(k, plans)
-        pairs = list(zip(plans, reversed(halves), strict=True))
+        pairs = list(zip(plans, reversed(posterior.halves()), strict=True))
         if n_blocks == 1:
             single = [
-                estimate_in_one_block(p.proposal, half, p.n_proposals, rng=rng) for p, half in pairs
+                estimate_in_one_block(
+                    p.proposal,
+                    half,
+                    p.n_proposals,
+                    most=self._most_proposals(posterior) // 2,
+                    target_se=self._target_of_half,
+                    rng=rng,
+                )
+                for p, half in pairs
             ]
-            found = _of_one_block(single, sum(plan.n_proposals for plan in plans))
+            found = _of_one_block(single)
+            se_draws = found.settings["n_effective_numerator"] ** -0.5
+            se_proposals = found.settings["n_effective_denominator"] ** -0.5
         else:
             n_proposals = self._proposals_of_run(posterior)
             several = [
@@ -129,7 +151,32 @@ class ChibJeliazkov:
                 for p, half in pairs
             ]
             found = _of_blocks(several, n_blocks, n_proposals)
-        return replace(found, settings={"n_draws": posterior.log_density.size, **found.settings})
+            se_draws, se_proposals = 0.0, found.se
+        n_draws = posterior.log_density.size
+        return replace(
+            found,
+            settings={"n_draws": n_draws, **found.settings},
+            shortfall=shortfall(self.target_se, se_draws, se_proposals, n_draws, REMEDY),
+        )
+
+    def _plans(self, posterior: Posterior, rng: np.random.Generator) -> list[ProposalPlan]:
+        """The plans of both halves."""
+        given = None if self.n_proposals is None else self.n_proposals // 2
+        most = self._most_proposals(posterior) // 2
+        pilots = normal_proposals(posterior, rng)
+        return [
+            plan_proposal(
+                half, pilot, n_proposals=given, most=most, target_se=self._target_of_half, rng=rng
+            )
+            for half, pilot in zip(posterior.halves(), pilots, strict=True)
+        ]
+
+    @property
+    def _target_of_half(self) -> float | None:
+        """The error of each half that gives the average its target."""
+        if self.target_se is None or self.n_proposals is not None:
+            return None
+        return math.sqrt(2) * self.target_se
 
     def _most_proposals(self, posterior: Posterior) -> int:
         return self.n_proposals or min(max(posterior.log_density.size, 1000), MOST_PROPOSALS)
@@ -146,6 +193,7 @@ class OneBlockEstimate:
     scale: float
     numerator: LogMean
     denominator: LogMean
+    n_proposals: int
     zero_density: float  # fraction of the proposals
 
     @property
@@ -155,21 +203,41 @@ class OneBlockEstimate:
 
 
 def estimate_in_one_block(
-    proposal: Proposal, posterior: Posterior, n_proposals: int, *, rng: np.random.Generator
+    proposal: Proposal,
+    posterior: Posterior,
+    n_proposals: int,
+    *,
+    most: int = MOST_PROPOSALS,
+    target_se: float | None = None,
+    rng: np.random.Generator,
 ) -> OneBlockEstimate:
-    """Estimate the log-evidence with a proposal fitted to other draws."""
+    """Estimate the log-evidence with a proposal fitted to other draws.
+
+    With ``target_se`` the number of proposals is doubled while more of them help to reach it, up to
+    ``most``.
+    """
     # Numerator: the draws, with the log-densities stored by the chain.
     numerator = log_mean_of_chains(
         proposal.log_alpha_to_center(posterior.log_density) + proposal.log_q(posterior.draws)
     )
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
-    log_density = posterior.evaluate(proposal.sample(n_proposals, rng), rng)
-    check_overlap(log_density)
-    denominator = log_mean_of_independent(proposal.log_alpha_from_center(log_density))
+    ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
+    log_density = np.empty(0)
+    while True:
+        proposals = proposal.sample(n_proposals - len(log_density), rng)
+        log_density = np.append(log_density, posterior.evaluate(proposals, rng))
+        check_overlap(log_density)
+        denominator = log_mean_of_independent(proposal.log_alpha_from_center(log_density))
+        small = is_small(target_se, numerator.error, denominator.error, ratio)
+        if small or n_proposals >= most:
+            break
+        n_proposals = min(2 * n_proposals, most)
     log_evidence = proposal.log_density - numerator.value + denominator.value
     zero_density = float(np.isneginf(log_density).mean())
-    return OneBlockEstimate(log_evidence, proposal.scale, numerator, denominator, zero_density)
+    return OneBlockEstimate(
+        log_evidence, proposal.scale, numerator, denominator, n_proposals, zero_density
+    )
 
 
 def _choose_n_blocks(k: int, plans: Sequence[ProposalPlan]) -> int:
@@ -180,7 +248,7 @@ def _choose_n_blocks(k: int, plans: Sequence[ProposalPlan]) -> int:
     return max(2, -(-k // BLOCK_SIZE))
 
 
-def _of_one_block(folds: Sequence[OneBlockEstimate], n_proposals: int) -> Estimate:
+def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
     numerator = _effective(fold.numerator.n_effective for fold in folds)
     denominator = _effective(fold.denominator.n_effective for fold in folds)
     doubts = []
@@ -197,7 +265,7 @@ def _of_one_block(folds: Sequence[OneBlockEstimate], n_proposals: int) -> Estima
     settings = {
         "n_blocks": 1,
         "scale": math.sqrt(folds[0].scale * folds[1].scale),
-        "n_proposals": n_proposals,
+        "n_proposals": sum(fold.n_proposals for fold in folds),
         "n_effective_numerator": numerator,
         "n_effective_denominator": denominator,
         "zero_density": float(np.mean([fold.zero_density for fold in folds])),

@@ -22,6 +22,12 @@ from typing import ClassVar
 import numpy as np
 
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.stopping import (
+    check_target,
+    is_small,
+    shortfall,
+    totals,
+)
 from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
 from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
@@ -30,7 +36,6 @@ from pymc_statespace_filters.evidence.log_mean import (
 )
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 
-FEWEST_PROPOSALS, MOST_PROPOSALS = 1000, 10_000
 MAX_PARETO_K = 0.7
 
 
@@ -38,30 +43,41 @@ MAX_PARETO_K = 0.7
 class Importance:
     """Importance sampling from a mixture of Student-t distributions fitted to the draws.
 
-    The number of proposals is that of the draws, within 1000 to 10 000.
+    Parameters
+    ----------
+    target_se : float, optional
+        Standard error to be reached. The number of proposals is doubled from 1000 to at most 16 000
+        until it is. By default it is the number of draws, within 1000 to 10 000.
 
     Examples
     --------
     >>> from pymc_statespace_filters.evidence.estimators.importance import Importance
-    >>> Importance()
-    Importance()
+    >>> Importance(target_se=0.02)
+    Importance(target_se=0.02)
     """
 
     name: ClassVar[str] = "importance"
+    target_se: float | None = None
+
+    def __post_init__(self) -> None:
+        check_target(self.target_se)
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """The number of proposals."""
-        return min(max(posterior.log_density.size, FEWEST_PROPOSALS), MOST_PROPOSALS)
+        """The number of proposals; with a target, the fewest."""
+        return next(totals(posterior, self.target_se))
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from a fit to the draws and fresh log-densities."""
-        n_proposals = self.n_evaluations(posterior)
         q = choose_mixture(posterior, rng)
-        proposals = q.sample(n_proposals, rng)
-        log_density = posterior.evaluate(proposals, rng)
-        check_overlap(log_density)
-        log_weights = log_density - q.log_density(proposals)
-        evidence = log_mean_of_independent(log_weights)
+        log_weights = np.empty(0)
+        for n_proposals in totals(posterior, self.target_se):
+            proposals = q.sample(n_proposals - len(log_weights), rng)
+            log_density = posterior.evaluate(proposals, rng)
+            log_weights = np.append(log_weights, log_density - q.log_density(proposals))
+            check_overlap(log_weights)
+            evidence = log_mean_of_independent(log_weights)
+            if is_small(self.target_se, 0.0, evidence.error):
+                break
         tail = pareto_k(log_weights)
         n_effective = evidence.kish_ess(n_proposals)
         return Estimate(
@@ -72,9 +88,16 @@ class Importance:
                 "n_components": len(q.weights),
                 "n_effective_proposals": n_effective,
                 "pareto_k": tail,
-                "zero_density": float(np.isneginf(log_density).mean()),
+                "zero_density": float(np.isneginf(log_weights).mean()),
             },
             doubts=tuple(_check(n_effective, tail)),
+            shortfall=shortfall(
+                self.target_se,
+                0.0,
+                evidence.error,
+                posterior.log_density.size,
+                "draw more, for proposals that fit better, or use bridge sampling",
+            ),
         )
 
 

@@ -20,6 +20,12 @@ import numpy as np
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
+from pymc_statespace_filters.evidence.estimators.stopping import (
+    check_target,
+    is_small,
+    shortfall,
+    totals,
+)
 from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE, log_mean_of_independent
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from pymc_statespace_filters.system.checks import check_count
@@ -34,24 +40,28 @@ class PriorMonteCarlo:
     Parameters
     ----------
     n_draws : int
-        Number of prior draws.
+        Number of prior draws; with a target, the most.
+    target_se : float, optional
+        Standard error to be reached: the number of draws is doubled from 1000 until it is.
 
     Examples
     --------
     >>> from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
     >>> PriorMonteCarlo(n_draws=20_000)
-    PriorMonteCarlo(n_draws=20000)
+    PriorMonteCarlo(n_draws=20000, target_se=None)
     """
 
     name: ClassVar[str] = "prior_monte_carlo"
     n_draws: int = 10_000
+    target_se: float | None = None
 
     def __post_init__(self) -> None:
         check_count("n_draws", self.n_draws, MIN_DRAWS)
+        check_target(self.target_se)
 
     def n_evaluations(self, posterior: Posterior) -> int:
-        """One per prior draw."""
-        return self.n_draws
+        """One per prior draw; with a target, the fewest."""
+        return next(self._totals(posterior))
 
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from prior draws.
@@ -61,21 +71,37 @@ class PriorMonteCarlo:
         ModelError
             If the prior is improper, or the likelihood is zero at all of its draws.
         """
-        x = posterior.required_prior.sample(self.n_draws, rng)
-        _, log_likelihood = posterior.evaluate_factors(x, rng)
-        evidence = log_mean_of_independent(log_likelihood)
+        log_likelihood = np.empty(0)
+        for n_draws in self._totals(posterior):
+            x = posterior.required_prior.sample(n_draws - len(log_likelihood), rng)
+            log_likelihood = np.append(log_likelihood, posterior.evaluate_factors(x, rng)[1])
+            evidence = log_mean_of_independent(log_likelihood)
+            if is_small(self.target_se, 0.0, evidence.error):
+                break
         if np.isneginf(evidence.value):
             raise ModelError(
-                f"the likelihood is zero at all {self.n_draws} draws of the prior: narrow the "
-                "priors to plausible values"
+                f"the likelihood is zero at all {n_draws} draws of the prior: narrow the priors "
+                "to plausible values"
             )
-        n_effective = evidence.kish_ess(self.n_draws)
+        n_effective = evidence.kish_ess(n_draws)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,
-            settings={"n_prior_draws": self.n_draws, "n_effective_prior_draws": n_effective},
+            settings={"n_prior_draws": n_draws, "n_effective_prior_draws": n_effective},
             doubts=tuple(_check(n_effective)),
+            shortfall=shortfall(
+                self.target_se,
+                0.0,
+                evidence.error,
+                posterior.log_density.size,
+                "raise n_draws of PriorMonteCarlo, or narrow the priors",
+            ),
         )
+
+    def _totals(self, posterior: Posterior) -> Iterator[int]:
+        if self.target_se is None:
+            return iter((self.n_draws,))
+        return totals(posterior, self.target_se, self.n_draws)
 
 
 def _check(n_effective: float) -> Iterator[str]:

@@ -23,12 +23,16 @@ class Estimate:
         ``evidence`` beside the estimate.
     doubts : tuple of str
         Reasons why the error may be larger than `se`, each with a remedy.
+    shortfall : str
+        Why `se` is larger than the ``target_se`` of the estimator, with a remedy; empty if it is
+        not, or if the estimator has none.
     """
 
     log_evidence: float
     se: float
     settings: Mapping[str, float] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
+    shortfall: str = ""
 
 
 @runtime_checkable
@@ -37,7 +41,8 @@ class Estimator(Protocol):
 
     Any object with these three members can be passed to `estimate_evidence`. Its own settings are
     its attributes, checked when it is constructed; it raises `ModelError` for a model that it
-    cannot treat.
+    cannot treat. A frozen dataclass with a field ``target_se`` that is None gets that of
+    `estimate_evidence`.
 
     Examples
     --------

@@ -9,6 +9,7 @@ candidate is averaged over fresh estimates and candidates in holes are discarded
 the smallest predicted error of the evidence is chosen, then the width.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from pymc_statespace_filters.errors import DataMismatchError
+from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, NormalProposals
+from pymc_statespace_filters.evidence.estimators.stopping import ratio_of_errors
 from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
 from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-N_PILOT = 500  # evaluations to choose the scale, not used for the estimate
+N_PILOT = BLOCK  # evaluations to choose the scale, not used for the estimate
 N_REPEATS = 20  # fresh estimates averaged into f(x*) of a noisy likelihood
 N_CLUSTERS = 2
 N_CLUSTERED = 4000  # draws to be clustered, at most
@@ -31,6 +34,8 @@ MAX_LOG = 200.0  # avoids overflow of a useless relative variance
 MIN_PROPOSALS = 500  # of the default
 MAX_ERROR_RATIO = 1 / 3  # error of the denominator over that of the numerator
 NEGLIGIBLE = 0.01  # nats, an error that needs no more evaluations
+ROUNDING = 1e-9
+MARGIN = 0.9  # of the target, because the error is only predicted
 
 Array = NDArray[np.float64]
 
@@ -76,27 +81,41 @@ class ProposalPlan:
 
 
 def plan_proposal(
-    posterior: Posterior, *, n_proposals: int | None, most: int, rng: np.random.Generator
+    posterior: Posterior,
+    pilot: NormalProposals,
+    *,
+    n_proposals: int | None,
+    most: int,
+    target_se: float | None = None,
+    rng: np.random.Generator,
 ) -> ProposalPlan:
     """Choose x*, the scale s and the number of proposals for the smallest predicted error.
 
     The draws must not be those to be averaged: a plan fitted to them would bias the estimate. By
     default the number of proposals is that for which the denominator's error is a third of the
-    numerator's, or negligible, and at most ``most``. It is fixed before the first proposal is
-    drawn, so that there is no optional stopping.
+    numerator's, or negligible, and at most ``most``. With a target it is that for which the whole
+    error is a little below ``target_se``, or the numerator's dominates. ``pilot`` has proposals
+    fitted to the draws.
     """
     candidates = _candidates(posterior, rng)
-    log_evidence = _pilot(posterior, rng)
+    log_evidence = _pilot(posterior, pilot)
+    enough = NEGLIGIBLE if target_se is None else MARGIN * target_se
 
     def planned(proposal: Proposal) -> ProposalPlan:
         numerator, relative = _predicted_variances(proposal, posterior, log_evidence)
-        allowed = max(MAX_ERROR_RATIO**2 * numerator, NEGLIGIBLE**2)
-        count = n_proposals or int(np.clip(relative / allowed, MIN_PROPOSALS, most))
+        ratio, left = MAX_ERROR_RATIO, enough**2
+        if target_se is not None:
+            ratio, left = ratio_of_errors(target_se, numerator**0.5), enough**2 - numerator
+        allowed = max(ratio**2 * numerator, left)
+        count = n_proposals or math.ceil(np.clip(relative / allowed, MIN_PROPOSALS, most))
         return ProposalPlan(proposal, count, float(np.sqrt(numerator + relative / count)))
 
-    best = min(map(planned, candidates), key=lambda plan: plan.se).proposal
-    plans = [planned(replace(best, scale=scale)) for scale in SCALES]
-    return min(plans, key=lambda plan: (max(plan.se, NEGLIGIBLE), plan.n_proposals))
+    def rank(plan: ProposalPlan) -> tuple[float, int, float]:
+        """Of errors that are small enough, the one of the fewest proposals."""
+        return max(plan.se, (1 + ROUNDING) * enough), plan.n_proposals, plan.se
+
+    best = min(map(planned, candidates), key=rank).proposal
+    return min((planned(replace(best, scale=scale)) for scale in SCALES), key=rank)
 
 
 def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal]:
@@ -135,17 +154,16 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
     return sorted(dense, key=lambda candidate: -candidate.log_density)
 
 
-def _pilot(posterior: Posterior, rng: np.random.Generator) -> float:
+def _pilot(posterior: Posterior, pilot: NormalProposals) -> float:
     """Estimate the log-evidence roughly, by bridge sampling to the Gaussian of the draws.
 
     The iteration of Meng and Wong (1996), which needs no centre x*.
     """
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-    mean, chol = moments(draws)
-    normal = Proposal(mean, 0.0, chol)
-    sampled = normal.sample(N_PILOT, rng)
+    normal = Proposal(pilot.moments.mean, 0.0, pilot.moments.chol)
+    sampled, at_sampled = pilot.first(N_PILOT)
     ratio_drawn = posterior.log_density.ravel() - normal.log_q(draws)
-    ratio_sampled = posterior.evaluate(sampled, rng) - normal.log_q(sampled)
+    ratio_sampled = at_sampled - normal.log_q(sampled)
     log_evidence = float(np.median(ratio_drawn))
     if np.isneginf(ratio_sampled).all():
         return log_evidence

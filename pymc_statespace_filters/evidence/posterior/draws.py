@@ -4,8 +4,8 @@ Log-densities on the unconstrained space include the Jacobians of the transforms
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -50,6 +50,11 @@ class Posterior:
         Whether repeated evaluations at one point differ.
     prior : Prior, optional
         The likelihood is the log-density of `evaluate` minus that of the prior.
+    shared_seed : tuple of int, optional
+        Seed of the points whose log-densities several estimators use. Without it each estimator
+        evaluates points of its own.
+    shared : dict
+        These points; empty at first, and in every copy.
     """
 
     draws: Array
@@ -57,6 +62,8 @@ class Posterior:
     evaluate: Callable[[Array, np.random.Generator], Array]
     is_noisy: bool = False
     prior: Prior | None = None
+    shared_seed: tuple[int, ...] | None = None
+    shared: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def required_prior(self) -> Prior:

@@ -1,0 +1,83 @@
+"""How many evaluations an estimator makes: as many as the standard error that is asked for needs.
+
+The number is doubled until the estimate's own standard error is at most ``target_se``. Such a rule
+prefers estimates whose error looks small, and weights of a long tail look least variable where the
+tail was missed. It begins with `FEWEST` evaluations: in simulations with log-normal weights of
+log-variance two, the rule then shifts the estimate by a tenth of its standard error, and by less
+than a twentieth with log-variance one.
+
+An error with two sources, the draws and the evaluations, is not reduced beyond the point where the
+evaluations contribute half as much as the draws: without them it would be a tenth smaller. If the
+draws' error alone exceeds the target, whatever the evaluations, they stop at its size.
+"""
+
+import math
+from collections.abc import Iterator
+
+from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.system.checks import check_positive
+
+FEWEST, MOST = 1000, 16_000  # evaluations with a target
+MOST_WITHOUT_TARGET = 10_000
+DOMINANT = 1.5  # ratio of errors at which the evaluations are to blame
+RATIO = 0.5  # of the evaluations' error to that of the draws, below which more hardly help
+
+
+def check_target(target_se: float | None) -> None:
+    """Raise a `ModelError` unless ``target_se`` is a positive number or None."""
+    if target_se is not None:
+        check_positive("target_se", target_se)
+
+
+def totals(posterior: Posterior, target_se: float | None, most: int = MOST) -> Iterator[int]:
+    """Totals after which an estimator looks at its error; without a target, only one.
+
+    That one is the number of draws, within 1000 to 10 000.
+    """
+    if target_se is None:
+        yield min(max(posterior.log_density.size, FEWEST), MOST_WITHOUT_TARGET)
+        return
+    total = min(FEWEST, most)
+    while total < most:
+        yield total
+        total *= 2
+    yield most
+
+
+def is_small(
+    target_se: float | None, se_draws: float, se_evaluations: float, ratio: float = RATIO
+) -> bool:
+    """Whether the error has reached the target, or further evaluations can hardly reduce it."""
+    if target_se is None:
+        return True
+    se = math.hypot(se_draws, se_evaluations)
+    return se <= target_se or se_evaluations <= ratio * se_draws
+
+
+def ratio_of_errors(target_se: float, se_draws: float) -> float:
+    """The `ratio` of `is_small` if evaluations leave the draws' error as it is."""
+    return RATIO if se_draws < target_se else 1.0
+
+
+def shortfall(
+    target_se: float | None, se_draws: float, se_evaluations: float, n_draws: int, remedy: str
+) -> str:
+    """Why an error exceeds the target, and what would help; empty if it does not exceed it.
+
+    ``remedy`` is that for evaluations, of which the most have been made.
+    """
+    if target_se is None or math.hypot(se_draws, se_evaluations) <= target_se:
+        return ""
+    if se_evaluations > DOMINANT * se_draws:
+        return f"{se_evaluations:.2g} nats come from the evaluations: {remedy}"
+    needed = n_draws * (1 + RATIO**2) * (se_draws / target_se) ** 2
+    return (
+        f"{se_draws:.2g} nats come from the draws: about {_rounded(needed)} instead of {n_draws} "
+        "would do"
+    )
+
+
+def _rounded(number: float) -> int:
+    """Upwards, to two digits."""
+    scale = 10 ** max(math.floor(math.log10(number)) - 1, 0)
+    return math.ceil(number / scale) * scale

@@ -1,0 +1,195 @@
+"""Estimators that stop at a stated standard error, and evaluations that several of them share."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.importance import Importance
+from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, normal_proposals
+from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.stopping import FEWEST, MOST, shortfall
+from tests.evidence.analytic import gaussian
+from tests.evidence.targets import Regression, TwoModes
+from tests.evidence.test_models import REGRESSION, exact_draws
+
+LOG_EVIDENCE = -3.7  # of `gaussian`
+WITH_TARGET = {
+    "chib_jeliazkov": ChibJeliazkov,
+    "bridge": Bridge,
+    "warp_bridge": lambda **settings: Bridge(warped=True, **settings),
+    "importance": Importance,
+}
+EACH = pytest.mark.parametrize("make", WITH_TARGET.values(), ids=WITH_TARGET)
+
+
+def counted(posterior):
+    """The posterior, and the batches that are evaluated."""
+    batches = []
+
+    def evaluate(x, rng):
+        batches.append(x)
+        return posterior.evaluate(x, rng)
+
+    return replace(posterior, evaluate=evaluate, shared_seed=posterior.shared_seed), batches
+
+
+@EACH
+def test_no_more_evaluations_than_the_error_needs(make):
+    rng = np.random.default_rng(100)
+    posterior = gaussian(2, (4, 1000), rng, noise_sd=1.0)
+    numbers, target = [], 0.1
+    for _ in range(2):
+        watched, batches = counted(posterior)
+        found = make(target_se=target).estimate(watched, rng=rng)
+        assert found.se <= target
+        assert not found.shortfall
+        assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
+        numbers.append(sum(map(len, batches)))
+        target = found.se / 1.5
+    assert numbers[0] <= 3 * FEWEST  # warped, or with a plan
+    assert numbers[1] > 1.4 * numbers[0]
+
+
+def test_the_mean_likelihood_of_as_many_draws_of_the_prior():
+    target, rng = TwoModes(1), np.random.default_rng(101)
+    posterior = target.posterior((2, 20), rng)
+    for target_se, n_draws in ((0.05, 2000), (0.02, 10_000)):
+        found = PriorMonteCarlo(target_se=target_se).estimate(posterior, rng=rng)
+        assert found.settings["n_prior_draws"] <= n_draws
+        assert found.se <= target_se or found.settings["n_prior_draws"] == n_draws
+        assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
+
+
+# For 200 independent standard normal scores the mean is within 0.25 of zero and the mean square
+# within [0.7, 1.4] with probability above 0.9995; seeds are fixed. The number of evaluations is
+# decided by the error in most of the replications.
+@pytest.mark.parametrize(
+    ("make", "noise_sd", "target_se"),
+    [
+        (ChibJeliazkov, 1.0, 0.025),
+        (Importance, 1.0, 0.03),
+        pytest.param(Bridge, 1.0, 0.0135, marks=pytest.mark.slow),
+        pytest.param(WITH_TARGET["warp_bridge"], 1.0, 0.015, marks=pytest.mark.slow),
+        pytest.param(Importance, 1.4, 0.05, marks=pytest.mark.slow),
+    ],
+)
+def test_stopping_at_an_estimated_error_leaves_it_right(make, noise_sd, target_se):
+    scores, numbers = [], []
+    for run in range(200):
+        rng = np.random.default_rng([102, run])
+        posterior = gaussian(2, (4, 1000), rng, noise_sd=noise_sd)
+        found = make(target_se=target_se).estimate(posterior, rng=rng)
+        scores.append((found.log_evidence - LOG_EVIDENCE) / found.se)
+        numbers.append(found.settings["n_proposals"])
+    assert np.mean(np.array(numbers) > FEWEST) > 0.5
+    assert abs(np.mean(scores)) < 0.25
+    assert 0.7 < np.mean(np.square(scores)) < 1.4
+
+
+class TestShortfall:
+    def test_by_hand(self):
+        # The draws' error alone is to be 0.05 / sqrt(1.25), the evaluations' half as large.
+        text = shortfall(0.05, 0.08, 0.04, 1000, "a remedy")
+        assert text == "0.08 nats come from the draws: about 3200 instead of 1000 would do"
+        text = shortfall(0.05, 0.03, 0.06, 1000, "a remedy")
+        assert text == "0.06 nats come from the evaluations: a remedy"
+        assert shortfall(0.05, 0.03, 0.03, 1000, "a remedy") == ""
+        assert shortfall(None, 0.3, 0.3, 1000, "a remedy") == ""
+
+    def test_of_the_draws_says_how_many_would_do(self):
+        def estimate(n_draws):
+            rng = np.random.default_rng([103, n_draws])
+            posterior = Regression(4, 18, rng).posterior((4, n_draws), rng, correlation=0.97)
+            watched, batches = counted(posterior)
+            found = ChibJeliazkov(target_se=0.05).estimate(watched, rng=rng)
+            return found, sum(map(len, batches))
+
+        found, n_evaluations = estimate(200)
+        assert found.se > 0.05
+        assert n_evaluations < MOST  # more of them cannot help
+        needed = int(found.shortfall.split("about ")[1].split(" instead of 800 would do")[0])
+        assert 800 < needed < 40_000
+        assert estimate(needed // 4)[0].se < 0.065  # errors of few effective draws are rough
+
+    def test_of_the_evaluations_names_a_remedy(self):
+        rng = np.random.default_rng(104)
+        posterior = gaussian(2, (4, 500), rng, noise_sd=2.5)
+        found = Importance(target_se=0.01).estimate(posterior, rng=rng)
+        assert found.settings["n_proposals"] == MOST
+        assert "come from the evaluations: draw more" in found.shortfall
+        found = PriorMonteCarlo(n_draws=1500, target_se=0.01).estimate(
+            Regression(2, 4, rng).posterior((2, 20), rng), rng=rng
+        )
+        assert found.settings["n_prior_draws"] == 1500
+        assert "raise n_draws of PriorMonteCarlo" in found.shortfall
+
+    def test_is_a_warning(self):
+        idata = exact_draws((2, 100))
+        with pytest.warns(EvidenceWarning, match="error of 0.0.*, above target_se: .* would do"):
+            psf.estimate_evidence(
+                idata,
+                REGRESSION.model(),
+                estimators="chib_jeliazkov",
+                target_se=0.01,
+                random_seed=1,
+            )
+
+
+class TestShared:
+    def posterior(self, n_draws=500):
+        made = gaussian(2, (4, n_draws), np.random.default_rng(105), noise_sd=1.0)
+        return replace(made, shared_seed=(1, 2))
+
+    def test_points_do_not_depend_on_who_asks_for_how_many(self):
+        rng = np.random.default_rng(106)
+        at_once, in_turn = (normal_proposals(self.posterior(), rng)[1] for _ in range(2))
+        in_turn.first(10)
+        in_turn.first(2 * BLOCK)
+        for one, other in zip(at_once.first(3 * BLOCK), in_turn.first(3 * BLOCK), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_halves_have_points_of_their_own(self):
+        first, second = normal_proposals(self.posterior(), np.random.default_rng(107))
+        z = [q.moments.whitened(q.first(BLOCK)[0]) for q in (first, second)]
+        assert abs(np.corrcoef(z[0].ravel(), z[1].ravel())[0, 1]) < 4 / (2 * BLOCK) ** 0.5
+
+    def test_a_point_is_evaluated_once(self):
+        posterior, batches = counted(self.posterior())
+        estimators = Bridge(target_se=0.05), ChibJeliazkov(target_se=0.05), Bridge(True, 0.05)
+        n_alone = 0
+        for estimator in estimators:
+            together = estimator.estimate(posterior, rng=np.random.default_rng(108))
+            by_itself, own = counted(self.posterior())
+            assert together == estimator.estimate(by_itself, rng=np.random.default_rng(108))
+            n_alone += sum(map(len, own))
+        # All three start from the first blocks of both halves.
+        assert sum(map(len, batches)) == n_alone - 2 * 2 * BLOCK
+
+    def test_a_copy_of_the_posterior_has_its_own(self):
+        posterior = self.posterior()
+        normal_proposals(posterior, np.random.default_rng(109))
+        assert posterior.shared
+        assert not replace(posterior, draws=posterior.draws + 1).shared
+
+
+@pytest.mark.parametrize("target_se", [0, -0.1, np.nan, np.inf, "small", True, None])
+def test_a_wrong_target(target_se):
+    with pytest.raises(ModelError, match="target_se must be a positive number, got"):
+        psf.estimate_evidence(exact_draws((2, 100)), REGRESSION.model(), target_se=target_se)
+    if target_se is not None:
+        for make in (*WITH_TARGET.values(), PriorMonteCarlo):
+            with pytest.raises(ModelError, match="target_se must be a positive number, got"):
+                make(target_se=target_se)
+
+
+def test_an_estimator_keeps_its_own_target():
+    idata, model = exact_draws((4, 1000)), REGRESSION.model()
+    with pytest.warns(EvidenceWarning, match="above target_se"):
+        psf.estimate_evidence(idata, model, estimators=ChibJeliazkov(target_se=1e-3), random_seed=1)
+    estimate = {"estimators": [Importance(target_se=0.01)], "target_se": 0.5, "random_seed": 1}
+    assert psf.estimate_evidence(idata, model, **estimate)["importance"].se <= 0.01
