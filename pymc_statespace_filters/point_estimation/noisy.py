@@ -101,9 +101,7 @@ def maximize_estimated(
     """
     spread, mean = population_scale(population.x), population.x.mean(axis=0)
     z = (population.x - mean) @ np.linalg.inv(spread).T
-    _, best = maximize_noisy(
-        lambda z: log_likelihood(mean + z @ spread.T), z, population.log_ratio
-    )
+    _, best = maximize_noisy(lambda z: log_likelihood(mean + z @ spread.T), z, population.log_ratio)
     point, scale = mean + spread @ best, spread
     settings = _FIRST
     for remaining in reversed(range(N_ROUNDS)):
