@@ -159,7 +159,12 @@ class ModelTask:
         journal = None if self.checkpoint is None else self.checkpoint.journal("starts")
         if journal is not None and (stored := journal.read()) is not None:
             return stored.draws["population"]
-        found = find_population(target, self._generator(), progressbar=progressbar)
+        try:
+            found = find_population(target, self._generator(), progressbar=progressbar)
+        except Exception as error:
+            of_model = f" of model {self.name!r}" if self.name else ""
+            error.add_note(f"in the search for starts{of_model}")
+            raise
         if journal is not None:
             journal.append({"population": found}, {})
         return found

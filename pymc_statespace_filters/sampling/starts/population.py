@@ -24,7 +24,7 @@ from pymc_statespace_filters.sampling.target.target import Target
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 9000  # for the progress bar
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
-_MOST_BATCHES = 8  # of draws of the prior
+_MOST_BATCHES = 10  # of draws of the prior
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
-N_DRAWS = 256
+N_DRAWS = 200
 # Number of prior draws with finite log-density of which a chain starts at the best.
 N_COMPARED = 10
 
