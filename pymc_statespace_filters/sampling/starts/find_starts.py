@@ -1,16 +1,16 @@
 """``find_starts``: initial values of chains that lie in the posterior."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 from pymc.model import Model, modelcontext
-from pymc.pytensorf import compile as compile_pymc
+from pymc.stats.convergence import log_warnings
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.support import can_sample
+from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import N_POINTS, find_population
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.sampling.target.variables import constrained_values
 from pymc_statespace_filters.system.checks import check_count, check_random_seed
 
 
@@ -89,19 +89,8 @@ def find_starts(
         )
     target = Target(model, None, DRAMSettings())
     target.prepare()
-    population = find_population(target, rng, progressbar=progressbar)
-    chosen = rng.choice(len(population), chains, replace=chains > len(population))
-    return _initial_values(model, [target.raveled.unravel(x) for x in population[chosen]])
-
-
-def _initial_values(
-    model: Model, points: Sequence[Mapping[str, np.ndarray]]
-) -> list[dict[str, np.ndarray]]:
-    """The values of the free variables at points of the unconstrained space."""
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    outputs = model.replace_rvs_by_values(model.free_RVs)
-    # Machine code would take seconds to compile.
-    function = compile_pymc(values, outputs, mode="FAST_COMPILE")
-    names = [rv.name for rv in model.free_RVs]
-    found = [function(*(point[value.name] for value in values)) for point in points]
-    return [dict(zip(names, map(np.asarray, of_point), strict=True)) for of_point in found]
+    found = find_population(target, rng, progressbar=progressbar)
+    if (message := modes_message(model, target.raveled, found)) is not None:
+        log_warnings([modes_warning(message)])
+    chosen = rng.choice(len(found.x), chains, replace=chains > len(found.x))
+    return constrained_values(model, [target.raveled.unravel(x) for x in found.x[chosen]])

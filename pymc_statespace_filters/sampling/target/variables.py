@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from pymc.blocking import DictToArrayBijection, RaveledVars
 from pymc.model import Model
+from pymc.pytensorf import compile as compile_pymc
 from pymc.util import get_value_vars_from_user_vars
 from pytensor.graph.traversal import ancestors, graph_inputs
 from pytensor.tensor.random.type import RandomType
@@ -96,3 +97,16 @@ def check_noise_dependencies(
                 f"noisy likelihood of {', '.join(noisy)} depends on them, and other step methods "
                 "would redraw the estimate at a point already accepted"
             )
+
+
+def constrained_values(
+    model: Model, points: Sequence[Mapping[str, np.ndarray]]
+) -> list[dict[str, np.ndarray]]:
+    """The values of the free variables at points of the unconstrained space."""
+    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    outputs = model.replace_rvs_by_values(model.free_RVs)
+    # Machine code would take seconds to compile.
+    function = compile_pymc(values, outputs, mode="FAST_COMPILE")
+    names = [rv.name for rv in model.free_RVs]
+    found = [function(*(point[value.name] for value in values)) for point in points]
+    return [dict(zip(names, map(np.asarray, of_point), strict=True)) for of_point in found]
