@@ -90,12 +90,8 @@ def _thinned(draws: np.ndarray) -> np.ndarray:
 def _rows(draws: np.ndarray, shared: list[str], model: Model) -> list[list[float | None]]:
     """Draws (n, k) of some variables as positions of the model, None for what they lack."""
     point = model.initial_point(random_seed=0)
-    known = np.concatenate(
-        [
-            np.full(point[model.rvs_to_values[rv].name].size, rv.name in shared)
-            for rv in model.free_RVs
-        ]
-    )
+    sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
+    known = np.repeat([rv.name in shared for rv in model.free_RVs], sizes)
     rows = np.full((len(draws), known.size), None, dtype=object)
     rows[:, known] = draws
     return rows.tolist()

@@ -24,7 +24,7 @@ from pymc_statespace_filters.student_mixture import fit_mixture, place_component
 # With these, at most 120 evaluations of the log-density; the search for starts makes 3000 or more.
 _N_GROUPS = 4
 _N_LINES = 4  # between two groups
-_N_PER_LINE = 5
+_N_PER_LINE = 5  # its ends included, as the estimates of points that stayed are too high
 _DIP = 5.0  # nats below the lower end of each line, between separate modes
 _LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
 _APART = 2.0  # standard deviations within the modes: variables that differ between them
@@ -42,7 +42,7 @@ class Points(NamedTuple):
 
 
 def find_modes(
-    x: Array, log_density: Array, evaluate: Callable[[Array], Array], rng: np.random.Generator
+    x: Array, evaluate: Callable[[Array], Array], rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """The number of the mode of each point; of few points or one mode, 0.
 
@@ -62,7 +62,7 @@ def find_modes(
     mode = group.copy()
     for pair in sorted(lines, key=lambda pair: lines[pair].length):
         first, second = (mode[np.argmax(group == g)] for g in pair)
-        if first != second and _is_connected(lines[pair], x, log_density, evaluate):
+        if first != second and _is_connected(lines[pair], x, evaluate):
             mode[mode == second] = first
     return mode
 
@@ -83,14 +83,12 @@ def _shortest_lines(x: Array, first: NDArray[np.intp], second: NDArray[np.intp])
     return _Lines(first[chosen], second[distances[chosen].argmin(axis=1)], float(shortest.min()))
 
 
-def _is_connected(
-    lines: _Lines, x: Array, log_density: Array, evaluate: Callable[[Array], Array]
-) -> bool:
-    fractions = np.linspace(0.0, 1.0, _N_PER_LINE + 2)[1:-1, np.newaxis, np.newaxis]
-    between = x[lines.begin] + fractions * (x[lines.end] - x[lines.begin])
-    lowest = evaluate(between.reshape(-1, x.shape[1])).reshape(_N_PER_LINE, -1).min(axis=0)
-    ends = np.minimum(log_density[lines.begin], log_density[lines.end])
-    return bool((lowest > ends - _DIP).any())
+def _is_connected(lines: _Lines, x: Array, evaluate: Callable[[Array], Array]) -> bool:
+    fractions = np.linspace(0.0, 1.0, _N_PER_LINE)[:, np.newaxis, np.newaxis]
+    points = x[lines.begin] + fractions * (x[lines.end] - x[lines.begin])
+    log_density = evaluate(points.reshape(-1, x.shape[1])).reshape(_N_PER_LINE, -1)
+    ends = np.minimum(log_density[0], log_density[-1])
+    return bool((log_density[1:-1].min(axis=0) >= ends - _DIP).any())
 
 
 def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> str | None:

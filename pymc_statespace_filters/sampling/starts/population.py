@@ -72,7 +72,7 @@ def find_population(
                 "the priors to plausible values"
             )
         log_density = found.log_first + found.log_ratio
-        modes = find_modes(found.x, log_density, lambda x: full(x)[1], rng)
+        modes = find_modes(found.x, lambda x: full(x)[1], rng)
     return Points(found.x, log_density, modes)
 
 
