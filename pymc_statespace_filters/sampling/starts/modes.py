@@ -21,7 +21,7 @@ from pymc_statespace_filters.sampling.target.variables import (
 )
 from pymc_statespace_filters.student_mixture import fit_mixture, place_components
 
-# With these, at most 120 evaluations of the log-density; the search for starts makes 3000 or more.
+# With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
 _N_GROUPS = 4
 _N_LINES = 4  # between two groups
 _N_PER_LINE = 5  # its ends included, as the estimates of points that stayed are too high
@@ -108,8 +108,8 @@ def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> st
         for i, top, value in zip(large, highest, values, strict=True)
     ]
     return (
-        f"The posterior has {len(large)} separate modes: {' and '.join(described)}, found from "
-        "draws of the prior or of the pilot. A mean over all modes may lie in none of them."
+        f"The posterior has {len(large)} separate modes: {' and '.join(described)}. A mean over "
+        "all modes may lie in none of them."
     )
 
 
