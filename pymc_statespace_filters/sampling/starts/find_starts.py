@@ -54,6 +54,9 @@ def find_starts(
 
     Notes
     -----
+    If the log-density falls by more than 5 nats between groups of the points, a warning of PyMC's
+    logger says that there are separate modes, where, and with which shares and log-densities.
+
     The cost is 3000 to 16 000 evaluations of the log-density, in threads: more, the narrower the
     posterior is. With an expensive filter, find the starts with the same model and a cheaper one,
     such as `EKF`.
