@@ -272,7 +272,7 @@ def test_long_pilots_are_thinned_and_keep_all_chains(model, tasks):
     place = np.stack(np.broadcast_arrays(np.arange(4.0)[:, None], np.arange(1000.0)), axis=-1)
     place += 1e-3 * np.random.default_rng(1).normal(size=place.shape)
     sd = np.exp(np.random.default_rng(2).normal(size=(4, 1000)))
-    sample(model, pilot=az.from_dict({"posterior": {"place": place, "sd": sd}}), draws=2, tune=4)
+    sample(model, pilot=az.from_dict({"posterior": {"place": place, "sd": sd}}), draws=2, tune=8)
     kept = tasks[0].population[:, 1:].round()
     assert kept.shape == (500, 2)
     np.testing.assert_array_equal(kept[:, 0], np.tile(np.arange(4), 125))
