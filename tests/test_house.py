@@ -75,6 +75,7 @@ TOUCH_INSIDES = {
     "filters/kernel_density/simd_windows.py": ("llvmlite", "numba.core", "numba.extending"),
     # functions that run in Python too
     "sampling/kernel/adaptation_state.py": "numba.extending",
+    "sampling/kernel/independence.py": "numba.extending",
 }
 
 

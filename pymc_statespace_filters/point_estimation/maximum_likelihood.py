@@ -127,7 +127,7 @@ def maximum_likelihood(
         n_evaluations += len(x)
         return factors.evaluate(x, rng)
 
-    x = population_of(model, rng, progressbar=False)[::N_SWEEPS]
+    x = population_of(model, rng, progressbar=False)[0].x[::N_SWEEPS]
     population = Population(x, *evaluate(x))
     if factors.is_noisy:
         peak = maximize_estimated(lambda x: evaluate(x)[1], population, rng)

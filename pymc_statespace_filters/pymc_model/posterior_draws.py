@@ -4,10 +4,13 @@ The unconstrained space is that of the model's value variables: every free varia
 and vectors and matrices are flattened.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
+from pymc.initial_point import make_initial_point_fn
 from pymc.model.transform_values import unconstrain_values
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
@@ -38,10 +41,16 @@ def noise_was_moved(idata: xr.DataTree) -> bool:
     return "sample_stats" in idata.children and "correlation" in idata["sample_stats"]
 
 
-def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float64]:
-    """The posterior group, checked against the model, in unconstrained space (chain, draw, k)."""
+def unconstrained_draws(
+    idata: xr.DataTree, model: pm.Model, names: Sequence[str] | None = None
+) -> NDArray[np.float64]:
+    """The posterior group, checked against the model, in unconstrained space (chain, draw, k).
+
+    Of the free variables with these names; default: all. The others may be missing.
+    """
     posterior = posterior_group(idata)
-    missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
+    chosen = [rv for rv in model.free_RVs if names is None or rv.name in names]
+    missing = [rv.name for rv in chosen if rv.name not in posterior]
     if missing:
         raise DataMismatchError(
             f"idata must have draws of {missing}, free variables of the model, got "
@@ -52,7 +61,7 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
         raise ModelError(f"idata must have at least {MIN_DRAWS} draws per chain, got {n_draws}")
 
     shapes = model.eval_rv_shapes()
-    for rv in model.free_RVs:
+    for rv in chosen:
         drawn = posterior[rv.name].transpose("chain", "draw", ...).shape[2:]
         expected = tuple(int(length) for length in shapes[rv.name])
         if drawn != expected:
@@ -61,11 +70,11 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
             )
     # A single call for all draws does not repay compilation to machine code.
     unconstrained = unconstrain_values(
-        posterior, model=model, compile_kwargs={"mode": "FAST_COMPILE"}
+        _completed(posterior, model), model=model, compile_kwargs={"mode": "FAST_COMPILE"}
     )
     columns = [
         unconstrained[model.rvs_to_values[rv].name].values.reshape(n_chains, n_draws, -1)
-        for rv in model.free_RVs
+        for rv in chosen
     ]
     draws = np.concatenate(columns, axis=-1).astype(np.float64)
     outside = int((~np.isfinite(draws).all(axis=-1)).sum())
@@ -76,3 +85,18 @@ def unconstrained_draws(idata: xr.DataTree, model: pm.Model) -> NDArray[np.float
             "another model"
         )
     return draws
+
+
+def _completed(posterior: xr.Dataset, model: pm.Model) -> xr.Dataset:
+    """The draws, with the model's initial value of each free variable that they lack."""
+    missing = [rv.name for rv in model.free_RVs if rv.name not in posterior]
+    if not missing:
+        return posterior
+    start = make_initial_point_fn(model=model, return_transformed=False)(0)
+    sizes = posterior.sizes["chain"], posterior.sizes["draw"]
+    filled = {}
+    for name in missing:
+        value = np.asarray(start[name])
+        axes = [f"{name}_axis_{i}" for i in range(value.ndim)]
+        filled[name] = ["chain", "draw", *axes], np.broadcast_to(value, sizes + value.shape)
+    return posterior.assign(filled)

@@ -13,7 +13,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import folder_name
 from pymc_statespace_filters.sampling.run.driver import sample_models
 from pymc_statespace_filters.sampling.run.request import ExecutionOptions, sampling_request
-from pymc_statespace_filters.sampling.run.warm_start import warm_started
+from pymc_statespace_filters.sampling.run.warm_start import warm_started, warm_started_models
 
 
 @overload
@@ -82,9 +82,13 @@ def sample_dram(
         Draws from a posterior close to the model's, such as that of the same parameters with a
         cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is
         the one that its chains used last, if they were sampled and adapted by DRAM, else that of
-        its draws; it is adapted only if ``adapt_every`` or ``adaptation`` is given. A mode that the
-        pilot has missed is missed again. With ``checkpoint`` the pilot must be the same in each
-        call; with ``comm`` all ranks pass it (``gather="all"``).
+        its draws; it is adapted only if ``adapt_every`` or ``adaptation`` is given. Independence
+        proposals come from a mixture fitted to some 500 of its draws, from the first iteration. A
+        mode that the pilot has missed is missed again. If the pilot lacks some variables of the
+        model, as that of a smaller model does, the search for starts begins at its draws, completed
+        by draws of the prior, and ``tune`` must be positive. Other variables of the pilot are
+        ignored. With ``checkpoint`` the pilot must be the same in each call; with ``comm`` all
+        ranks pass it (``gather="all"``).
     progressbar : bool or str
         As in ``pm.sample``. Beside what that shows, the largest R-hat and the smallest bulk
         effective sample size so far, computed every two seconds, or as often as takes 1 % of the
@@ -131,7 +135,8 @@ def sample_dram(
         random numbers, or no starting point with finite log-density is found.
     DataMismatchError
         If the checkpoint belongs to a run with other arguments, another model or other data, if
-        ranks differ in these, or if the pilot does not have the parameters of the model.
+        ranks differ in these, or if the pilot has no parameter of the model, or one of another
+        shape or outside its support.
     ParallelError
         If another rank has failed; the message names the rank, the chain and the error.
 
@@ -167,7 +172,8 @@ def sample_dram(
     options = ExecutionOptions(
         cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
     )
-    trees = sample_models({"": model}, request, options, [] if checkpoint is None else [checkpoint])
+    folders = [] if checkpoint is None else [checkpoint]
+    trees = sample_models({"": model}, [request], options, folders)
     return None if trees is None else trees[""]
 
 
@@ -194,6 +200,7 @@ def run_models(
     cores: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     initvals: Mapping[str, Any] | None = None,
+    pilot: DataTree | Mapping[str, DataTree] | None = None,
     progressbar: bool | str = True,
     discard_tuned_samples: bool = True,
     compute_convergence_checks: bool = True,
@@ -214,6 +221,9 @@ def run_models(
     draws, tune, until_ess, max_draws, chains, cores, random_seed, initvals
         As in `sample_dram`, for every model. A model's draws are those of `sample_dram` with the
         same seed and do not depend on the other models; with ``until_ess`` each stops on its own.
+    pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
+        As in `sample_dram`, of the models with these names. A single one is the pilot of every
+        model that has a free variable in common with it.
     progressbar, discard_tuned_samples, compute_convergence_checks
         As in `sample_dram`.
     checkpoint : str or path, optional
@@ -267,8 +277,10 @@ def run_models(
         max_draws,
         dram_settings,
     )
+    adapts = not dram_settings.keys().isdisjoint({"adapt_every", "adaptation"})
+    requests = warm_started_models(request, models, pilot, adapts=adapts)
     options = ExecutionOptions(
         cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
     )
     folders = [] if checkpoint is None else [Path(checkpoint, folder_name(name)) for name in models]
-    return sample_models(models, request, options, folders)
+    return sample_models(models, requests, options, folders)

@@ -6,6 +6,7 @@ import re
 import signal
 import time
 
+import arviz as az
 import numpy as np
 import pytest
 
@@ -64,6 +65,7 @@ def disagreements(comm):
         {"models": {"M": other}},
         {"random_seed": np.random.default_rng(1)},
         {"proposal_cov": [[1.0]]},
+        {"pilot": az.from_dict({"posterior": {"phi": np.linspace(0.3, 0.6, 40).reshape(2, 20)}})},
     ]
     heard = []
     for changes in variants:
@@ -85,8 +87,9 @@ def test_ranks_that_make_different_calls_are_told():
     assert [("the same integer as random_seed" in text) for text in zero] == [
         "random_seed" in what for what in said
     ]
-    assert said[9:] == ["random_seed", "proposal_cov"]
-    assert [("the same pilot" in text) for text in zero] == [False] * 10 + [True]
+    assert said[9:11] == ["random_seed", "proposal_cov"]
+    assert said[11].startswith("initvals, proposal_cov, pilot")
+    assert [("the same pilot" in text) for text in zero] == [False] * 11 + [True]
 
 
 def wait_for_a_checkpoint(folder, since):

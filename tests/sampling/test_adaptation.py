@@ -15,6 +15,7 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     start_adaptation,
     unpack,
 )
+from pymc_statespace_filters.sampling.kernel.independence import no_mixture
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -60,7 +61,15 @@ def warm_up(adapt, cov, start, first_cov, n, *, seed, stages=2):
     settings = DRAMSettings(stages=stages, adaptation=scheme)
     target = Target(model, None, settings, first_cov)
     target.prepare()
-    task = ChainTask(target, n, 0, lambda rng: [start], np.random.SeedSequence(seed))
+    task = ChainTask(
+        target,
+        n,
+        n,
+        lambda rng: [start],
+        np.random.SeedSequence(seed),
+        n_rows=n,
+        mixture=no_mixture(len(start)),
+    )
     task.run(Event())
     return unpack(task.chain.state.adaptation, len(start))
 

@@ -8,6 +8,10 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.sampling.kernel import proposal_mixture
+from pymc_statespace_filters.sampling.kernel.independence import N_COMPONENTS, SHARE
+from pymc_statespace_filters.sampling.run import model_task
+from pymc_statespace_filters.sampling.run.model_task import ModelTask
 
 RNG = np.random.default_rng(3)
 N_CHAINS, N_DRAWS = 2, 30
@@ -45,6 +49,14 @@ def start(chain, draw):
     return {"sd": SD[chain, draw], "place": PLACE[chain, draw]}
 
 
+@pytest.fixture
+def walk_alone(monkeypatch):
+    """Chains without independence proposals."""
+    for module in (model_task, proposal_mixture):
+        monkeypatch.setattr(module, "fitted_mixture", lambda *of: None)
+
+
+@pytest.mark.usefixtures("walk_alone")
 def test_chains_begin_at_the_ends_of_the_pilots_and_propose_by_its_covariance(model):
     found = sample(model, pilot=tree())
     told = sample(
@@ -74,6 +86,7 @@ def test_a_pilot_that_ends_where_nothing_is_possible_is_named():
         sample(bounded, pilot=tree())
 
 
+@pytest.mark.usefixtures("walk_alone")
 @pytest.mark.parametrize("ends", [[29, 29, 19, 19, 9], [29, 29, 14]])
 def test_more_chains_than_the_pilot_has_begin_apart(model, ends):
     still = {"tune": 1, "draws": 1, "discard_tuned_samples": False, "stages": 1}
@@ -173,12 +186,25 @@ def test_draws_of_nuts_do(model):
         (tree(), {"proposal_cov": np.eye(3)}, ModelError, "proposal_cov must be None with a pilot"),
         (3, {}, ModelError, "pilot: idata must be a DataTree"),
         (
-            az.from_dict({"posterior": {"sd": SD}}),
+            az.from_dict({"posterior": {"other": SD}}),
             {},
             DataMismatchError,
-            r"pilot: idata must have draws of \['place'\]",
+            r"pilot: idata must have draws of a free variable .*, sd, place, got \['other'\]",
         ),
         (tree(place=PLACE[..., :1]), {}, DataMismatchError, "pilot: 'place' in idata must have"),
+        (
+            az.from_dict({"posterior": {"place": PLACE[..., :1]}}),
+            {},
+            DataMismatchError,
+            r"pilot: 'place' in idata must have the model's shape \(2,\), got \(1,\)",
+        ),
+        (az.from_dict({"posterior": {"sd": SD}}), {"tune": 0}, ModelError, "lacks free .* tune of"),
+        (
+            az.from_dict({"posterior": {"sd": -SD}}),
+            {},
+            DataMismatchError,
+            "pilot: draws in idata must .*60 of 60 draws outside",
+        ),
         (
             tree(sd=-SD),
             {},
@@ -201,6 +227,65 @@ def test_a_run_is_taken_up_with_the_same_pilot_only(model, tmp_path):
     np.testing.assert_array_equal(first["posterior"]["sd"], again["posterior"]["sd"])
     with pytest.raises(DataMismatchError, match="initvals"):
         sample(model, pilot=tree(sd=2 * SD), checkpoint=tmp_path / "run")
+
+
+def test_a_run_of_a_larger_model_is_taken_up_with_the_same_pilot_only(model, tmp_path):
+    def pilot(place):
+        return az.from_dict({"posterior": {"place": place}})
+
+    first = sample(model, pilot=pilot(PLACE), checkpoint=tmp_path / "run")
+    again = sample(model, pilot=pilot(PLACE), checkpoint=tmp_path / "run")
+    np.testing.assert_array_equal(first["posterior"]["sd"], again["posterior"]["sd"])
+    with pytest.raises(DataMismatchError, match=r"pilot: the checkpoint has .*null") as caught:
+        sample(model, pilot=pilot(2 * PLACE), checkpoint=tmp_path / "run")
+    assert "initvals" not in str(caught.value)
+
+
+@pytest.fixture
+def tasks(monkeypatch):
+    """The tasks of the runs to come."""
+    made = []
+
+    class Watched(ModelTask):
+        def __init__(self, *of):
+            super().__init__(*of)
+            made.append(self)
+
+    monkeypatch.setattr("pymc_statespace_filters.sampling.run.driver.ModelTask", Watched)
+    return made
+
+
+@pytest.mark.parametrize("more", [{}, {"tune": 0}])
+def test_a_mixture_is_fitted_to_the_pilots_draws_before_the_first_iteration(model, tasks, more):
+    found = sample(model, pilot=tree(), **more)
+    unconstrained = np.concatenate([np.log(SD)[..., None], PLACE], axis=-1)
+    rows = np.concatenate(np.swapaxes(unconstrained, 0, 1))
+    np.testing.assert_allclose(tasks[0].population, rows, rtol=1e-11)
+    first = tasks[0]._first_mixture
+    assert first[SHARE] == 0.5
+    assert first[N_COMPONENTS] >= 2
+    assert found["sample_stats"]["independent"].values.any()
+
+
+def test_long_pilots_are_thinned_and_keep_all_chains(model, tasks):
+    """Chains are told apart by their first component, draws by their second."""
+    place = np.stack(np.broadcast_arrays(np.arange(4.0)[:, None], np.arange(1000.0)), axis=-1)
+    place += 1e-3 * np.random.default_rng(1).normal(size=place.shape)
+    sd = np.exp(np.random.default_rng(2).normal(size=(4, 1000)))
+    sample(model, pilot=az.from_dict({"posterior": {"place": place, "sd": sd}}), draws=2, tune=8)
+    kept = tasks[0].population[:, 1:].round()
+    assert kept.shape == (500, 2)
+    np.testing.assert_array_equal(kept[:, 0], np.tile(np.arange(4), 125))
+    np.testing.assert_array_equal(kept[:, 1], np.repeat(np.arange(7, 1000, 8), 4))
+
+
+def test_variables_that_the_model_lacks_are_ignored(model):
+    more = tree(other=PLACE[..., 0])
+    for name in ("sd", "place"):
+        np.testing.assert_array_equal(
+            sample(model, pilot=more)["posterior"][name],
+            sample(model, pilot=tree())["posterior"][name],
+        )
 
 
 def test_proposals_stay_where_a_short_warm_up_accepts_nothing(model):

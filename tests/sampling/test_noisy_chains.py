@@ -62,11 +62,15 @@ def test_the_target_is_evaluated_only_where_the_screen_has_moved(screen):
     calls, moved, screened = (
         stats[name].to_numpy() for name in ("n_evaluations", "accepted", "n_screened")
     )
+    walked = stats["independent"].to_numpy() == 0
     assert set(np.unique(calls)) == {0, 1}
     assert set(np.unique(screened)) == {1, 2}
     assert np.all(moved <= calls)
     # The first proposal's rejections are certain, as the second one was made.
-    assert np.all(calls[screened == 1] == 1)
+    assert np.all(calls[walked & (screened == 1)] == 1)
+    # A proposal of the mixture has no second one.
+    assert np.all(screened[~walked] == 1)
+    assert 0 < np.mean(calls[~walked]) < 1
     assert 0 < np.mean(calls[screened == 2]) < 1
 
 

@@ -160,7 +160,7 @@ def test_an_error_names_chain_and_model(models):
     with pm.Model() as broken:
         pm.Potential("p", wrap_py([pt.dscalar], [pt.dscalar])(breaking)(pm.Normal("mu", 0, 3)))
     with pytest.raises(ArithmeticError) as caught:
-        psf.run_models(models | {"broken": broken}, **SETTINGS | {"draws": 10**5})
+        psf.run_models(models | {"broken": broken}, **SETTINGS | {"draws": 10**5}, initvals={})
     assert re.fullmatch(
         r"in chain \d of model 'broken', after \d+ iterations", caught.value.__notes__[-1]
     )

@@ -83,6 +83,8 @@ def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> f
     is a^2 / (a^2 + b^2). If one kind was not tried, it is `FIRST_SHARE`.
     """
     first = max(begin, 1)
+    if end == first:  # one iteration, without one before it
+        return share
     jumps = [np.diff(draws.positions[first - 1 : end], axis=0) for draws in chains]
     scales = np.concatenate([draws.positions[first:end] for draws in chains]).var(axis=0)
     moved = scales > 0

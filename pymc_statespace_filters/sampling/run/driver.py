@@ -39,19 +39,20 @@ _PILOT_ADVICE = ', and the same pilot, which gather="all" gives to all ranks'
 
 def sample_models(
     models: Mapping[str, Model],
-    request: SamplingRequest,
+    requests: Sequence[SamplingRequest],
     options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
 ) -> dict[str, DataTree] | None:
     """Sample models on all ranks of a communicator; None on ranks that do not get the result.
 
-    ``checkpoints`` has a folder for each model, or none. Errors are those of ``sample_dram``.
+    ``requests`` has one for each model, of as many draws and chains; ``checkpoints`` has a folder
+    for each model, or none. Errors are those of ``sample_dram``.
     """
     options.check()
     with communicator_of(options.comm, in_lockstep=options.ranks_per_chain > 1) as comm:
         if comm.size > 1:
-            _check_agreement(comm, models, request, options, bool(checkpoints))
-        request = request._replace(entropy=comm.broadcast(request.entropy))
+            _check_agreement(comm, models, requests, options, bool(checkpoints))
+        entropy = comm.broadcast(requests[0].entropy)
         group, leaders = comm.groups(_group_size(options.ranks_per_chain, comm.size))
         trees = None
         with group:
@@ -60,7 +61,8 @@ def sample_models(
             else:
                 with release_followers(group), leaders:
                     tasks = [
-                        ModelTask(model, request, name, group) for name, model in models.items()
+                        ModelTask(model, request._replace(entropy=entropy), name, group)
+                        for (name, model), request in zip(models.items(), requests, strict=True)
                     ]
                     trees = _run(tasks, leaders, options, checkpoints)
         if options.gather == "all":
@@ -141,7 +143,7 @@ def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
 def _check_agreement(
     comm: Communicator,
     models: Mapping[str, Model],
-    request: SamplingRequest,
+    requests: Sequence[SamplingRequest],
     options: ExecutionOptions,
     has_checkpoint: bool,
 ) -> None:
@@ -155,7 +157,10 @@ def _check_agreement(
                 "gather": options.gather,
                 "checkpoint": has_checkpoint,
             },
-            *(request.cache_key(model, require_fingerprint=False) for model in models.values()),
+            *(
+                request.cache_key(model, require_fingerprint=False)
+                for model, request in zip(models.values(), requests, strict=True)
+            ),
         ]
 
     first, *others = comm.allgather(comm.run_collectively(keys))
@@ -163,7 +168,7 @@ def _check_agreement(
         pairs = zip(first, theirs, strict=False)  # with other numbers of models the first differ
         differing = [name for a, b in pairs for name in a if a[name] != b[name]]
         if differing:
-            advice = {"random_seed": _SEED_ADVICE, "proposal_cov": _PILOT_ADVICE}
+            advice = {"random_seed": _SEED_ADVICE, "pilot": _PILOT_ADVICE}
             raise DataMismatchError(
                 f"rank {rank} of {comm.size} and rank 0 differ in "
                 f"{', '.join(dict.fromkeys(differing))}; all ranks must make the same call, with "

@@ -16,6 +16,7 @@ from pymc.stats.convergence import (
 )
 from xarray import DataTree
 
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.kernel.independence import no_mixture
@@ -47,12 +48,17 @@ from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
+from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import find_population
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
 _NO_CHAIN = 2**32 - 1
+_UNUSABLE_PILOT = (
+    "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
+    "drawn from, no initval in the model, no correlation, and one rank per chain"
+)
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
 _MOST_LIVE_DRAWS = 4000
@@ -138,16 +144,25 @@ class ModelTask:
             checkpoint=self.checkpoint,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
-            population=self.population,
+            population=self.population if request.initvals is None else None,
             mixture=self._first_mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        Neither without warm-up, nor if ranks divide the particles or the noise is carried.
+        Neither without warm-up, nor if ranks divide the particles or the noise is carried. A pilot
+        that lacks no variable has the points itself.
+
+        Raises
+        ------
+        ModelError
+            If no points can be found, though the pilot needs some.
         """
         target, request = self.prepare(), self.request
+        pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
+        if pilot is not None and np.isfinite(pilot).all():
+            return pilot
         if (
             request.tune == 0
             or request.initvals is not None
@@ -155,19 +170,23 @@ class ModelTask:
             or target.carries_noise
             or self.is_distributed
         ):
+            if pilot is not None:
+                raise ModelError(self._said(_UNUSABLE_PILOT))
             return None
         journal = None if self.checkpoint is None else self.checkpoint.journal("starts")
         if journal is not None and (stored := journal.read()) is not None:
             return stored.draws["population"]
         try:
-            found = find_population(target, self._generator(), progressbar=progressbar)
+            found = find_population(target, self._generator(), progressbar=progressbar, pilot=pilot)
         except Exception as error:
             of_model = f" of model {self.name!r}" if self.name else ""
             error.add_note(f"in the search for starts{of_model}")
             raise
+        if (message := modes_message(self.model, target.raveled, found)) is not None:
+            log_warnings([modes_warning(self._said(message))])
         if journal is not None:
-            journal.append({"population": found}, {})
-        return found
+            journal.append({"population": found.x}, {})
+        return found.x
 
     def cost(self) -> float:
         """Estimate the seconds that a chain takes: as many evaluations as iterations."""
@@ -232,7 +251,7 @@ class ModelTask:
         chains = [self._results[i][0] for i in range(self.request.chains)]
         population = np.empty((0, self.prepare().raveled.dim))
         if self.population is not None:
-            population = self.population[::N_SWEEPS]
+            population = self.population[:: N_SWEEPS if self.request.initvals is None else 1]
         self._mixture = improved_mixture(
             self.mixture,
             chains,
@@ -308,10 +327,12 @@ class ModelTask:
             ):
                 warnings += run_convergence_checks(tree, self.model)
         warnings += closing
-        if self.name:
-            warnings = [replace(w, message=f"Model {self.name!r}: {w.message}") for w in warnings]
-        log_warnings(warnings)
+        log_warnings([replace(w, message=self._said(w.message)) for w in warnings])
         return tree
+
+    def _said(self, message: str) -> str:
+        """A message about this model, with its name if there are several."""
+        return f"Model {self.name!r}: {message}" if self.name else message
 
     def _closing_messages(self, check_convergence: bool, report_level: str) -> list[SamplerWarning]:
         """The report, and a warning if ``max_draws`` ended the run."""

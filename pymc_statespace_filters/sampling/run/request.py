@@ -27,7 +27,10 @@ _FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
 
 
 class SamplingRequest(NamedTuple):
-    """Arguments of ``sample_dram`` that the draws depend on, the same for all models of a run."""
+    """Arguments of ``sample_dram`` that the draws of a model depend on.
+
+    Those of several models of a run differ in what their pilots determine, at most.
+    """
 
     draws: int
     tune: int
@@ -40,6 +43,8 @@ class SamplingRequest(NamedTuple):
     settings: DRAMSettings
     until_ess: float | None = None
     max_draws: int | None = None  # a number if until_ess is
+    # Draws of a pilot on the unconstrained space, by rows; None for what it lacks.
+    pilot: list[list[float | None]] | None = None
 
     @property
     def n_iterations(self) -> int:
@@ -65,6 +70,7 @@ class SamplingRequest(NamedTuple):
             "random_seed": self.entropy if self.is_seeded else None,
             "initvals": _json_value(self.initvals),
             "proposal_cov": _json_value(self.proposal_cov),
+            "pilot": self.pilot,
             "draws": int(self.draws),
             "until_ess": self.until_ess,
             "max_draws": self.max_draws,

@@ -1,5 +1,10 @@
-"""Starts and proposals from a pilot: the draws of a posterior close to that of the model."""
+"""Starts and proposals from a pilot: the draws of a posterior close to that of the model.
 
+The pilot may be of a smaller model. What it lacks then comes from the prior, and a population is
+annealed from there to the posterior before the chains start.
+"""
+
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +23,7 @@ SINGULAR = 1e-10
 # Range of the variances proposed by a chain of the pilot, relative to those of all draws. Adapted
 # ones lie between 0.002 and 4. Outside, the chain had not converged, or used the prior's.
 LEAST_RATIO, LARGEST_RATIO = 1e-3, 4.0
+MOST_KEPT = 500  # draws, for the first mixture of the proposals
 
 
 def warm_started(
@@ -25,14 +31,16 @@ def warm_started(
 ) -> SamplingRequest:
     """Start chains at draws of a pilot, with proposals from its chains or its draws.
 
-    The warm-up, which may be short, changes the proposals only if ``adapts``.
+    The warm-up, which may be short, changes the proposal covariance only if ``adapts``. A pilot
+    that lacks variables of the model determines neither starts nor covariance, only the population
+    from which they are found.
 
     Raises
     ------
     ModelError
         If starts or proposals are given too, or cannot be made of the pilot's draws.
     DataMismatchError
-        If the pilot is of another model.
+        If the pilot has no variable of the model, or one of another shape or support.
     """
     for name in ("initvals", "proposal_cov"):
         if getattr(request, name) is not None:
@@ -40,12 +48,16 @@ def warm_started(
     if not continuous_value_vars(None, model):
         return request  # the run itself raises that there is nothing to sample
     try:
-        draws = unconstrained_draws(pilot, model)
+        posterior = posterior_group(pilot)
+        shared = _shared_names(posterior, model)
+        draws = unconstrained_draws(pilot, model, shared)
     except (ModelError, DataMismatchError) as error:
         raise type(error)(f"pilot: {error}") from None
-    posterior = posterior_group(pilot)
     cov = _covariance(draws.reshape(-1, draws.shape[-1]))
     names = [rv.name for rv in model.free_RVs]
+    request = request._replace(pilot=_rows(_thinned(draws), shared, model))
+    if len(shared) < len(names):
+        return request
     adapted = [c for c in _adapted_covs(pilot, len(cov)) if _is_plausible(c, cov)]
     # A quarter of a block is longer than the warm-up, so that the proposals never change.
     without_adaptation = replace(request.settings, adapt_every=4 * request.tune + 4)
@@ -54,6 +66,84 @@ def warm_started(
         proposal_cov=_rounded(np.mean(adapted or [cov], axis=0)),
         settings=request.settings if adapts else without_adaptation,
     )
+
+
+def _shared_names(posterior: xr.Dataset, model: Model) -> list[str]:
+    """Free variables of the model that have draws; a DataMismatchError if there are none."""
+    names = [rv.name for rv in model.free_RVs]
+    shared = [name for name in names if name in posterior]
+    if not shared:
+        raise DataMismatchError(
+            f"idata must have draws of a free variable of the model, {', '.join(names)}, got "
+            f"{sorted(map(str, posterior.data_vars))}"
+        )
+    return shared
+
+
+def _thinned(draws: np.ndarray) -> np.ndarray:
+    """Some of the draws (chain, draw, k) of each chain, in the order in which they were made."""
+    step = -(-draws.shape[0] * draws.shape[1] // MOST_KEPT)
+    kept = draws[:, ::-step][:, ::-1]
+    return _rounded(kept.swapaxes(0, 1).reshape(-1, draws.shape[-1]))
+
+
+def _rows(draws: np.ndarray, shared: list[str], model: Model) -> list[list[float | None]]:
+    """Draws (n, k) of some variables as positions of the model, None for what they lack."""
+    point = model.initial_point(random_seed=0)
+    sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
+    known = np.repeat([rv.name in shared for rv in model.free_RVs], sizes)
+    rows = np.full((len(draws), known.size), None, dtype=object)
+    rows[:, known] = draws
+    return rows.tolist()
+
+
+def warm_started_models(
+    request: SamplingRequest, models: Mapping[str, Model], pilot: Any, *, adapts: bool
+) -> list[SamplingRequest]:
+    """The requests of several models: a pilot for each name, or one for all that share variables.
+
+    Raises
+    ------
+    ModelError, DataMismatchError
+        As `warm_started`, with the name of the model; also if no model has the name of a pilot, or
+        none shares a variable with the only one.
+    """
+    if pilot is None:
+        return [request] * len(models)
+    if isinstance(pilot, xr.DataTree):
+        pilots = {name: pilot for name, model in models.items() if _shares(pilot, model)}
+        if not pilots:
+            names = sorted({rv.name for model in models.values() for rv in model.free_RVs})
+            raise DataMismatchError(
+                f"pilot must have draws of a free variable of a model, {', '.join(names)}"
+            )
+    elif isinstance(pilot, Mapping):
+        pilots = dict(pilot)
+    else:
+        raise ModelError(
+            "pilot must be a DataTree or a mapping of names of models to DataTrees, got "
+            f"{type(pilot).__name__}"
+        )
+    if unknown := [name for name in pilots if name not in models]:
+        raise ModelError(
+            f"pilot must have names of models, {', '.join(models)}, got {unknown[0]!r}"
+        )
+    requests = []
+    for name, model in models.items():
+        try:
+            started = request
+            if name in pilots:
+                started = warm_started(request, model, pilots[name], adapts=adapts)
+        except (ModelError, DataMismatchError) as error:
+            raise type(error)(f"models[{name!r}]: {error}") from None
+        requests.append(started)
+    return requests
+
+
+def _shares(pilot: xr.DataTree, model: Model) -> bool:
+    """Whether a pilot has draws of a free variable of a model."""
+    posterior = posterior_group(pilot)
+    return any(rv.name in posterior for rv in model.free_RVs)
 
 
 def _covariance(positions: np.ndarray) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 import numpy as np
 from pymc.model import Model, modelcontext
+from pymc.stats.convergence import log_warnings
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
+from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import N_POINTS, population_of
 from pymc_statespace_filters.system.checks import check_count, check_random_seed
 
@@ -49,6 +51,9 @@ def find_starts(
 
     Notes
     -----
+    If the log-density falls by more than 5 nats between groups of the points, a warning of PyMC's
+    logger says that there are separate modes, where, and with which shares and log-densities.
+
     The cost is 3000 to 16 000 evaluations of the log-density, in threads: more, the narrower the
     posterior is. If the filters are expensive and the systems allow an `EKF`, the population is
     first led to the prior times the square root of its likelihood.
@@ -76,7 +81,9 @@ def find_starts(
     if chains > N_POINTS:
         raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
-    population = population_of(model, rng, progressbar=progressbar)
-    chosen = rng.choice(len(population), chains, replace=chains > len(population))
+    found, raveled = population_of(model, rng, progressbar=progressbar)
+    if (message := modes_message(model, raveled, found)) is not None:
+        log_warnings([modes_warning(message)])
+    chosen = rng.choice(len(found.x), chains, replace=chains > len(found.x))
     values = ConstrainedValues(model)
-    return [values(x) for x in population[chosen]]
+    return [values(x) for x in found.x[chosen]]

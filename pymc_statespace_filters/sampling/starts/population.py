@@ -3,7 +3,8 @@
 Draws of the prior are annealed to the posterior. If the filters are expensive and an extended
 Kalman filter exists, it leads the way: the population is first annealed to the prior times the
 square root of its likelihood, and from there to the posterior, which takes fewer evaluations. The
-square root, because the two likelihoods may differ by many nats.
+square root, because the two likelihoods may differ by many nats. Draws of some variables from a
+pilot, if there are any, lead the way instead (`nested`).
 """
 
 from collections.abc import Callable
@@ -18,8 +19,12 @@ from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.support import can_sample
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
+from pymc_statespace_filters.sampling.starts.modes import Points, find_modes
+from pymc_statespace_filters.sampling.starts.nested import nested_reference
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from pymc_statespace_filters.student_mixture import StudentMixture
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 9000  # for the progress bar
@@ -32,14 +37,15 @@ Array = NDArray[np.float64]
 Densities = Callable[[Array], tuple[Array, Array]]
 
 
-def population_of(model: Model, rng: np.random.Generator, *, progressbar: bool) -> Array:
-    """Points (m, d) distributed nearly as a model's posterior, on the unconstrained space.
+def population_of(
+    model: Model, rng: np.random.Generator, *, progressbar: bool
+) -> tuple[Points, RaveledVariables]:
+    """Points distributed nearly as a model's posterior, and their coordinates.
 
     Raises
     ------
     ModelError
-        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive
-        likelihood.
+        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive likelihood.
     """
     if model.discrete_value_vars:
         names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
@@ -51,11 +57,15 @@ def population_of(model: Model, rng: np.random.Generator, *, progressbar: bool) 
         )
     target = Target(model, None, DRAMSettings())
     target.prepare()
-    return find_population(target, rng, progressbar=progressbar)
+    return find_population(target, rng, progressbar=progressbar), target.raveled
 
 
-def find_population(target: Target, rng: np.random.Generator, *, progressbar: bool) -> Array:
-    """Points (m, d) distributed nearly as the posterior.
+def find_population(
+    target: Target, rng: np.random.Generator, *, progressbar: bool, pilot: Array | None = None
+) -> Points:
+    """Points distributed nearly as the posterior.
+
+    ``pilot`` are draws (n, d) of a posterior close by, with columns of NaN for what it lacks.
 
     Raises
     ------
@@ -63,9 +73,9 @@ def find_population(target: Target, rng: np.random.Generator, *, progressbar: bo
         If no draw of the prior has a positive likelihood.
     """
     found = None
-    pilot = target.pilot_density()
-    if pilot is not None:
-        rows = pilot.at_rows()
+    by_ekf = target.pilot_density() if pilot is None else None
+    if by_ekf is not None:
+        rows = by_ekf.at_rows()
         with row_progress(rows, enabled=progressbar) as announce:
             announce("Finding starts by an EKF", _TYPICAL_EVALUATIONS)
             cheap = _densities(rows, target, rng)
@@ -74,17 +84,23 @@ def find_population(target: Target, rng: np.random.Generator, *, progressbar: bo
     with row_progress(rows, enabled=progressbar) as announce:
         announce("Finding starts", _TYPICAL_EVALUATIONS)
         full = _densities(rows, target, rng)
-        if found is not None:
-            found = _annealed(_population(found, _from_pilot(cheap, full)), rng)
+        if pilot is not None:
+            reference = nested_reference(pilot, target.prior_draws.draws, rng)
+            drawn = _population(reference.sample(N_POINTS, rng), _from_reference(reference, full))
+            found = _annealed(drawn, rng)
+        elif found is not None:
+            found = _annealed(_population(found.x, _from_ekf(cheap, full)), rng)
         if found is None:
             drawn = _prior_population(target, _from_prior(full))
             found = _annealed(drawn, rng, fewest=1)
-    if found is None:
-        raise ModelError(
-            f"the likelihood is zero at all of {len(drawn[0].x)} draws of the prior: narrow the "
-            "priors to plausible values"
-        )
-    return found
+        if found is None:
+            raise ModelError(
+                f"the likelihood is zero at all of {len(drawn[0].x)} draws of the prior: narrow "
+                "the priors to plausible values"
+            )
+        log_density = found.log_first + found.log_ratio
+        modes = find_modes(found.x, lambda x: full(x)[1], rng)
+    return Points(found.x, log_density, modes)
 
 
 def _population(x: Array, log_densities: Densities) -> tuple[Population, Densities]:
@@ -105,7 +121,7 @@ def _prior_population(target: Target, log_densities: Densities) -> tuple[Populat
 
 def _annealed(
     drawn: tuple[Population, Densities], rng: np.random.Generator, fewest: int = _FEWEST
-) -> Array | None:
+) -> Population | None:
     """The points led to the second distribution; None if it is positive at too few of them."""
     population, log_densities = drawn
     if np.isfinite(population.log_ratio).sum() < fewest:
@@ -113,7 +129,7 @@ def _annealed(
     return _without_stragglers(anneal(population, log_densities, N_POINTS, rng))
 
 
-def _without_stragglers(population: Population) -> Array:
+def _without_stragglers(population: Population) -> Population:
     """The points that have reached the second distribution, at least a quarter of them.
 
     A point that no move has led out of a ridge lies many nats below all others, where there is next
@@ -121,7 +137,8 @@ def _without_stragglers(population: Population) -> Array:
     """
     log_density = population.log_first + population.log_ratio
     most = log_density.max() - _DEPTH - _DEPTH_PER_DIMENSION * population.x.shape[1]
-    return population.x[log_density >= min(most, float(np.quantile(log_density, 0.75)))]
+    least = min(most, float(np.quantile(log_density, 0.75)))
+    return population.at(np.flatnonzero(log_density >= least))
 
 
 def _densities(rows: ParallelMap, target: Target, rng: np.random.Generator) -> Densities:
@@ -146,7 +163,15 @@ def _from_prior(densities: Densities) -> Densities:
     return evaluate
 
 
-def _from_pilot(cheap: Densities, full: Densities) -> Densities:
+def _from_reference(reference: StudentMixture, full: Densities) -> Densities:
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        first, second = reference.log_density(x), full(x)[1]
+        return first, second - first
+
+    return evaluate
+
+
+def _from_ekf(cheap: Densities, full: Densities) -> Densities:
     def evaluate(x: Array) -> tuple[Array, Array]:
         first, second = cheap(x)[1], full(x)[1]
         with np.errstate(invalid="ignore"):

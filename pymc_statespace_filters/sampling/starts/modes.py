@@ -1,0 +1,133 @@
+"""Separate modes of a posterior, in a population of its points.
+
+The population is divided into groups by a mixture of Student-t distributions. Two groups belong to
+one mode if the log-density between two points of theirs, close to each other, hardly falls. A
+curved posterior has several groups and one mode.
+"""
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pymc.model import Model
+from pymc.stats.convergence import SamplerWarning, WarningType
+from scipy.spatial.distance import cdist
+
+from pymc_statespace_filters.sampling.target.variables import (
+    RaveledVariables,
+    constrained_values,
+)
+from pymc_statespace_filters.student_mixture import fit_mixture, place_components
+
+# With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
+_N_GROUPS = 4
+_N_LINES = 4  # between two groups
+_N_PER_LINE = 5  # its ends included, as the estimates of points that stayed are too high
+_DIP = 5.0  # nats below the lower end of each line, between separate modes
+_LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
+_APART = 2.0  # standard deviations within the modes: variables that differ between them
+_MOST_NAMED = 4  # variables in the message
+
+Array = NDArray[np.float64]
+
+
+class Points(NamedTuple):
+    """Points (m, d) of a posterior, their log-densities (m,), and the numbers of their modes."""
+
+    x: Array
+    log_density: Array
+    mode: NDArray[np.intp]
+
+
+def find_modes(
+    x: Array, evaluate: Callable[[Array], Array], rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """The number of the mode of each point; of few points or one mode, 0.
+
+    ``evaluate`` gives the log-densities at points (m, d).
+    """
+    none = np.zeros(len(x), dtype=np.intp)
+    if np.linalg.matrix_rank(x - x.mean(axis=0)) < x.shape[1]:
+        return none
+    chol = np.linalg.cholesky(np.atleast_2d(np.cov(x, rowvar=False)))
+    standardised = (x - x.mean(axis=0)) @ np.linalg.inv(chol).T
+    mixture = fit_mixture(standardised, place_components(standardised, _N_GROUPS, rng))
+    group = mixture.log_joint(standardised).argmax(axis=0)
+    lines = {
+        pair: _shortest_lines(standardised, *(np.flatnonzero(group == g) for g in pair))
+        for pair in combinations(np.unique(group), 2)
+    }
+    mode = group.copy()
+    for pair in sorted(lines, key=lambda pair: lines[pair].length):
+        first, second = (mode[np.argmax(group == g)] for g in pair)
+        if first != second and _is_connected(lines[pair], x, evaluate):
+            mode[mode == second] = first
+    return mode
+
+
+class _Lines(NamedTuple):
+    begin: NDArray[np.intp]
+    end: NDArray[np.intp]
+    length: float  # of the shortest
+
+
+def _shortest_lines(x: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> _Lines:
+    """Lines from different points of a group to the closest ones of another."""
+    _, distinct = np.unique(x[first], axis=0, return_index=True)
+    first = first[distinct]
+    distances = cdist(x[first], x[second])
+    shortest = distances.min(axis=1)
+    chosen = np.argsort(shortest)[:_N_LINES]
+    return _Lines(first[chosen], second[distances[chosen].argmin(axis=1)], float(shortest.min()))
+
+
+def _is_connected(lines: _Lines, x: Array, evaluate: Callable[[Array], Array]) -> bool:
+    fractions = np.linspace(0.0, 1.0, _N_PER_LINE)[:, np.newaxis, np.newaxis]
+    points = x[lines.begin] + fractions * (x[lines.end] - x[lines.begin])
+    log_density = evaluate(points.reshape(-1, x.shape[1])).reshape(_N_PER_LINE, -1)
+    ends = np.minimum(log_density[0], log_density[-1])
+    return bool((log_density[1:-1].min(axis=0) >= ends - _DIP).any())
+
+
+def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> str | None:
+    """Describe the modes, if there are several: where they are highest, and their shares."""
+    numbers, counts = np.unique(points.mode, return_counts=True)
+    shares = counts / len(points.mode)
+    large = sorted(np.flatnonzero(shares >= _LEAST_SHARE), key=lambda i: -shares[i])
+    if len(large) < 2:
+        return None
+    members = [np.flatnonzero(points.mode == numbers[i]) for i in large]
+    highest = [of_mode[points.log_density[of_mode].argmax()] for of_mode in members]
+    names = _differing(model, raveled, [points.x[of_mode] for of_mode in members])
+    values = constrained_values(model, [raveled.unravel(points.x[i]) for i in highest])
+    described = [
+        f"at {', '.join(f'{name}={_short(value[name])}' for name in names)} "
+        f"(share {shares[i]:.2f}, log-density {points.log_density[top]:.1f})"
+        for i, top, value in zip(large, highest, values, strict=True)
+    ]
+    return (
+        f"The posterior has {len(large)} separate modes: {' and '.join(described)}. A mean over "
+        "all modes may lie in none of them."
+    )
+
+
+def modes_warning(message: str) -> SamplerWarning:
+    """Make a warning for PyMC's logger."""
+    return SamplerWarning(WarningType.CONVERGENCE, message, "warn")
+
+
+def _differing(model: Model, raveled: RaveledVariables, modes: list[Array]) -> list[str]:
+    """The variables that differ between modes, the most different first."""
+    means = np.array([x.mean(axis=0) for x in modes])
+    within = np.mean([x.std(axis=0) for x in modes], axis=0)
+    apart = np.ptp(means, axis=0) / np.where(within > 0, within, np.inf)
+    order = np.argsort(-apart)
+    chosen = [i for i in order if apart[i] > _APART] or [order[0]]
+    variables = {v.name: model.values_to_rvs[v].name for v in raveled.variables}
+    return list(dict.fromkeys(variables[raveled.name_at(int(i))] for i in chosen))[:_MOST_NAMED]
+
+
+def _short(value: Array) -> str:
+    return np.array2string(np.asarray(value), precision=3, threshold=6, edgeitems=2)
