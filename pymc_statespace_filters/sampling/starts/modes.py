@@ -15,10 +15,8 @@ from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
 from scipy.spatial.distance import cdist
 
-from pymc_statespace_filters.sampling.target.variables import (
-    RaveledVariables,
-    constrained_values,
-)
+from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
+from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from pymc_statespace_filters.student_mixture import fit_mixture, place_components
 
 # With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
@@ -101,7 +99,8 @@ def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> st
     members = [np.flatnonzero(points.mode == numbers[i]) for i in large]
     highest = [of_mode[points.log_density[of_mode].argmax()] for of_mode in members]
     names = _differing(model, raveled, [points.x[of_mode] for of_mode in members])
-    values = constrained_values(model, [raveled.unravel(points.x[i]) for i in highest])
+    at = ConstrainedValues(model)
+    values = [at(points.x[i]) for i in highest]
     described = [
         f"at {', '.join(f'{name}={_short(value[name])}' for name in names)} "
         f"(share {shares[i]:.2f}, log-density {points.log_density[top]:.1f})"

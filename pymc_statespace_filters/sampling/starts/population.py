@@ -45,7 +45,8 @@ def population_of(
     Raises
     ------
     ModelError
-        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive likelihood.
+        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive
+        likelihood.
     """
     if model.discrete_value_vars:
         names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
