@@ -35,7 +35,8 @@ from benchmarks.measure import FOLDER, ROOT
 from benchmarks.posteriors import POSTERIORS
 
 STORE = FOLDER / "efficiency.jsonl"
-BEFORE, SLOW, N_SEEDS = "the version before", ("GridFilter", "BootstrapPF"), 5
+BEFORE, N_SEEDS = "the version before", 5
+SLOW, NOISY = "GridFilter", "BootstrapPF"
 SLOW_DRAWS, SLOW_SEEDS = 1000, 2
 
 
@@ -76,7 +77,7 @@ class Run:
     seconds: float
     start_seconds: float
     start_evaluations: int
-    kept_microseconds: float  # for each evaluation of the kept draws; NaN if not measured
+    kept_seconds: float
 
 
 def banana() -> pm.Model:
@@ -102,32 +103,30 @@ TARGETS = POSTERIORS | {"banana, 4": banana, "normal, 10": normal}
 
 
 def planned(posterior: str, name: str) -> Plan | None:
-    """The plan of a row: shorter for slow filters, None if the sampler does not suit them."""
+    """The plan of a row: shorter for slow filters, None if the sampler does not suit the filter."""
     plan = PLANS[name]
-    if not any(filter in posterior for filter in SLOW):
-        return plan
-    if plan.sampler is samplers.by_nutpie or (
-        plan.sampler is not samplers.dram and "BootstrapPF" in posterior
-    ):
-        return None  # no gradient; an estimate with new noise at every call
-    return plan._replace(draws=SLOW_DRAWS, seeds=SLOW_SEEDS)
+    if NOISY in posterior:
+        # Its likelihood is an estimate with new noise at every call.
+        return plan._replace(seeds=SLOW_SEEDS) if plan.sampler is samplers.dram else None
+    if SLOW in posterior:
+        # It has no gradient.
+        short = plan._replace(draws=SLOW_DRAWS, seeds=SLOW_SEEDS)
+        return short if plan.sampler is not samplers.by_nutpie else None
+    return plan
 
 
 def measured(posterior: str, name: str, plan: Plan, seeds: list[int], model: pm.Model) -> None:
     """Make the runs of a row, and store each."""
     sample = plan.sampler(model)
     for seed in seeds:
-        run, kept = sample(seed, plan.draws, plan.tune), np.nan
-        if seed == 0:
-            tuned = sample(seed, 1, plan.tune)
-            kept = 1e6 * (run.seconds - tuned.seconds) / run.kept_evaluations
+        run = sample(seed, plan.draws, plan.tune)
         columns = np.moveaxis(run.draws, 2, 0)
         row = Run(
             posterior, name, seed, plan.draws, plan.tune,
             float(min(array_stats.ess(c) for c in columns)),
             float(max(array_stats.rhat(c) for c in columns)),
             run.evaluations, run.kept_evaluations, run.seconds, run.start_seconds,
-            run.start_evaluations, kept,
+            run.start_evaluations, run.kept_seconds,
         )  # fmt: skip
         with STORE.open("a") as file:
             print(json.dumps(asdict(row), default=float), file=file)
@@ -167,7 +166,8 @@ def by_version(checkout: Path, arguments: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, origin in (("pymc_statespace_filters", checkout.resolve()), ("benchmarks", ROOT)):
             Path(folder, name).symlink_to(origin / name)
-        Path(folder, "out").symlink_to(ROOT / "out")
+        for name in ("out", "docs"):
+            Path(folder, name).symlink_to(ROOT / name)
         command = [sys.executable, "-m", "benchmarks.efficiency", "--samplers", BEFORE, *arguments]
         path = os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])
         subprocess.run(command, cwd=folder, env=os.environ | {"PYTHONPATH": path}, check=True)

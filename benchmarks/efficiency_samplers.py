@@ -24,6 +24,7 @@ class Sample(NamedTuple):
 
     draws: np.ndarray
     seconds: float
+    kept_seconds: float
     evaluations: int
     kept_evaluations: int
     start_seconds: float = 0.0
@@ -39,54 +40,71 @@ def elements(model: pm.Model, posterior) -> np.ndarray:
     return np.concatenate([v.reshape(*v.shape[:2], -1) for v in values], axis=2)
 
 
-class Starts:
-    """CPU seconds and evaluations of the search for starts."""
+class Clock:
+    """CPU seconds of the parts of ``sample_dram``, and evaluations of its search for starts."""
 
     def __init__(self) -> None:
-        self.seconds, self.evaluations = 0.0, 0
+        self.compilation = self.starts = 0.0
+        self.start_evaluations = 0
+        self.tuned: float | None = None  # when all chains had ended their warm-up together
 
     @contextmanager
-    def counted(self) -> Iterator[None]:
-        """Count in this block; a version without such a search has none."""
-        search, call = getattr(model_task, "find_population", None), ParallelMap.__call__
+    def running(self) -> Iterator[None]:
+        """Count in this block; earlier versions have neither a search nor a common warm-up."""
+        task = model_task.ModelTask
+        prepare, extend, call = task.prepare, getattr(task, "extend", None), ParallelMap.__call__
+        search = getattr(model_task, "find_population", None)
 
-        def find(*args, **kwargs):
+        def prepared(this):
+            began = time.process_time()
+            target = prepare(this)
+            self.compilation += time.process_time() - began
+            return target
+
+        def found(*args, **kwargs):
             began = time.process_time()
             with patch.object(ParallelMap, "__call__", rows):
-                found = search(*args, **kwargs)
-            self.seconds += time.process_time() - began
-            return found
+                population = search(*args, **kwargs)
+            self.starts += time.process_time() - began
+            return population
 
         def rows(mapped, *columns):
-            self.evaluations += len(columns[0])
+            self.start_evaluations += len(columns[0])
             return call(mapped, *columns)
 
-        with patch.object(model_task, "find_population", find, create=True):
+        def extended(this):
+            is_tuned, goes_on = this.n_iterations == this.request.tune, extend(this)
+            if is_tuned:
+                self.tuned = time.process_time()
+            return goes_on
+
+        with (
+            patch.object(task, "prepare", prepared),
+            patch.object(task, "extend", extended, create=True),
+            patch.object(model_task, "find_population", found, create=True),
+        ):
             yield
 
 
 def dram(model: pm.Model) -> Sampler:
-    def prepared() -> float:
-        began = time.process_time()
-        Target(model, None, DRAMSettings()).prepare()
-        return time.process_time() - began
-
     psf.sample_dram(2, 2, chains=1, initvals={}, model=model, progressbar=False)
-    preparation = min(prepared() for _ in range(2))
 
     def sample(seed: int, draws: int, tune: int) -> Sample:
-        starts, began = Starts(), time.process_time()
-        with starts.counted():
+        clock, began = Clock(), time.process_time()
+        with clock.running():
             idata = psf.sample_dram(
                 draws, tune, model=model, random_seed=seed, cores=1, progressbar=False,
                 discard_tuned_samples=False, compute_convergence_checks=False,
             )  # fmt: skip
-        seconds = time.process_time() - began - preparation
+        ended = time.process_time()
+        seconds = ended - began - clock.compilation
         groups = "sample_stats", "warmup_sample_stats"
         kept, warmup = (int(idata[group]["n_evaluations"].sum()) for group in groups)
-        everything = kept + warmup + starts.evaluations
-        cost = seconds, everything, kept, starts.seconds, starts.evaluations
-        return Sample(elements(model, idata["posterior"]), *cost)
+        in_kept = seconds * kept / (kept + warmup) if clock.tuned is None else ended - clock.tuned
+        return Sample(
+            elements(model, idata["posterior"]), seconds, in_kept,
+            kept + warmup + clock.start_evaluations, kept, clock.starts, clock.start_evaluations,
+        )  # fmt: skip
 
     return sample
 
@@ -108,7 +126,8 @@ def de_metropolis(model: pm.Model) -> Sampler:
         chains, seconds = timed(seed, draws, tune)
         # Every iteration evaluates the proposal and, again, the current point.
         counts = 2 * CHAINS * (draws + tune), 2 * CHAINS * draws
-        return Sample(chains, seconds - preparation, *counts)
+        seconds -= preparation
+        return Sample(chains, seconds, seconds * draws / (draws + tune), *counts)
 
     return sample
 
@@ -127,7 +146,8 @@ def by_nutpie(model: pm.Model) -> Sampler:
         seconds = time.process_time() - began
         groups = "sample_stats", "warmup_sample_stats"
         kept, warmup = (int(idata[group]["n_steps"].sum()) for group in groups)
-        return Sample(elements(model, idata["posterior"]), seconds, kept + warmup, kept)
+        in_kept = seconds * kept / (kept + warmup)
+        return Sample(elements(model, idata["posterior"]), seconds, in_kept, kept + warmup, kept)
 
     sample(0, 2, 2)
     return sample
@@ -163,12 +183,13 @@ def by_emcee(model: pm.Model) -> Sampler:
         start = density.starts(WALKERS, rng)
         sampler = emcee.EnsembleSampler(WALKERS, start.shape[1], density)
         state = sampler.run_mcmc(start, max(1, CHAINS * tune // WALKERS))
-        tuning = density.calls
+        tuning, tuned = density.calls, time.process_time()
         sampler.reset()
         sampler.run_mcmc(state, max(1, CHAINS * draws // WALKERS))
-        seconds = time.process_time() - began
+        ended = time.process_time()
         chains = sampler.get_chain().swapaxes(0, 1)
-        return Sample(chains, seconds, density.calls, density.calls - tuning)
+        kept = density.calls - tuning
+        return Sample(chains, ended - began, ended - tuned, density.calls, kept)
 
     return sample
 
@@ -188,6 +209,7 @@ def by_pymcmcstat(model: pm.Model) -> Sampler:
             chains.append(run[0][tune:])
         kept = density.calls * draws // (draws + tune)
         seconds = time.process_time() - began
-        return Sample(np.array(chains), seconds, density.calls, kept)
+        in_kept = seconds * kept / density.calls
+        return Sample(np.array(chains), seconds, in_kept, density.calls, kept)
 
     return sample

@@ -34,7 +34,6 @@ def starts(group: list["Run"]) -> str:
 
 def row(group: list["Run"]) -> list[str]:
     first = group[0]
-    kept = np.nanmedian([run.kept_microseconds for run in group])
     return [
         first.posterior,
         f"`{first.sampler}`" if "(" in first.sampler else first.sampler,
@@ -42,7 +41,7 @@ def row(group: list["Run"]) -> list[str]:
         number(median(1000 * run.ess / run.evaluations for run in group)),
         number(median(1000 * run.ess / run.kept_evaluations for run in group)),
         number(median(run.ess / run.seconds for run in group)),
-        number(median(1e6 * run.ess / (run.kept_evaluations * kept) for run in group)),
+        number(median(run.ess / run.kept_seconds for run in group)),
         f"{np.mean([run.rhat for run in group]):.3f}",
         f"{max(run.rhat for run in group):.3f}",
         starts(group),
