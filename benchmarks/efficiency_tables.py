@@ -1,6 +1,7 @@
 """The tables of `efficiency`: medians over seeds, and the worst of them."""
 
 from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,17 @@ HEAD = [
     "ESS per CPU second", "of kept draws", "R-hat, mean", "worst", "starts, of CPU time",
 ]  # fmt: skip
 LONG_HEAD = ["posterior", "draws", "R-hat of each seed", "smallest ESS", "starts, of CPU time"]
+
+
+def versions() -> str:
+    """The installed samplers."""
+    found = []
+    for name in ("pymc", "nutpie", "pymcmcstat", "emcee"):
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} not installed")
+    return ", ".join(found)
 
 
 def grouped(runs: Sequence["Run"]) -> dict[tuple[str, str], list["Run"]]:
@@ -59,7 +71,7 @@ def write(runs: Sequence["Run"], posteriors: list[str], samplers: list[str], lon
     groups = grouped(runs)
     keys = [(p, s) for p in posteriors for s in samplers if s != long]
     text = (
-        f"Measured on {cpu()}; medians over seeds.\n\n"
+        f"Measured on {cpu()}; {versions()}; medians over seeds.\n\n"
         + table(HEAD, [row(groups[key]) for key in keys if key in groups])
         + "\nLong runs with default arguments, four chains:\n\n"
         + table(LONG_HEAD, [long_row(groups[p, long]) for p in posteriors if (p, long) in groups])
