@@ -228,4 +228,4 @@ def seconds(value: float) -> str:
 def number(value: float | None) -> str:
     if value is None:
         return "not measured"
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}" if value >= 10 else f"{value:.2f}"
+    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}" if value >= 10 else f"{value:.2f}"

@@ -6,6 +6,7 @@ It does not use ``serve``: it runs one chain per seed and writes all of them to 
 
 import sys
 import time
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
@@ -30,7 +31,8 @@ def minus_two_log_posterior(q, steps, observed):
     return -2.0 * (ekf_double_well(theta, steps, observed) + prior)
 
 
-def chain(seed, n, start, steps, observed):
+def chain(seed, n, names, start, minus_two_log_density):
+    """A chain of n draws from a start, and its CPU seconds."""
     np.random.seed(seed)  # noqa: NPY002 - it draws from the global generator
     mcmc = MCMC()
     mcmc.data.add_data_set(x=np.zeros(1), y=np.zeros(1))
@@ -39,10 +41,10 @@ def chain(seed, n, start, steps, observed):
         nsimu=n, updatesigma=False, method="dram", verbosity=0, waitbar=False
     )
     mcmc.model_settings.define_model_settings(
-        sos_function=lambda q, data, custom=None: minus_two_log_posterior(q, steps, observed),
+        sos_function=lambda q, data, custom=None: minus_two_log_density(q),
         sigma2=1.0,
     )
-    for name, value in zip(NAMES, start, strict=True):
+    for name, value in zip(names, start, strict=True):
         mcmc.parameters.add_model_parameter(
             name=name, theta0=value, prior_mu=0.0, prior_sigma=np.inf
         )
@@ -56,9 +58,10 @@ def main(records, target, n_seeds, tune, draws):
     alpha, beta, sigma, gamma = data["double_well_theta"]
     start = np.array([alpha, beta, np.log(sigma), np.log(gamma)])
     steps, observed = data["steps"], data["double_well_observed"]
-    minus_two_log_posterior(start, steps, observed)
+    density = partial(minus_two_log_posterior, steps=steps, observed=observed)
+    density(start)
     chains, seconds = zip(
-        *(chain(seed, tune + draws, start, steps, observed) for seed in range(n_seeds)),
+        *(chain(seed, tune + draws, NAMES, start, density) for seed in range(n_seeds)),
         strict=True,
     )
     np.savez(
@@ -66,4 +69,5 @@ def main(records, target, n_seeds, tune, draws):
     )
 
 
-main(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:]))
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:]))
