@@ -28,6 +28,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
     INDEPENDENT,
     N_EVALUATIONS,
     N_SCREENED,
+    STAGE,
     Draws,
 )
 from pymc_statespace_filters.student_mixture import (
@@ -40,6 +41,7 @@ from pymc_statespace_filters.student_mixture import (
 FIRST_SHARE = 0.5  # of a mixture not tried yet
 LEAST_SHARE, MOST_SHARE = 0.2, 0.65  # the least while tuning, so that it goes on being tried
 NO_SHARE = 0.05  # a smaller one is not worth its evaluations after warm-up
+LEAST_ACCEPTANCE = 0.05  # of the mixture's proposals, else the share is as small as may be
 MIN_GAIN = 0.02  # nats per held-out draw, to accept a further component
 FEWEST = 10  # different draws for each dimension, to fit at all
 MOST_FITTED = 2000  # draws, more take long
@@ -80,7 +82,8 @@ def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> f
     """The share, by the squared jumps for each evaluation in some iterations.
 
     They are a and b for the two kinds of proposals, in standard deviations of the draws; the share
-    is a^2 / (a^2 + b^2). If one kind was not tried, it is `FIRST_SHARE`.
+    is a^2 / (a^2 + b^2), and 0 if hardly a proposal of the mixture was accepted. If one kind was
+    not tried, it is `FIRST_SHARE`.
     """
     first = max(begin, 1)
     if end == first:  # one iteration, without one before it
@@ -94,6 +97,8 @@ def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> f
     cost = counts[:, N_EVALUATIONS] + counts[:, N_SCREENED]
     if not cost[free].sum() or not cost[~free].sum():
         return FIRST_SHARE if share == 0.0 else share
+    if (counts[free, STAGE] > 0).mean() < LEAST_ACCEPTANCE:
+        return 0.0  # rare long jumps, as into a mode, while the random walk is still on its way
     a = squared[free].sum() / cost[free].sum()
     b = squared[~free].sum() / cost[~free].sum()
     found = a**2 / (a**2 + b**2) if a > 0 else 0.0
