@@ -49,10 +49,15 @@ def sample_dram(
     gather: str = "root",
     **dram_settings: Any,
 ) -> DataTree | None:
-    """Sample a model by delayed rejection adaptive Metropolis, with whole chains in machine code.
+    """Sample a model by adaptive Metropolis-Hastings, with whole chains in machine code.
 
-    The transitions are those of ``pm.sample(step=psf.DRAM())``, without Python between the draws: a
-    draw costs as much as its likelihood. Chains run in threads, and with MPI on several machines.
+    Chains start in the posterior, which a population finds first, see `find_starts`. Some proposals
+    are the random walk of `DRAM` with delayed rejection, the others are drawn from a mixture of
+    Student-t distributions. It is fitted to the draws of all chains after each quarter of the
+    warm-up, and its share of the proposals follows the jumps that it has made. Both are then
+    frozen, so that the draws are exact, with an estimated likelihood too. There is no Python
+    between the draws: one costs as much as its likelihood. Chains run in threads, and with MPI on
+    several machines.
 
     Parameters
     ----------
@@ -77,7 +82,9 @@ def sample_dram(
     random_seed : int or numpy.random.Generator, optional
     initvals : dict, or sequence of dict, optional
         Initial values, for all chains or for each, as in ``pm.sample``. Default: with
-        ``tune > 0``, the best of a few draws from the prior.
+        ``tune > 0``, points of a population that is led from the prior to the posterior; the best
+        of a few draws from the prior if a prior is improper, with ``correlation``, or if ranks
+        share a chain.
     pilot : xarray.DataTree, optional
         Draws from a posterior close to the model's, such as that of the same parameters with a
         cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is
