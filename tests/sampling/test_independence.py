@@ -10,7 +10,7 @@ import pymc as pm
 import pytest
 from numba import njit
 from scipy.integrate import quad
-from scipy.stats import kstest
+from scipy.stats import chi2, kstest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.kernel import proposal_mixture
@@ -31,6 +31,7 @@ from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
     next_share,
     warmup_parts,
 )
+from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import (
     INDEPENDENT,
     N_COUNTS,
@@ -90,6 +91,18 @@ def test_draws_have_the_density():
     others = mixture.sample(20_000, np.random.default_rng(4))
     for direction in np.random.default_rng(5).standard_normal((6, 3)):
         assert kstest(mine @ direction, others @ direction).pvalue > 0.001
+
+
+def test_spreads_of_a_block_are_those_of_a_student_t():
+    """A spread times a normal has nu degrees of freedom; Kolmogorov-Smirnov at 0.1 %."""
+    key = np.array([3, 4], dtype=np.uint64)
+    blocks = [random_block(key, i, 1, 1, 0) for i in range(40)]
+    spreads = np.concatenate([block.spreads for block in blocks])
+    squared = DEGREES_OF_FREEDOM / spreads**2
+    assert kstest(squared, chi2(DEGREES_OF_FREEDOM).cdf).pvalue > 0.001
+    choices = np.concatenate([block.choices for block in blocks])
+    assert kstest(choices.ravel(), "uniform").pvalue > 0.001
+    assert abs(np.corrcoef(choices.T)[0, 1]) < 0.05
 
 
 # The chain, on a posterior of one dimension with two unequal modes, known by quadrature.
