@@ -26,7 +26,8 @@ import pytensor
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.output.deterministics import Deterministics
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
+from pymc_statespace_filters.sampling.run.model_task import ModelTask
+from pymc_statespace_filters.sampling.run.request import sampling_request
 from pymc_statespace_filters.sampling.target.log_density import screening_density
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -122,11 +123,6 @@ class Replications:
         graph = setting.graph and setting.graph(self.model)
         self._target = Target(self.model, None, settings, graph=graph)
         self._deterministics = Deterministics(self.model, self._target.raveled)
-        seeds = [np.random.SeedSequence(0)]  # of a start that is not random
-        raveled, prior_draws = self._target.raveled, self._target.prior_draws
-        (self._candidates,) = chain_candidates(
-            self.model, raveled, prior_draws, None, seeds, disperse=True
-        )
         # Machine code runs in threads; what PyTensor has compiled is called by one at a time.
         self._lock = Lock()
 
@@ -137,18 +133,24 @@ class Replications:
 
     def chain(self, index, n_draws):
         """Draws by name, each (n_draws,): those of ``sample_dram(random_seed=index, chains=1)``."""
-        (seed,) = np.random.SeedSequence([index]).spawn(1)
+        request = sampling_request(
+            n_draws, TUNE, 1, index, None, False, None, None, self._setting.dram
+        )
+        task = ModelTask(self.model, request, target=self._target)
         with self._lock:
             self.record.set_value(self.truth_and_record(index)[1])
-            self._target.prepare()
-            task = self._setting.run(self._target, TUNE, n_draws, self._start, seed)
-        task.run(Event())
+            task.prepare()
+            task.population = task.find_population(progressbar=False)
+            chain = task.chain_task(0)
+        chain.__class__ = self._setting.run
+        chain.run(Event())
+        task.add_result(0, *chain.result())
+        while task.extend():
+            chain.extend(task.n_iterations, task.mixture)
+            chain.run(Event())
+            task.add_result(0, *chain.result())
         with self._lock:
-            return self._deterministics(task.chain.draws.positions[TUNE:])
-
-    def _start(self, rng):
-        with self._lock:
-            return self._candidates(rng)
+            return self._deterministics(chain.chain.draws.positions[TUNE:])
 
     def replicate(self, index):
         """Ranks of the truth, correlations of neighbours, and the length of the chain."""

@@ -75,6 +75,8 @@ class ModelTask:
         For messages; empty if there is only one model.
     group : Communicator, optional
         Ranks that evaluate the likelihoods together, of which this is the first.
+    target : Target, optional
+        The model's, if it has been made already.
 
     Raises
     ------
@@ -88,12 +90,14 @@ class ModelTask:
         request: SamplingRequest,
         name: str = "",
         group: Communicator | None = None,
+        target: Target | None = None,
     ):
         check_no_generators(model)
         self.model, self.request, self.name = model, request, name
         self._group = group
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
+        self._given = target
         self._target: Target | None = None
         # Iterations after which the chains wait for each other, and the next of them.
         self._stops = [*warmup_parts(request.tune), request.n_iterations]
@@ -113,9 +117,10 @@ class ModelTask:
         """Compile the model and find candidates for the starts, once."""
         if self._target is None:
             request = self.request
-            self._target = target = Target(
+            target = self._given or Target(
                 self.model, None, request.settings, request.proposal_cov, group=self._group
             )
+            self._target = target
             target.prepare()
             self._seeds = np.random.SeedSequence(request.entropy).spawn(request.chains)
             self._candidates = chain_candidates(
