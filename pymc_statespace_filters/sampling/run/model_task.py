@@ -19,12 +19,6 @@ from xarray import DataTree
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
-    fitted_mixture,
-    improved_mixture,
-    warmup_parts,
-)
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
@@ -47,14 +41,13 @@ from pymc_statespace_filters.sampling.output.warnings import (
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
+from pymc_statespace_filters.sampling.run.warm_up import WarmUp, generator_of, stops_of
 from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import find_population
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
-_NO_CHAIN = 2**32 - 1
 _UNUSABLE_PILOT = (
     "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
     "drawn from, no initval in the model, no correlation, and one rank per chain"
@@ -99,10 +92,7 @@ class ModelTask:
         self.population: np.ndarray | None = None
         self._given = target
         self._target: Target | None = None
-        # Iterations after which the chains wait for each other, and the next of them.
-        self._stops = [*warmup_parts(request.tune), request.n_iterations]
-        self.n_iterations = self._stops[0]
-        self._mixture: np.ndarray | None = None
+        self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the lengths of the chains that they are of.
         self._convergence: tuple[list[int], Convergence | None] = [], None
@@ -150,7 +140,7 @@ class ModelTask:
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
             population=self.population if request.initvals is None else None,
-            mixture=self._first_mixture,
+            mixture=self.mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
@@ -182,7 +172,9 @@ class ModelTask:
         if journal is not None and (stored := journal.read()) is not None:
             return stored.draws["population"]
         try:
-            found = find_population(target, self._generator(), progressbar=progressbar, pilot=pilot)
+            found = find_population(
+                target, generator_of(request), progressbar=progressbar, pilot=pilot
+            )
         except Exception as error:
             of_model = f" of model {self.name!r}" if self.name else ""
             error.add_note(f"in the search for starts{of_model}")
@@ -225,8 +217,8 @@ class ModelTask:
         """
         request = self.request
         if self.n_iterations < request.n_iterations:
-            self._improve_mixture()
-            self.n_iterations = min(stop for stop in self._stops if stop > self.n_iterations)
+            chains = [self._results[i][0] for i in range(request.chains)]
+            self.n_iterations = self._warm_up.end_part(chains, self.n_iterations)
             return True
         if request.until_ess is None or request.max_draws is None:
             return False
@@ -236,41 +228,14 @@ class ModelTask:
         self.n_iterations = request.tune + min(request.max_draws, draws + (draws + 1) // 2)
         return True
 
-    @cached_property
-    def _first_mixture(self) -> np.ndarray:
-        """The mixture of the chains' first part."""
-        fitted = None
-        if self.population is not None:
-            fitted = fitted_mixture([self.population], self._generator(0))
-        return no_mixture(self.prepare().raveled.dim) if fitted is None else fitted
-
     @property
     def mixture(self) -> np.ndarray:
-        """The packed mixture of the proposals, of the current part."""
-        return self._first_mixture if self._mixture is None else self._mixture
+        """The packed mixture of the chains' proposals, of the current part."""
+        return self._warm_up.mixture
 
-    def _improve_mixture(self) -> None:
-        """Fit the mixture to the draws of all chains since the middle of the warm-up so far."""
-        end = self.n_iterations
-        begin = max((stop for stop in self._stops if stop < end), default=0)
-        chains = [self._results[i][0] for i in range(self.request.chains)]
-        population = np.empty((0, self.prepare().raveled.dim))
-        if self.population is not None:
-            population = self.population[:: N_SWEEPS if self.request.initvals is None else 1]
-        self._mixture = improved_mixture(
-            self.mixture,
-            chains,
-            begin,
-            end,
-            self._generator(end),
-            population=population,
-            tuning=end < self.request.tune,
-        )
-
-    def _generator(self, *key: int) -> np.random.Generator:
-        """A generator of the model's own random numbers, which are not those of a chain."""
-        seed = np.random.SeedSequence(self.request.entropy, spawn_key=(_NO_CHAIN, *key))
-        return np.random.default_rng(seed)
+    @cached_property
+    def _warm_up(self) -> WarmUp:
+        return WarmUp(self.request, self.prepare().raveled.dim, self.population)
 
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""
