@@ -258,7 +258,7 @@ class TestRefusals:
         with pm.Model() as model:
             x = pm.Normal("x", 0.0, 1.0)
             pm.Potential("never", pt.switch(x > 100.0, 0.0, -np.inf))
-        self.refused("zero at all of 2048 draws", model=model)
+        self.refused("zero at all of 2000 draws", model=model)
 
     def test_other_arguments(self):
         self.refused("model must be a pymc.Model, got str", model="model")
