@@ -83,8 +83,7 @@ def sample_dram(
     initvals : dict, or sequence of dict, optional
         Initial values, for all chains or for each, as in ``pm.sample``. Default: with
         ``tune > 0``, points of a population that is led from the prior to the posterior; the best
-        of a few draws from the prior if a prior is improper, with ``correlation``, or if ranks
-        share a chain.
+        of a few draws from the prior if a prior is improper, or with ``correlation``.
     pilot : xarray.DataTree, optional
         Draws from a posterior close to the model's, such as that of the same parameters with a
         cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is

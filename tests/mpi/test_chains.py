@@ -8,7 +8,7 @@ from tests.sampling.test_sample_dram import state_space_model
 
 FILTERS = {"exact": [psf.EKF()], "noisy": [psf.BootstrapPF(20), psf.EKF()]}
 # Runs of one length, and runs that go on: the first model for longer.
-RULES = {"one round": {}, "rounds": {"until_ess": 400, "max_draws": 4000}}
+RULES = {"one round": {}, "rounds": {"until_ess": 250, "max_draws": 4000}}
 
 
 def draws_of_all(**settings):

@@ -50,7 +50,7 @@ from pymc_statespace_filters.sampling.target.variables import check_no_generator
 
 _UNUSABLE_PILOT = (
     "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
-    "drawn from, no initval in the model, no correlation, and one rank per chain"
+    "drawn from, no initval in the model, and no correlation"
 )
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
@@ -146,7 +146,7 @@ class ModelTask:
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        Neither without warm-up, nor if ranks divide the particles or the noise is carried. A pilot
+        Neither without warm-up, nor if the noise is carried. A pilot
         that lacks no variable has the points itself.
 
         Raises
@@ -163,7 +163,6 @@ class ModelTask:
             or request.initvals is not None
             or not target.prior_draws.may_start
             or target.carries_noise
-            or self.is_distributed
         ):
             if pilot is not None:
                 raise ModelError(self._said(_UNUSABLE_PILOT))

@@ -21,6 +21,7 @@ from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
 from pymc_statespace_filters.sampling.starts.modes import Points, find_modes
 from pymc_statespace_filters.sampling.starts.nested import nested_reference
+from pymc_statespace_filters.sampling.target.log_density import RowsOnAllRanks
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
@@ -142,7 +143,9 @@ def _without_stragglers(population: Population) -> Population:
     return population.at(np.flatnonzero(log_density >= least))
 
 
-def _densities(rows: ParallelMap, target: Target, rng: np.random.Generator) -> Densities:
+def _densities(
+    rows: ParallelMap | RowsOnAllRanks, target: Target, rng: np.random.Generator
+) -> Densities:
     """Log-densities of prior and posterior; an estimate gets new noise, unless it is fixed."""
 
     def evaluate(x: Array) -> tuple[Array, Array]:

@@ -137,11 +137,14 @@ class LogDensity:
             self._native = NativeFunction(self._function, inputs)
         return self._native
 
-    def at_rows(self) -> ParallelMap:
-        """A function of positions (m, d) and m seeds of each noisy variable, in threads.
+    def at_rows(self) -> "ParallelMap | RowsOnAllRanks":
+        """A function of positions (m, d) and m seeds of each noisy variable.
 
-        Columns of its results are the log-density and that of the prior.
+        The first columns of its results are the log-density and that of the prior. It works in
+        threads, unless all ranks evaluate together.
         """
+        if self._leader is not None:
+            return RowsOnAllRanks(self.bind())
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
         inputs = self._inputs(self._start, self._others, np.zeros(()), self._first_normals(), seeds)
         n = 1 + self._n_seeds
@@ -224,6 +227,23 @@ class BoundLogDensity:
         if result.failure == RAISED:
             self.raise_error()
         return result
+
+
+class RowsOnAllRanks:
+    """A log-density at many points, one after the other, as ranks evaluate each together."""
+
+    def __init__(self, density: BoundLogDensity) -> None:
+        self._density = density
+        self.on_progress: Callable[[int], None] = lambda count: None
+
+    def __call__(self, x: np.ndarray, *seeds: np.ndarray) -> np.ndarray:
+        """Log-densities of posterior and prior, (m, 2), at positions (m, d)."""
+        results = np.empty((len(x), 2))
+        for i, position in enumerate(x):
+            self._density(position, self._density.others, [column[i] for column in seeds])
+            results[i] = self._density.native.call.out[1:3]
+            self.on_progress(1)
+        return results
 
 
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:
