@@ -9,6 +9,7 @@ the tails (Hesterberg 1995).
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,24 @@ class StudentMixture:
     def affine(self, mean: Array, chol: Array) -> "StudentMixture":
         """The distribution of mean + chol x."""
         return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
+
+
+class Standardised(NamedTuple):
+    """Draws x (n, k) as mean + chol z, with z of mean zero and covariance one."""
+
+    mean: Array
+    chol: Array
+    z: Array
+
+
+def standardised(x: Array) -> Standardised | None:
+    """Draws (n, k) as `fit_mixture` takes them; None if they do not vary in every direction."""
+    mean, cov = x.mean(axis=0), np.atleast_2d(np.cov(x, rowvar=False))
+    try:
+        chol = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return None
+    return Standardised(mean, chol, (x - mean) @ np.linalg.inv(chol).T)
 
 
 def place_components(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:

@@ -3,9 +3,8 @@
 Chib and Jeliazkov's plan and both kinds of bridge sampling need log-densities at draws of N(m, C),
 with the moments of each half of the chains. In a set of estimators they are evaluated once.
 
-Points are made in blocks, each with its own random numbers. The first points are therefore the
-same whoever asks for them and however many others ask for: an estimate does not depend on which
-estimators run beside it.
+Points are made in blocks, each with its own random numbers. Every estimator therefore gets the same
+first points, and an estimate does not depend on which estimators run beside it.
 """
 
 from collections.abc import Sequence

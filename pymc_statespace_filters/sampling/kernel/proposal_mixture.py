@@ -36,6 +36,7 @@ from pymc_statespace_filters.student_mixture import (
     StudentMixture,
     fit_mixture,
     place_components,
+    standardised,
 )
 
 FIRST_SHARE = 0.5  # of a mixture not tried yet
@@ -116,14 +117,12 @@ def fitted_mixture(parts: Sequence[Array], rng: np.random.Generator) -> Array | 
     dim = draws.shape[1]
     if len(np.unique(draws, axis=0)) < FEWEST * dim:
         return None
-    mean, cov = draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
-    try:
-        chol = np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
+    found = standardised(draws)
+    if found is None:
         return None
-    whitened = [(part - mean) @ np.linalg.inv(chol).T for part in parts]
-    mixture = _likeliest(whitened, rng).with_defensive_component().affine(mean, chol)
-    return _packed(mixture)
+    whitened = np.split(found.z, np.cumsum([len(part) for part in parts])[:-1])
+    mixture = _likeliest(whitened, rng).with_defensive_component()
+    return _packed(mixture.affine(found.mean, found.chol))
 
 
 def _likeliest(parts: Sequence[Array], rng: np.random.Generator) -> StudentMixture:

@@ -146,8 +146,8 @@ class ModelTask:
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        Neither without warm-up, nor if the noise is carried. A pilot
-        that lacks no variable has the points itself.
+        None without warm-up, too, and if the noise is carried. A pilot that lacks no variable has
+        the points itself.
 
         Raises
         ------

@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 
 from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
-from pymc_statespace_filters.student_mixture import fit_mixture, place_components
+from pymc_statespace_filters.student_mixture import fit_mixture, place_components, standardised
 
 # With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
 _N_GROUPS = 4
@@ -46,15 +46,13 @@ def find_modes(
 
     ``evaluate`` gives the log-densities at points (m, d).
     """
-    none = np.zeros(len(x), dtype=np.intp)
-    if np.linalg.matrix_rank(x - x.mean(axis=0)) < x.shape[1]:
-        return none
-    chol = np.linalg.cholesky(np.atleast_2d(np.cov(x, rowvar=False)))
-    standardised = (x - x.mean(axis=0)) @ np.linalg.inv(chol).T
-    mixture = fit_mixture(standardised, place_components(standardised, _N_GROUPS, rng))
-    group = mixture.log_joint(standardised).argmax(axis=0)
+    points = standardised(x) if len(x) > x.shape[1] else None
+    if points is None:
+        return np.zeros(len(x), dtype=np.intp)
+    mixture = fit_mixture(points.z, place_components(points.z, _N_GROUPS, rng))
+    group = mixture.log_joint(points.z).argmax(axis=0)
     lines = {
-        pair: _shortest_lines(standardised, *(np.flatnonzero(group == g) for g in pair))
+        pair: _shortest_lines(points.z, *(np.flatnonzero(group == g) for g in pair))
         for pair in combinations(np.unique(group), 2)
     }
     mode = group.copy()

@@ -8,7 +8,13 @@ component covers the prior of all variables, as the posterior may lie far from t
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.student_mixture import StudentMixture, fit_mixture, place_components
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.student_mixture import (
+    StudentMixture,
+    fit_mixture,
+    place_components,
+    standardised,
+)
 
 _N_COMPONENTS = 4  # of the known draws, which may have several modes
 _PRIOR_WEIGHT = 0.2
@@ -30,7 +36,8 @@ def nested_reference(known: Array, prior: Array, rng: np.random.Generator) -> St
 
 
 def _fitted(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
-    mean, chol = x.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(x, rowvar=False)))
-    standardised = (x - mean) @ np.linalg.inv(chol).T
-    placed = place_components(standardised, n_components, rng)
-    return fit_mixture(standardised, placed).affine(mean, chol)
+    draws = standardised(x)
+    if draws is None:
+        raise ModelError("pilot must have draws that vary in every direction")
+    placed = place_components(draws.z, n_components, rng)
+    return fit_mixture(draws.z, placed).affine(draws.mean, draws.chol)
