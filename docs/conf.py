@@ -68,6 +68,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "header_links_before_dropdown": 6,
     "navbar_end": ["theme-switcher"],
+    "navbar_persistent": ["search-button"],  # a field would wrap the header at 1280 px
     "secondary_sidebar_items": ["page-toc"],
     "show_nav_level": 2,
 }

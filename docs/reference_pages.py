@@ -33,12 +33,12 @@ def write(folder: Path) -> None:
     """Write an index of all names in groups, and one page for each name."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    sections = [_heading("Names", "="), f".. currentmodule:: {PACKAGE}\n"]
-    for title, names in _grouped().items():
-        sections.append(_section(title, names))
+    groups = _grouped()
+    for title, names in groups.items():
+        (folder / f"{_slug(title)}.rst").write_text(_group(title, names))
         for name in names:
             (folder / f"{name}.rst").write_text(_page(name))
-    (folder / "index.rst").write_text("\n".join(sections))
+    (folder / "index.rst").write_text(_index(groups))
 
 
 def _grouped() -> dict[str, list[str]]:
@@ -55,20 +55,34 @@ def _grouped() -> dict[str, list[str]]:
     return {title: names for title, names in groups.items() if names}
 
 
-def _section(title: str, names: list[str]) -> str:
-    table = [
-        ".. autosummary::",
-        "   :nosignatures:",
-        "",
-        *(f"   {name}" for name in names),
-    ]
-    pages = [
-        ".. toctree::",
-        "   :hidden:",
-        "",
-        *(f"   {name}" for name in names),
-    ]
-    return "\n".join([_heading(title, "-"), *table, "", *pages, ""])
+def _index(groups: dict[str, list[str]]) -> str:
+    """All names on one page; in the sidebar, a page for each group."""
+    sections = [_heading("Names", "="), f".. currentmodule:: {PACKAGE}\n"]
+    for title, names in groups.items():
+        sections += [_heading(title, "-"), _table(names)]
+    return "\n".join([*sections, _toctree([_slug(title) for title in groups])])
+
+
+def _group(title: str, names: list[str]) -> str:
+    heading = [_heading(title, "="), f".. currentmodule:: {PACKAGE}\n"]
+    return "\n".join([*heading, _table(names), _toctree(names)])
+
+
+def _slug(title: str) -> str:
+    return "-".join(title.lower().replace(",", "").split())
+
+
+def _table(names: list[str]) -> str:
+    return _directive("autosummary", "nosignatures", names)
+
+
+def _toctree(pages: list[str]) -> str:
+    return _directive("toctree", "hidden", pages)
+
+
+def _directive(name: str, option: str, entries: list[str]) -> str:
+    lines = [f".. {name}::", f"   :{option}:", ""]
+    return "\n".join([*lines, *(f"   {entry}" for entry in entries), ""])
 
 
 def _page(name: str) -> str:

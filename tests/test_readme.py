@@ -30,7 +30,7 @@ def run_code_of(*pages: str) -> dict:
     return names
 
 
-def test_twenty_lines(capsys: pytest.CaptureFixture) -> None:
+def test_the_example(capsys: pytest.CaptureFixture) -> None:
     names = run_code_of("README.md")
     assert np.isfinite(names["evidence"].log_evidence)
     assert dict(names["idata"]["posterior"].sizes) == {"chain": 4, "draw": 2000}
