@@ -42,7 +42,7 @@ from .plots import (
 from .point_estimation import MaximumLikelihoodEstimate, maximum_likelihood
 from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
-from .states import filtered_states, forecast, smoothed_states
+from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.integrators import EulerMaruyama
 from .system.model import StateSpaceModel
@@ -84,6 +84,7 @@ __all__ = [
     "filtered_states",
     "find_starts",
     "forecast",
+    "free_run",
     "freeplay",
     "hysteresis",
     "hysteresis_branch",
