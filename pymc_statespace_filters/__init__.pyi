@@ -15,6 +15,7 @@ from .errors import (
     ParallelWarning,
     StateSpaceFiltersError,
 )
+from .evaluation.linear_modes import linear_modes
 from .evaluation.log_likelihood import log_likelihood
 from .evaluation.run_filter import run_filter
 from .evaluation.simulate import simulate
@@ -47,6 +48,7 @@ from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.integrators import EulerMaruyama
 from .system.model import StateSpaceModel
 from .system.record import nearest_steps
+from .system.second_order import second_order
 
 __all__ = [
     "DRAM",
@@ -89,6 +91,7 @@ __all__ = [
     "hysteresis",
     "hysteresis_branch",
     "leave_future_out",
+    "linear_modes",
     "log_likelihood",
     "marginal_modes",
     "maximum_likelihood",
@@ -105,6 +108,7 @@ __all__ = [
     "run_filter",
     "run_models",
     "sample_dram",
+    "second_order",
     "simulate",
     "smoothed_states",
     "suggest_particles",

@@ -19,28 +19,28 @@ def prediction_errors(
     ``measured`` (draws, R, p) are predictions with measurement noise. Missing data and NaN draws
     are left out.
     """
-    name, time, observable = predicted.name, *predicted.dims[-2:]
+    name, (time, observable) = predicted.name, map(str, predicted.dims[-2:])
     record = xr.DataArray(observed, dims=(time, observable))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # means of nothing are NaN
-        rmse = _rmse(predicted.mean(SAMPLE_DIMS), record)
+        rmse = _rmse(predicted.mean(SAMPLE_DIMS), record, time)
         return xr.Dataset(
             {
                 f"{name}_rmse": rmse,
                 f"{name}_relative_error": rmse / record.std(time),
-                f"{name}_rmse_of_draws": _rmse(predicted, record),
+                f"{name}_rmse_of_draws": _rmse(predicted, record, time),
                 f"{name}_coverage": _coverage(
-                    predicted.copy(data=measured.reshape(predicted.shape)), record
+                    predicted.copy(data=measured.reshape(predicted.shape)), record, time
                 ),
             }
         )
 
 
-def _rmse(predicted: xr.DataArray, record: xr.DataArray) -> xr.DataArray:
-    return np.sqrt(((predicted - record) ** 2).mean(record.dims[0]))
+def _rmse(predicted: xr.DataArray, record: xr.DataArray, time: str) -> xr.DataArray:
+    return ((predicted - record) ** 2).mean(time) ** 0.5
 
 
-def _coverage(measured: xr.DataArray, record: xr.DataArray) -> xr.DataArray:
+def _coverage(measured: xr.DataArray, record: xr.DataArray, time: str) -> xr.DataArray:
     """Fraction of the record in the central intervals of each time."""
     fractions = []
     for probability in PROBABILITIES:
@@ -50,5 +50,5 @@ def _coverage(measured: xr.DataArray, record: xr.DataArray) -> xr.DataArray:
         low, high = ends.isel(quantile=0, drop=True), ends.isel(quantile=1, drop=True)
         known = record.notnull() & low.notnull()
         inside = (record >= low) & (record <= high)
-        fractions.append(inside.where(known).mean(record.dims[0]))
+        fractions.append(inside.where(known).mean(time))
     return xr.concat(fractions, xr.Variable("interval", list(PROBABILITIES)))
