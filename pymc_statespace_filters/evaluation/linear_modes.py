@@ -31,7 +31,8 @@ def linear_modes(system: StateSpaceModel, params: Any, *, at: Any = None) -> pd.
     system : StateSpaceModel
     params : mapping, xarray.Dataset or xarray.DataTree
         A number or an array of draws for every parameter; or a posterior, or a DataTree with one,
-        whose variables have the names of the parameters.
+        whose variables have the names of the parameters. If they have others, give a mapping:
+        ``{"k": idata["posterior"]["stiffness"], ...}``.
     at : array_like, shape (n,), optional
         The state about which to linearise, taken as it is. By default the rest point, for zero
         inputs at time 0, that Newton's method finds from the initial mean, at every draw.
@@ -42,14 +43,16 @@ def linear_modes(system: StateSpaceModel, params: Any, *, at: Any = None) -> pd.
         One row per mode, a conjugate pair being one mode, by frequency:
 
         * ``frequency``: :math:`|\omega| / 2 \pi`, cycles per unit of time; 0 without oscillation.
-        * ``damping_ratio``: :math:`-\sigma / |s|`; from 1 without oscillation, to negative for a
-          growing mode. The frequency without damping is ``frequency / sqrt(1 - damping_ratio**2)``.
+        * ``damping_ratio``: :math:`-\sigma / |s|`; 1 for a decay without oscillation, below 1 for
+          one with it, negative for a growing mode, NaN for :math:`s = 0`. The frequency without
+          damping is ``frequency / sqrt(1 - damping_ratio**2)``.
         * ``growth_rate``: :math:`\sigma`, per unit of time; negative for a mode that decays.
         * ``time_constant``: :math:`1 / |\sigma|`, in which the amplitude changes by a factor of e.
 
         Given draws, these are medians, each followed by the ends of its central 90 % interval
-        (``frequency_low``, ``frequency_high``, ...). ``attrs["at"]`` is the state (at the median of
-        the parameters), and ``attrs["eigenvalues_of"]`` is "drift" or "step".
+        (``frequency_low``, ``frequency_high``, ...); ``modes.T`` shows them one below the other.
+        ``attrs["at"]`` is the state (at the median of the parameters), and
+        ``attrs["eigenvalues_of"]`` is "drift" or "step".
 
     Raises
     ------

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from pymc_statespace_filters.states.draws import SAMPLE_DIMS
 
-PROBABILITIES = (0.5, 0.9)  # of the central intervals
+PROBABILITIES = np.array([0.5, 0.9])  # of the central intervals
+
+Array = NDArray[np.float64]
 
 
-def prediction_errors(
-    predicted: xr.DataArray, measured: NDArray[np.float64], observed: NDArray[np.float64]
-) -> xr.Dataset:
+def prediction_errors(predicted: xr.DataArray, measured: Array, observed: Array) -> xr.Dataset:
     """Errors of predictions (chain, draw, time, observable) of a record (R, p).
 
     ``measured`` (draws, R, p) are predictions with measurement noise. Missing data and NaN draws
@@ -29,10 +29,9 @@ def prediction_errors(
                 f"{name}_rmse": rmse,
                 f"{name}_relative_error": rmse / record.std(time),
                 f"{name}_rmse_of_draws": _rmse(predicted, record, time),
-                f"{name}_coverage": _coverage(
-                    predicted.copy(data=measured.reshape(predicted.shape)), record, time
-                ),
-            }
+                f"{name}_coverage": (("interval", observable), _coverage(measured, observed)),
+            },
+            coords={"interval": PROBABILITIES.tolist()},
         )
 
 
@@ -40,15 +39,11 @@ def _rmse(predicted: xr.DataArray, record: xr.DataArray, time: str) -> xr.DataAr
     return ((predicted - record) ** 2).mean(time) ** 0.5
 
 
-def _coverage(measured: xr.DataArray, record: xr.DataArray, time: str) -> xr.DataArray:
-    """Fraction of the record in the central intervals of each time."""
-    fractions = []
-    for probability in PROBABILITIES:
-        ends = measured.quantile(
-            [(1 - probability) / 2, (1 + probability) / 2], dim=SAMPLE_DIMS, skipna=True
-        )
-        low, high = ends.isel(quantile=0, drop=True), ends.isel(quantile=1, drop=True)
-        known = record.notnull() & low.notnull()
-        inside = (record >= low) & (record <= high)
-        fractions.append(inside.where(known).mean(time))
-    return xr.concat(fractions, xr.Variable("interval", list(PROBABILITIES)))
+def _coverage(measured: Array, observed: Array) -> Array:
+    """Fraction (2, p) of the record in the central intervals of each time."""
+    known, drawn = ~np.isnan(observed), measured[np.isfinite(measured).all(axis=(1, 2))]
+    if not len(drawn):
+        return np.full((len(PROBABILITIES), observed.shape[1]), np.nan)
+    low, high = (np.quantile(drawn, (1 + sign * PROBABILITIES) / 2, axis=0) for sign in (-1, 1))
+    inside = known & (low <= observed) & (observed <= high)
+    return inside.sum(axis=1) / known.sum(axis=0)

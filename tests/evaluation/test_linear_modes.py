@@ -154,7 +154,8 @@ def test_draws_have_medians_and_intervals():
         found = modes[[name, f"{name}_low", f"{name}_high"]].values[0]
         np.testing.assert_allclose(found, expected, rtol=1e-10)
     idata = az.from_dict({"posterior": draws | {"unused": np.zeros((2, 400, 3))}})
-    for posterior in (idata, idata["posterior"].to_dataset()):
+    named = {name: idata["posterior"][name] for name in draws}
+    for posterior in (idata, idata["posterior"].to_dataset(), named):
         assert psf.linear_modes(system, posterior).equals(modes)
         turned = idata["posterior"].to_dataset().transpose("draw", "chain", ...)
         np.testing.assert_allclose(psf.linear_modes(system, turned), modes, rtol=1e-12)

@@ -46,9 +46,10 @@ def assert_drift(found, force, mass=MASS, v=V):
 
 
 def test_matrices_of_numbers():
-    """In lists too; the mass of a diagonal matrix is divided by."""
-    drift = psf.second_order(MASS, DAMPING.tolist(), STIFFNESS.tolist())
-    assert_drift(drift_at(drift, X), LINEAR)
+    """In lists too, and without symmetry; a diagonal mass matrix is divided by."""
+    mass = np.array([[2.0, 0.8], [0.5, 1.0]])
+    drift = psf.second_order(mass, DAMPING.tolist(), STIFFNESS.tolist())
+    assert_drift(drift_at(drift, X), LINEAR, mass)
     diagonal = np.diag([2.0, 0.5])
     drift = psf.second_order(diagonal, DAMPING, STIFFNESS)
     assert_drift(drift_at(drift, X), LINEAR, diagonal)
