@@ -15,6 +15,7 @@ from .errors import (
     ParallelWarning,
     StateSpaceFiltersError,
 )
+from .evaluation.linear_modes import linear_modes
 from .evaluation.log_likelihood import log_likelihood
 from .evaluation.run_filter import run_filter
 from .evaluation.simulate import simulate
@@ -42,11 +43,12 @@ from .plots import (
 from .point_estimation import MaximumLikelihoodEstimate, maximum_likelihood
 from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
-from .states import filtered_states, forecast, smoothed_states
+from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.integrators import EulerMaruyama
 from .system.model import StateSpaceModel
 from .system.record import nearest_steps
+from .system.second_order import second_order
 
 __all__ = [
     "DRAM",
@@ -84,10 +86,12 @@ __all__ = [
     "filtered_states",
     "find_starts",
     "forecast",
+    "free_run",
     "freeplay",
     "hysteresis",
     "hysteresis_branch",
     "leave_future_out",
+    "linear_modes",
     "log_likelihood",
     "marginal_modes",
     "maximum_likelihood",
@@ -104,6 +108,7 @@ __all__ = [
     "run_filter",
     "run_models",
     "sample_dram",
+    "second_order",
     "simulate",
     "smoothed_states",
     "suggest_particles",

@@ -27,7 +27,6 @@ from pymc_statespace_filters.diagnostics.predictions import (
 )
 from pymc_statespace_filters.diagnostics.truncated_data import observed_values
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about
-from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
@@ -38,6 +37,7 @@ from pymc_statespace_filters.states.variable import (
     TermHealthAtDraws,
     VariableAtDraws,
     select_variables,
+    simulate_observations,
 )
 from pymc_statespace_filters.system.checks import check_random_seed
 
@@ -166,7 +166,9 @@ def filter_diagnostics(
         at_draws = VariableAtDraws(model, variable, draws)
         before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
         health = _term_health(at_draws, before, rng, progressbar)
-        predicted = _simulate_observations(at_draws, before.drawn, rng)
+        predicted = simulate_observations(
+            at_draws, before.drawn, at_draws.steps, at_draws.inputs(), rng
+        )
         observed = observed_values(model, variable.name)
         laws = laws_of(at_draws, observed, before)
         if laws is None:
@@ -180,22 +182,6 @@ def filter_diagnostics(
         warn_about(variable.system, variable.filter, health.health, arguments_of)
     attrs = {"predictions": PREDICTION_NOTE}
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
-
-
-def _simulate_observations(
-    at_draws: VariableAtDraws, states: Array, rng: np.random.Generator
-) -> Array:
-    """Simulate an observation (draws, J, p) of each state (draws, J, n); NaN where that is NaN."""
-    system = at_draws.variable.system
-    observe, theta, rows = observer(system).function, at_draws.parameters(), at_draws.inputs()
-    simulated = np.full((*states.shape[:2], system.p), np.nan)
-    for i, path in enumerate(states):
-        known = np.isfinite(path).all(axis=1)
-        inputs = rows[i if len(rows) > 1 else 0]
-        simulated[i, known] = observe(
-            rng, theta[i], path[known], at_draws.steps[known], inputs, at_draws.t0
-        )
-    return simulated
 
 
 def _term_health(

@@ -9,12 +9,15 @@ import xarray as xr
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.observation_sampler import observation_sampler
+from pymc_statespace_filters.compiler.lowering.observation_sampler import (
+    observation_mean,
+    observation_sampler,
+)
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_finite, check_random_seed
+from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_inputs, check_system, steps_of
@@ -72,21 +75,35 @@ def _cached(function: Callable, key: str | None) -> CompiledFunction:
     return CompiledFunction(compiled if key is None else cached_on_disk(compiled, key), key)
 
 
-def _sampler(system: StateSpaceModel) -> CompiledFunction:
+def _sampler(system: StateSpaceModel, noise: bool = True) -> CompiledFunction:
     if system.equations.observation is None and system.equations.observation_draw is None:
         raise ModelError(
             "simulating needs observation and observation_noise, or observation_dist, got a system "
             "with a density of observations alone (observation_logp)"
         )
-    return observation_sampler(system)
+    return observation_sampler(system) if noise else observation_mean(system)
+
+
+@jit
+def _standard_normals(rng, size):
+    return rng.standard_normal((size, 1))
+
+
+@jit
+def _zeros(rng, size):
+    return np.zeros((size, 1))
 
 
 @lru_cache(maxsize=256)
-def simulator(system: StateSpaceModel) -> CompiledFunction:
-    """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p))."""
-    compiled, sampler = compile_system(system), _sampler(system)
+def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
+    """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p)).
+
+    Without ``noise`` the initial state is its mean, every noise is zero, and ``rng`` is not used.
+    """
+    compiled, sampler = compile_system(system), _sampler(system, noise)
     parts = compiled.prepare, compiled.initialise, compiled.propagate, sampler
     prepare, initialise, propagate, observe = (part.function for part in parts)
+    normals = _standard_normals if noise else _zeros
     dt, n, m, p = system.dt, system.n, compiled.m, system.p
 
     def simulate(rng, theta, steps, inputs, t0):
@@ -95,7 +112,7 @@ def simulator(system: StateSpaceModel) -> CompiledFunction:
         states = np.empty((n_steps + 1, n))
         observations = np.empty((steps.size, p))
         x = np.empty((n, 1))
-        initialise(c, rng.standard_normal((n, 1)), x)
+        initialise(c, normals(rng, n), x)
         j = 0
         for k in range(n_steps + 1):
             copy_into(states[k], x[:, 0])
@@ -103,11 +120,11 @@ def simulator(system: StateSpaceModel) -> CompiledFunction:
                 observe(rng, c, inputs, k, t0 + k * dt, x, observations[j])
                 j += 1
             if k < n_steps:
-                propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), x)
+                propagate(c, inputs, k, t0 + k * dt, normals(rng, m), x)
         return states, observations
 
     keys = (part.key for part in parts)
-    return _cached(simulate, key_of(f"simulate {dt!r} {n} {m} {p}", *keys))
+    return _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {m} {p}", *keys))
 
 
 def simulate(
@@ -118,9 +135,10 @@ def simulate(
     times: Any = None,
     inputs: Any = None,
     t0: float = 0.0,
+    noise: bool = True,
     random_seed: Any = None,
 ) -> xr.Dataset:
-    """Draw one path of the states and its observations.
+    """Simulate one path of the states and its observations.
 
     Parameters
     ----------
@@ -133,6 +151,10 @@ def simulate(
         Row k holds during step k.
     t0 : float
         Time of step 0.
+    noise : bool
+        Whether to draw the initial state, process noise and measurement noise. If not, the path
+        starts at the initial mean, and ``q`` and ``e`` are zero. Observations of
+        ``observation_dist`` are then the means of its distributions.
     random_seed : None, int or numpy.random.Generator
 
     Returns
@@ -140,6 +162,11 @@ def simulate(
     xarray.Dataset
         ``states`` (step, state) at every step from 0 to the last, ``observations``
         (obs, observable), with the coordinates ``time`` and ``obs_time``.
+
+    Raises
+    ------
+    ModelError
+        If an argument is wrong, or PyMC gives no mean of a distribution where ``noise`` is False.
 
     Examples
     --------
@@ -154,6 +181,8 @@ def simulate(
     >>> record = psf.simulate(system, {"a": 1.0}, steps=[0, 20, 40], random_seed=1)
     >>> dict(record.sizes)
     {'step': 41, 'state': 1, 'obs': 3, 'observable': 1}
+    >>> psf.simulate(system, {"a": 1.0}, steps=[0, 1, 2], noise=False)["states"].values.ravel()
+    array([1.    , 0.99  , 0.9801])
     """
     check_system(system)
     t0 = check_finite("t0", t0)
@@ -164,8 +193,9 @@ def simulate(
         raise ModelError(
             f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}"
         )
+    with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
-    states, observations = simulator(system).function(rng, theta, at, forces, t0)
+    states, observations = simulator(system, with_noise).function(rng, theta, at, forces, t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {

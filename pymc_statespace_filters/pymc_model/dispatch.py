@@ -30,7 +30,7 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
         np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
         for p, n in zip((theta, steps, inputs, t0), core_ndims, strict=False)
     )
-    simulate, check = simulator(op.system).function, check_record(op.system)
+    simulate, check = simulator(op.system, True).function, check_record(op.system)
     draws = np.empty((*batch, steps.shape[-1], op.system.p))
     for i in np.ndindex(batch):
         parts = [np.ascontiguousarray(a[i]) for a in (theta, steps, inputs)]
@@ -41,7 +41,7 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system)
+    compiled = simulator(op.system, True)
     simulate, check = compiled.function, check_record(op.system)
     key = cache_key(op.system, compiled)
 

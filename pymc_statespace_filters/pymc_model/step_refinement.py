@@ -5,17 +5,16 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor
-import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
-from pytensor.graph.replace import clone_replace, vectorize_graph
+from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
+from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_points
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.protocol import Filter
@@ -122,18 +121,7 @@ def _compile_path(system: StateSpaceModel) -> list[Callable]:
     advanced = call(system.equations.transition, system, values)
     start = call(system.equations.initial_mean, system, {"theta": theta})
     graphs = [([theta], start), (now, advanced), (now, jacobian_of(advanced, values["x"]))]
-    compiled = []
-    for arguments, output in graphs:
-        batches = [pt.tensor(shape=(None, *a.type.shape), dtype="float64") for a in arguments]
-        vectorised = vectorize_graph(output, dict(zip(arguments, batches, strict=True)))
-        # A constant output, such as an initial mean given as numbers, has no batch axis yet.
-        if vectorised.type.ndim == output.type.ndim:
-            vectorised = vectorised + pt.zeros((batches[0].shape[0],) + (1,) * output.type.ndim)
-        # Called a few thousand times: machine code would take longer to compile than it saves.
-        compiled.append(
-            pytensor.function(batches, vectorised, mode="FAST_COMPILE", on_unused_input="ignore")
-        )
-    return compiled
+    return [interpreted_at_points(arguments, output) for arguments, output in graphs]
 
 
 def _deterministic_filter(

@@ -16,7 +16,7 @@ from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, state_dims
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.record import check_inputs, n_input_rows, steps_of
+from pymc_statespace_filters.system.record import check_inputs, steps_of
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def forecast(
         if inputs is not None:
             rows = pt.as_tensor(check_inputs(inputs, system, future))
             at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
-        input_rows = _input_rows(at_draws, future)
+        input_rows = at_draws.inputs_until(future)
         initial = at_draws.states("filtered", last, rng, progressbar=progressbar)
         paths, simulated = _simulate(
             at_draws, initial.drawn[:, 0], int(last[0]), future, input_rows, rng
@@ -144,17 +144,6 @@ def _future_steps(
             "earlier states use filtered_states or smoothed_states"
         )
     return future
-
-
-def _input_rows(at_draws: VariableAtDraws, future: NDArray[np.int64]) -> Array:
-    """The inputs (draws or 1, rows, n_inputs), checked to cover the future steps."""
-    system, rows = at_draws.variable.system, at_draws.inputs()
-    if len(rows[0]) < n_input_rows(system, future) and system.n_inputs:
-        raise ModelError(
-            f"the model's inputs end after {len(rows[0])} rows, and step {future[-1]} needs "
-            f"{n_input_rows(system, future)}: give inputs= for the past and the future"
-        )
-    return rows
 
 
 def _simulate(

@@ -14,6 +14,7 @@ from pytensor.graph.traversal import ancestors
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
@@ -23,6 +24,7 @@ from pymc_statespace_filters.pymc_model.state_graphs import (
     with_other_filter,
 )
 from pymc_statespace_filters.states.draws import PosteriorDraws
+from pymc_statespace_filters.system.record import n_input_rows
 
 Array = NDArray[np.float64]
 
@@ -77,14 +79,29 @@ class VariableAtDraws:
 
     def parameters(self) -> Array:
         """Flat parameters at every draw, (draws, k)."""
-        return self.evaluate([self.variable.theta], {})[0]
+        return self._interpret(self.variable.theta)
 
     def inputs(self) -> Array:
         """Input rows at every draw, (draws or 1, rows, n_inputs)."""
         graph = self.variable.inputs
         if set(self._replaced) & set(ancestors([graph])):
-            return self.evaluate([graph], {})[0]
+            return self._interpret(graph)
         return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
+
+    def inputs_until(self, steps: NDArray[np.int64]) -> Array:
+        """The same, checked to have the rows that observations at `steps` need."""
+        system, rows = self.variable.system, self.inputs()
+        if len(rows[0]) < n_input_rows(system, steps) and system.n_inputs:
+            raise ModelError(
+                f"the model's inputs end after {len(rows[0])} rows, and step {steps[-1]} needs "
+                f"{n_input_rows(system, steps)}: give inputs= for all steps, from step 0 on"
+            )
+        return rows
+
+    def _interpret(self, graph: Variable) -> Array:
+        # Microseconds for each draw: machine code would take longer to compile than it saves.
+        with pytensor.config.change_flags(mode="FAST_COMPILE"):
+            return self.evaluate([graph], {})[0]
 
     def states(
         self, moment: str, rows: NDArray[np.int64], rng: np.random.Generator, *, progressbar: bool
@@ -157,6 +174,24 @@ class VariableAtDraws:
         ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
         parts = np.split(results, ends, axis=1)
         return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
+
+
+def simulate_observations(
+    at_draws: VariableAtDraws,
+    states: Array,
+    steps: NDArray[np.int64],
+    rows: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Simulate an observation (draws, R, p) of each state (draws, R, n); NaN where that is NaN."""
+    system, theta = at_draws.variable.system, at_draws.parameters()
+    observe = observer(system).function
+    simulated = np.full((*states.shape[:2], system.p), np.nan)
+    for i, path in enumerate(states):
+        known = np.isfinite(path).all(axis=1)
+        inputs = rows[i if len(rows) > 1 else 0]
+        simulated[i, known] = observe(rng, theta[i], path[known], steps[known], inputs, at_draws.t0)
+    return simulated
 
 
 def select_variables(

@@ -40,6 +40,13 @@ def check_finite(name: str, value: Any) -> float:
     return float(value)
 
 
+def check_flag(name: str, value: Any) -> bool:
+    """Return ``value`` as a bool, Python's or NumPy's."""
+    if not isinstance(value, bool | np.bool_):
+        raise ModelError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def check_random_seed(random_seed: Any) -> np.random.Generator:
     """The random generator of a seed; a generator is returned as it is."""
     try:

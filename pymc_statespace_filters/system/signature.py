@@ -28,11 +28,16 @@ def read_signature(
     inputs: Sequence[str] | None,
 ) -> Signature:
     """The signature of a system with these functions."""
-    names, defaults = _parameter_names(equations)
+    names, defaults = parameter_names(equations)
     declared = _shapes(names, shapes)
     _check_defaults(defaults, dict(zip(names, declared, strict=True)))
     input_names = checked_names("inputs", inputs, None)
-    with_inputs = [equation.role for equation in equations if "u" in equation.symbols]
+    with_inputs = [
+        equation.role
+        for equation in equations
+        # The drift of `second_order` has no external force without inputs.
+        if "u" in equation.symbols and not hasattr(equation.function, "inputs_are_optional")
+    ]
     if with_inputs and not input_names:
         raise ModelError(
             f"{with_inputs[0]} has the argument u, so inputs must name the inputs "
@@ -41,7 +46,7 @@ def read_signature(
     return Signature(names, defaults, declared, input_names)
 
 
-def _parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
+def parameter_names(equations: Sequence[Equation]) -> tuple[tuple[str, ...], tuple]:
     """Names of the parameters in order of appearance, and their defaults."""
     names: dict[str, None] = {}
     defaults: dict[str, Any] = {}

@@ -184,3 +184,63 @@ def test_times_lie_on_the_grid_to_a_millionth_of_a_step():
     psf.simulate(system, times=[0.5 * (4 + 9e-7)], **arguments)
     with pytest.raises(psf.ModelError, match=r"off the grid.*nearest_steps"):
         psf.simulate(system, times=[0.5 * (4 + 2e-6)], **arguments)
+
+
+# Without noise.
+
+
+def noisy(**changes):
+    """The same with noise everywhere, seen beside inputs and time."""
+    return deterministic(
+        **dict(
+            transition=lambda x, q, u, t, a: [a * x[0] + u[0] + t + q[0]],
+            process_noise=[[4.0]],
+            observation=lambda x, u, t: [x[0] + 10 * u[0] + 1000 * t],
+            observation_noise=[[9.0]],
+            initial_cov=[[2.0]],
+        )
+        | changes
+    )
+
+
+def test_without_noise_every_noise_is_zero():
+    inputs, steps = np.array([10.0, 20.0, 30.0, 40.0]), [1, 3]
+    path = psf.simulate(noisy(), {"a": 0.9}, steps=steps, inputs=inputs, t0=100.0, noise=False)
+    x = [1.0]
+    for k in range(3):
+        x.append(0.9 * x[k] + inputs[k] + 100.0 + 0.5 * k)
+    seen = [x[k] + 10 * inputs[k] + 1000 * (100.0 + 0.5 * k) for k in steps]
+    np.testing.assert_allclose(path.states.values[:, 0], x, rtol=1e-14)
+    np.testing.assert_allclose(path.observations.values[:, 0], seen, rtol=1e-14)
+
+
+def test_without_noise_an_observation_is_that_at_no_noise_or_its_mean():
+    """exp(e) at e = 0, not its mean exp(0.045); and the means of distributions, not rounded."""
+    settings = dict(transition=lambda x: x, inputs=None, initial_mean=[0.3], process_noise=None)
+    general = noisy(
+        **settings, observation=lambda x, e: [x[0] * pt.exp(e[0])], observation_noise=[[0.09]]
+    )
+    counted = noisy(
+        **settings, observation=None, observation_noise=None, observables=None,
+        observation_dist=lambda x, c: [
+            pm.Poisson.dist(mu=pt.exp(c + x[0])), pm.Normal.dist(x[0], c),
+            pm.ZeroInflatedPoisson.dist(psi=0.25, mu=c), pm.Gamma.dist(alpha=c, beta=2.0),
+        ],
+    )  # fmt: skip
+    path = psf.simulate(general, {}, steps=[0], noise=False)
+    assert path.observations.item() == 0.3
+    path = psf.simulate(counted, {"c": 1.0}, steps=[0, 2], noise=False)
+    np.testing.assert_allclose(path.observations, [[np.exp(1.3), 0.3, 0.25, 0.5]] * 2, rtol=1e-12)
+
+
+def test_a_distribution_without_a_mean_has_no_simulation_without_noise():
+    system = noisy(
+        observation=None, observation_noise=None,
+        observation_dist=lambda x: [pm.Cauchy.dist(x[0], 1.0)],
+    )  # fmt: skip
+    arguments = dict(steps=[0], inputs=[0.0])
+    assert psf.simulate(system, {"a": 0.5}, **arguments).observations.notnull().all()
+    with pytest.raises(psf.ModelError, match=r"the mean of every .*got cauchy_rv.*use noise=True"):
+        psf.simulate(system, {"a": 0.5}, noise=False, **arguments)
+    with pytest.raises(psf.ModelError, match="noise must be True or False, got 0"):
+        psf.simulate(system, {"a": 0.5}, noise=0, **arguments)

@@ -17,6 +17,7 @@ from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
 )
+from pymc_statespace_filters.compiler.lowering.expected_observation import expected_observation
 from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
 from pymc_statespace_filters.compiler.lowering.guidance import (
     guided_noise,
@@ -50,6 +51,7 @@ class CompiledSystem:
     * ``propagate(c, inputs, k, t, Z, X)`` moves every member from step k to k + 1, in place.
     * ``observe(c, inputs, k, t, Z, X, D)`` simulates observations D (p, N), where the user wrote an
       observation function.
+    * ``expect(c, inputs, k, t, X, D)`` writes observations D (p, N) without noise.
     * ``log_density(c, inputs, k, t, d, X, out)`` writes log p(d | x), NaN components left out.
     * ``propagate_guided(c, inputs, k, t, gains, Z, X)`` moves every member by noise that depends on
       its state, see `guided_noise`; X has one row more, to which log density ratios are added.
@@ -177,6 +179,13 @@ class CompiledSystem:
         seen = call(self.model.equations.observation, self.model, self._given("xut") | noise)
         arguments = "c, inputs, k, t, Z, X, D"
         return self._member_function("observe", arguments, seen, "D[{i}, member]", "xut", z=z)
+
+    @cached_property
+    def expect(self) -> CompiledFunction:
+        """The observation of every member without noise."""
+        seen = expected_observation(self.model, self._given("xut"))
+        arguments = "c, inputs, k, t, X, D"
+        return self._member_function("expect", arguments, seen, "D[{i}, member]", "xut")
 
     @cached_property
     def log_density(self) -> CompiledFunction:

@@ -27,6 +27,17 @@ def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
     return CompiledFunction(jit(observe), simulated.key)
 
 
+def observation_mean(system: StateSpaceModel) -> CompiledFunction:
+    """``observe`` with the arguments of `observation_sampler`, which writes d without noise."""
+    expected, p = compile_system(system).expect, system.p
+    expect_members = expected.function
+
+    def observe(rng, c, inputs, k, t, x, out):
+        expect_members(c, inputs, k, t, x, out.reshape(p, 1))
+
+    return CompiledFunction(jit(observe), expected.key)
+
+
 def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
     """The user's distributions, drawn by PyTensor's code."""
     no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}

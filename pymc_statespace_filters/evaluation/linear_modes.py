@@ -1,0 +1,183 @@
+"""Modes of a system linearised about a rest point."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.rest_points import VectorField, rest_points, vector_field
+from pymc_statespace_filters.system.checks import shortened
+from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.parameters import flat_parameters
+from pymc_statespace_filters.system.record import check_system
+
+INTERVAL = (0.05, 0.95)  # quantiles of the draws
+
+Array = NDArray[np.float64]
+
+
+def linear_modes(system: StateSpaceModel, params: Any, *, at: Any = None) -> pd.DataFrame:
+    r"""Frequencies, damping and growth of the modes of a system linearised about a rest point.
+
+    Small deviations from a rest point are sums of modes, :math:`e^{s t}` for each eigenvalue
+    :math:`s = \sigma + i \omega`.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+    params : mapping, xarray.Dataset or xarray.DataTree
+        A number or an array of draws for every parameter; or a posterior, or a DataTree with one,
+        whose variables have the names of the parameters. If they have others, give a mapping:
+        ``{"k": idata["posterior"]["stiffness"], ...}``.
+    at : array_like, shape (n,), optional
+        The state about which to linearise, taken as it is. By default the rest point, for zero
+        inputs at time 0, that Newton's method finds from the initial mean, at every draw.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per mode, a conjugate pair being one mode, by frequency:
+
+        * ``frequency``: :math:`|\omega| / 2 \pi`, cycles per unit of time; 0 without oscillation.
+        * ``damping_ratio``: :math:`-\sigma / |s|`; 1 for a decay without oscillation, below 1 for
+          one with it, negative for a growing mode, NaN for :math:`s = 0`. The frequency without
+          damping is ``frequency / sqrt(1 - damping_ratio**2)``.
+        * ``growth_rate``: :math:`\sigma`, per unit of time; negative for a mode that decays.
+        * ``time_constant``: :math:`1 / |\sigma|`, in which the amplitude changes by a factor of e.
+
+        Given draws, these are medians, each followed by the ends of its central 90 % interval
+        (``frequency_low``, ``frequency_high``, ...); ``modes.T`` shows them one below the other.
+        ``attrs["at"]`` is the state (at the median of the parameters), and
+        ``attrs["eigenvalues_of"]`` is "drift" or "step".
+
+    Raises
+    ------
+    ModelError
+        If there is no rest point, or the equations have no finite derivatives there.
+
+    Notes
+    -----
+    The eigenvalues are those of the drift's Jacobian, if the integrator has one: they are modes of
+    the differential equation, whatever the step length. Otherwise, and for a system that was
+    unpickled and knows only its steps, they are :math:`\log(\lambda) / dt` of the eigenvalues
+    :math:`\lambda` of the step's Jacobian, exact for equations in discrete time; a negative
+    :math:`\lambda` oscillates with the frequency ``1 / (2 * dt)``.
+
+    Modes of different draws are matched to those at the median of every parameter, by the
+    assignment of eigenvalues that has the least sum of distances in the complex plane.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=psf.EulerMaruyama(
+    ...         lambda x, k, c: [x[1], -k * x[0] - c * x[1]], [[0.0], [0.1]], dt=0.01
+    ...     ),
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.01]],
+    ...     initial_mean=[1.0, 0.0],
+    ...     initial_cov=[[0.1, 0.0], [0.0, 0.1]],
+    ... )
+    >>> psf.linear_modes(system, {"k": 4.0, "c": 0.2}).round(3)
+          frequency  damping_ratio  growth_rate  time_constant
+    mode
+    0         0.318           0.05         -0.1           10.0
+    """
+    check_system(system)
+    theta = _parameters(system, params)
+    several = theta.ndim > 1
+    draws = theta.reshape(int(np.prod(theta.shape[:-1])), system.n_theta)
+    if several:  # the modes at the median come first; those of the draws are matched to them
+        draws = np.vstack([np.median(draws, axis=0), draws])
+    field = vector_field(system)
+    points = (
+        rest_points(system, field, draws, several) if at is None else _states(system, at, draws)
+    )
+    eigenvalues = _matched(_eigenvalues(field, draws, points))
+    modes = _modes(field, eigenvalues)
+    table = _with_intervals(modes[1:]) if several else pd.DataFrame(modes[0], columns=COLUMNS)
+    table.index.name = "mode"
+    table.attrs = {
+        "at": dict(zip(system.states, map(float, points[0]), strict=True)),
+        "eigenvalues_of": "drift" if field.is_drift else "step",
+    }
+    return table
+
+
+COLUMNS = ("frequency", "damping_ratio", "growth_rate", "time_constant")
+
+
+def _parameters(system: StateSpaceModel, params: Any) -> Array:
+    """Flat parameters (k,), or those of draws (..., k)."""
+    if isinstance(params, xr.DataTree):
+        if "posterior" not in params.children:
+            raise ModelError(f"params must have a group 'posterior', got {sorted(params.children)}")
+        params = params["posterior"].to_dataset()
+    if isinstance(params, xr.Dataset):
+        first = [dim for dim in ("chain", "draw") if dim in params.dims]
+        params = {
+            name: params[name].transpose(*first, ..., missing_dims="ignore").values
+            for name in system.parameters
+            if name in params
+        }
+    return flat_parameters(system, params)
+
+
+def _states(system: StateSpaceModel, at: Any, draws: Array) -> Array:
+    try:
+        state = np.asarray(at, dtype="float64")
+    except (TypeError, ValueError):
+        state = np.array(np.nan)
+    if state.shape != (system.n,) or not np.isfinite(state).all():
+        raise ModelError(
+            f"at must have a finite number for each of the states {list(system.states)}, got "
+            f"{shortened(at)}"
+        )
+    return np.broadcast_to(state, (len(draws), system.n))
+
+
+def _eigenvalues(field: VectorField, draws: Array, points: Array) -> NDArray[np.complex128]:
+    jacobians = field.jacobian(draws, points)
+    finite = np.isfinite(jacobians).all(axis=(1, 2))
+    if not finite.all():
+        raise ModelError(
+            "the equations must have finite derivatives at the state about which they are "
+            f"linearised, got others at {shortened(points[~finite][0].tolist())}"
+        )
+    return np.linalg.eigvals(jacobians).astype(complex)
+
+
+def _matched(eigenvalues: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Those of every row in the order of the first row's, without its lower half plane."""
+    matched = eigenvalues.copy()
+    for i, found in enumerate(eigenvalues[1:], 1):
+        distances = np.abs(eigenvalues[0][:, None] - found)
+        matched[i] = found[linear_sum_assignment(distances)[1]]
+    return matched[:, eigenvalues[0].imag >= 0]
+
+
+def _modes(field: VectorField, eigenvalues: NDArray[np.complex128]) -> Array:
+    """Each of `COLUMNS` (draws, modes, columns), modes by frequency in the first row."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, dt = (eigenvalues, 1.0) if field.is_drift else (np.log(1.0 + eigenvalues), field.dt)
+        growth, turning = s.real / dt, np.abs(s.imag) / dt
+        # A mode that ends with a step decays without oscillation, at an infinite rate.
+        damping = np.where(np.isinf(growth), 1.0, -growth / np.hypot(growth, turning))
+        modes = np.stack([turning / (2 * np.pi), damping, growth, 1 / np.abs(growth)], axis=-1)
+    return modes[:, np.lexsort((-growth[0], turning[0]))]
+
+
+def _with_intervals(modes: Array) -> pd.DataFrame:
+    ends = np.quantile(modes, INTERVAL, axis=0)
+    middle = np.median(modes, axis=0)
+    return pd.DataFrame(
+        {
+            f"{name}{suffix}": values[:, i]
+            for i, name in enumerate(COLUMNS)
+            for suffix, values in (("", middle), ("_low", ends[0]), ("_high", ends[1]))
+        }
+    )

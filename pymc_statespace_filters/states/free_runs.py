@@ -1,0 +1,228 @@
+"""Free runs: simulations at draws of the posterior that see no observation."""
+
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.evaluation.simulate import simulator
+from pymc_statespace_filters.parallel.cpu_affinity import available_cores
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, observed_variables
+from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
+from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.prediction_errors import prediction_errors
+from pymc_statespace_filters.states.variable import (
+    VariableAtDraws,
+    select_variables,
+    simulate_observations,
+)
+from pymc_statespace_filters.system.checks import check_flag, check_random_seed
+from pymc_statespace_filters.system.record import check_inputs, check_observed, steps_of
+
+Array = NDArray[np.float64]
+
+
+def free_run(
+    idata: xr.DataTree,
+    model: pm.Model | None = None,
+    *,
+    inputs: Any = None,
+    steps: Any = None,
+    times: Any = None,
+    observed: Any = None,
+    noise: bool = False,
+    var_name: str | None = None,
+    n_draws: int | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    extend_inferencedata: bool = True,
+) -> xr.DataTree:
+    """Simulate from step 0 at draws of the posterior, without looking at observations.
+
+    The test of a model by its simulation: parameters are those of the draws, and nothing pulls the
+    states back to a record. New inputs, steps and lengths compile nothing anew.
+
+    Parameters
+    ----------
+    idata, model, var_name, n_draws, random_seed, extend_inferencedata
+        As in `filtered_states`.
+    inputs : array_like, shape (rows, n_inputs), optional
+        Row k holds during step k; by default those of the model.
+    steps : array_like of int, shape (R,), optional
+        When to predict an observation, from step 0 of the simulation on; by default the steps of
+        the variable's record.
+    times : array_like, shape (R,), optional
+        The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
+    observed : array_like, shape (R, p) or (R,), optional
+        Measurements at these steps, to compare the predictions with; NaN where missing.
+    noise : bool
+        Whether the initial state, process noise and measurement noise are drawn. By default none
+        is: a run starts at the initial mean, and its observations are those of `simulate` with
+        ``noise=False``.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the group ``free_run``. For a variable "d": observations ``d`` (chain, draw, d_time,
+        observable) and states ``d_states`` (chain, draw, d_time, state); NaN for a draw whose run
+        leaves the finite numbers. With `observed`, over the times where it is not missing:
+
+        * ``d_rmse`` (observable): root-mean-square error of the mean of ``d`` over all draws.
+        * ``d_relative_error`` (observable): the same divided by the standard deviation of
+          `observed`; 1 is the error of a constant.
+        * ``d_rmse_of_draws`` (chain, draw, observable): root-mean-square error of ``d`` at each
+          draw.
+        * ``d_coverage`` (interval, observable): the fraction of `observed` inside the central
+          intervals of 50 % and 90 % of the predicted measurements, at each time over all draws.
+          These have measurement noise, also where ``d`` has none.
+
+    Raises
+    ------
+    ModelError
+        If draws, model and settings are inconsistent.
+
+    Warns
+    -----
+    FilterWarning
+        If the simulation leaves the finite numbers at some draws.
+
+    See Also
+    --------
+    forecast : Predictions from the state at the end of the record.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> tank = psf.StateSpaceModel(
+    ...     transition=lambda x, q, u, a: [a * x[0] + u[0] + q[0]],
+    ...     process_noise=[[0.01]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.05]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[0.1]],
+    ...     inputs=["flow"],
+    ... )
+    >>> with pm.Model() as model:
+    ...     a = pm.Uniform("a", 0, 1)
+    ...     d = psf.StateSpace(
+    ...         "d", tank, psf.EKF(), steps=[1, 2, 3], inputs=[1.0, 0.0, 2.0],
+    ...         observed=[1.1, 0.7, 2.5],
+    ...     )
+    ...     idata = psf.sample_dram(200, tune=200, chains=2, random_seed=1, progressbar=False)
+    >>> idata = psf.free_run(
+    ...     idata, model, inputs=[0.0, 3.0], steps=[1, 2], observed=[0.1, 2.8], random_seed=2
+    ... )
+    >>> idata["free_run"]["d"].sizes, idata["free_run"]["d_coverage"].sizes
+    (Frozen({'chain': 2, 'draw': 200, 'd_time': 2, 'observable': 1}),
+     Frozen({'interval': 2, 'observable': 1}))
+    """
+    model = pm.modelcontext(model)
+    with_noise = check_flag("noise", noise)
+    rng = check_random_seed(random_seed)
+    draws = select_draws(idata, n_draws)
+    variables = select_variables(model, var_name)
+    if observed is not None and len(variables) > 1:
+        raise ModelError(
+            "observed must be that of one variable: give var_name, one of "
+            f"{[variable.name for variable in variables]}"
+        )
+    dims = state_dims(observed_variables(model))
+    parts = []
+    for variable in variables:
+        at_draws = VariableAtDraws(model, variable, draws)
+        at = _steps(at_draws, steps, times)
+        record = None if observed is None else check_observed(observed, variable.system, at.size)
+        rows = _input_rows(at_draws, inputs, at)
+        paths, seen = _simulate(at_draws, at, rows, with_noise, draws.shape[0], rng)
+        _warn_of_failed_runs(variable.name, paths)
+        part = _predictions(draws, variable, dims[variable.name], at_draws.times(at), paths, seen)
+        if record is not None:
+            measured = seen if with_noise else simulate_observations(at_draws, paths, at, rows, rng)
+            part = part.merge(prediction_errors(part[variable.name], measured, record))
+        parts.append(part)
+    attrs = {"noise": int(with_noise)}  # netCDF has no truth values
+    return add_group(idata, "free_run", xr.merge(parts), attrs, extend_inferencedata)
+
+
+def _steps(at_draws: VariableAtDraws, steps: Any, times: Any) -> NDArray[np.int64]:
+    """The steps to predict, those of the record by default."""
+    if steps is None and times is None:
+        return np.array(at_draws.steps)
+    if steps is not None and times is not None:
+        raise ModelError("give at most one of steps and times, got both")
+    return steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
+
+
+def _input_rows(at_draws: VariableAtDraws, inputs: Any, steps: NDArray[np.int64]) -> Array:
+    """The inputs (draws or 1, rows, n_inputs)."""
+    if inputs is None:
+        rows = at_draws.inputs_until(steps)
+    else:
+        rows = check_inputs(inputs, at_draws.variable.system, steps)[None]
+    # A copy: the simulator would be compiled again for arrays of another layout.
+    return np.array(rows, order="C")
+
+
+def _simulate(
+    at_draws: VariableAtDraws,
+    steps: NDArray[np.int64],
+    rows: Array,
+    noise: bool,
+    n_chains: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """States (draws, R, n) and observations (draws, R, p), each chain in a thread of its own.
+
+    NaN for a draw with a number that is not finite.
+    """
+    system, t0, theta = at_draws.variable.system, at_draws.t0, at_draws.parameters()
+    run = simulator(system, noise).function
+    paths = np.empty((len(theta), steps.size, system.n))
+    seen = np.empty((len(theta), steps.size, system.p))
+
+    def simulate_chain(chain: NDArray[np.int64], seed: np.int64) -> None:
+        own_rng = np.random.default_rng(seed)
+        for i in chain:
+            inputs = rows[i if len(rows) > 1 else 0]
+            states, seen[i] = run(own_rng, theta[i], steps, inputs, t0)
+            paths[i] = states[steps]
+
+    chains = np.split(np.arange(len(theta)), n_chains)
+    seeds = rng.integers(np.iinfo(np.int64).max, size=n_chains)
+    with ThreadPoolExecutor(min(available_cores(), n_chains)) as pool:
+        list(pool.map(simulate_chain, chains, seeds))  # raises what a thread raised
+    failed = ~(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2)))
+    paths[failed] = seen[failed] = np.nan
+    return paths, seen
+
+
+def _warn_of_failed_runs(name: str, paths: Array) -> None:
+    failed = np.isnan(paths).any(axis=(1, 2))
+    if failed.any():
+        warnings.warn(
+            f"the free run of {name!r} leaves the finite numbers at {failed.sum()} of "
+            f"{failed.size} draws, where the model is unstable: their predictions are NaN, and no "
+            "error or coverage counts them",
+            FilterWarning,
+            stacklevel=3,
+        )
+
+
+def _predictions(
+    draws: PosteriorDraws,
+    variable: StateSpaceVariable,
+    state: str,
+    times: Array,
+    paths: Array,
+    seen: Array,
+) -> xr.Dataset:
+    name, system, (time, observable) = variable.name, variable.system, variable.dims
+    return draws.dataset(
+        {name: ((time, observable), seen), f"{name}_states": ((time, state), paths)},
+        {time: times, state: list(system.states), observable: list(system.observables)},
+    )
