@@ -37,6 +37,7 @@ from .plots import (
     plot_model_probabilities,
     plot_phase,
     plot_prior_sensitivity,
+    plot_residuals,
     plot_states,
 )
 from .point_estimation import MaximumLikelihoodEstimate, maximum_likelihood
@@ -99,6 +100,7 @@ __all__ = [
     "plot_model_probabilities",
     "plot_phase",
     "plot_prior_sensitivity",
+    "plot_residuals",
     "plot_states",
     "prior_sensitivity",
     "run_filter",
