@@ -19,7 +19,14 @@ from scipy.stats import norm
 from pymc_statespace_filters.plots.axes import label_ticks, logarithmic_ticks, time_label
 from pymc_statespace_filters.plots.canvas import PANELS_IN_LINE, band, canvas, curve, interval
 from pymc_statespace_filters.plots.legend import add_legend, legend_style
-from pymc_statespace_filters.plots.marks import bars, draw_bands, draw_median, point_size, points
+from pymc_statespace_filters.plots.marks import (
+    bars,
+    draw_bands,
+    draw_median,
+    over_draws,
+    point_size,
+    points,
+)
 from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
@@ -246,8 +253,9 @@ def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
 
 
 def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:
-    legend = draw_bands(collection, logs)
-    legend = draw_median(collection, logs) | legend
+    quantiles = over_draws(logs)
+    legend = draw_bands(collection, quantiles)
+    legend = draw_median(collection, quantiles) | legend
     limit = np.log10(COLLAPSED)
     collection.map(hline, "collapsed", data=xr.Dataset({"effective": limit}), **LIMIT)
     ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])

@@ -133,24 +133,27 @@ def plot_forecast(
         truth = transformed(truth, "observable", functions)
     draws = transformed(draws, "observable", functions)
     record = None if record is None else transformed(record, "observable", functions)
-    if errors:
-        draws, observed = _errors(draws, _observed_at(draws, truth, record))
-        labels = [f"error of {label}" for label in labels]
+    observed = _observed_at(draws, truth, record) if errors else None
 
     data = draws.to_dataset(name="observations")
     collection = canvas_over_time(data, "observable", backend=backend, pc_kwargs=pc_kwargs)
     at_one_time = data.sizes["time"] == 1
+    quantiles = over_draws(data)
+    if observed is not None:
+        labels = [f"error of {label}" for label in labels]
+        median = quantiles.sel(quantile=0.5, drop=True)
+        quantiles, observed = quantiles - median, observed - median["observations"]
     # Bands below the points, the median above them.
-    bands = (draw_bars if at_one_time else draw_bands)(collection, data)
+    bands = (draw_bars if at_one_time else draw_bands)(collection, quantiles)
     legend: dict[str, dict[str, Any]] = {}
-    if errors:
+    if observed is not None:
         legend |= _draw_errors(collection, observed)
     elif record is not None:
         legend |= draw_data(collection, _shown(record, draws, n_past))
         legend |= _mark_end(collection, record, draws)
     if truth is not None and not errors:
         legend |= _draw_truth(collection, truth, record, draws)
-    lines = {} if at_one_time else draw_median(collection, data)
+    lines = {} if at_one_time else draw_median(collection, quantiles)
     label_axes(collection, labels, time)
     add_legend(collection, lines | bands | legend)
     return collection
@@ -206,13 +209,6 @@ def _draw_errors(collection: PlotCollection, observed: xr.DataArray) -> dict[str
     data = observed.to_dataset(name="errors")
     collection.map(points, "errors", data=data, **DATA, **point_size(observed))
     return {"observed − median": legend_style(DATA)}
-
-
-def _errors(draws: xr.DataArray, observed: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return draws and observations minus the median of the draws."""
-    quantiles = over_draws(draws.to_dataset(name="draws"))["draws"]
-    median = quantiles.sel(quantile=0.5, drop=True)
-    return draws - median, observed - median
 
 
 def _observed_at(

@@ -43,25 +43,22 @@ def canvas_over_time(
     )
 
 
-def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw 50 % and 90 % bands of draws over time; return their legend entries."""
-    quantiles = over_draws(draws)
+def draw_bands(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw 50 % and 90 % bands over time; return their legend entries."""
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
         collection.map(band, f"band_{prob}", data=ends, alpha=OPACITIES[prob], **DRAWS)
     return {f"{prob} %": {**DRAWS, "alpha": OPACITIES[prob] + 0.1, "width": 8} for prob in (50, 90)}
 
 
-def draw_median(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw the median of draws over time; return its legend entry."""
-    median = over_draws(draws).sel(quantile=0.5, drop=True)
-    collection.map(curve, "median", data=median, **MEDIAN)
+def draw_median(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw the median over time; return its legend entry."""
+    collection.map(curve, "median", data=quantiles.sel(quantile=0.5, drop=True), **MEDIAN)
     return {"median": MEDIAN}
 
 
-def draw_bars(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw 50 % and 90 % bars of draws at separate times; return their legend entries."""
-    quantiles = over_draws(draws)
+def draw_bars(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw 50 % and 90 % bars at separate times; return their legend entries."""
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
         collection.map(bars, f"bar_{prob}", data=ends, width=WIDTHS[prob], **DRAWS)

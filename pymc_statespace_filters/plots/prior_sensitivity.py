@@ -1,5 +1,6 @@
 """Plot of model probabilities against the correction's exponent and the width of priors."""
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ LABELS = {
     "prob": ("exponent", "exponent α of the correction"),
     "width_prob": ("width", "width of the priors (factor)"),
 }
+LABEL_WIDTH = 44  # characters, of a line below a panel
 
 
 def plot_prior_sensitivity(
@@ -32,8 +34,9 @@ def plot_prior_sensitivity(
     table : pandas.DataFrame or xarray.Dataset
         The table of `compare_evidence`: one panel, the probabilities against the exponent of
         `DimensionCorrection`, ignoring the correction in the table. Or the result of
-        `prior_sensitivity`: a second panel, against the width of the priors, if it has one. A
-        curve has no points where the draws do not determine the result; a note tells why.
+        `prior_sensitivity`: a second panel, against the width of the priors, if it has one. Its
+        label names the priors that were left out, or because of which the panel is empty. A curve
+        has no points where the draws do not determine the result; a note tells why.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -95,11 +98,13 @@ def plot_prior_sensitivity(
 def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
     panels = probs.fillna(0.0)  # a panel without results has axes too
+    further = {"width_prob": _about_priors(probs)}
     for name, (dim, label) in LABELS.items():
         if name not in probs:
             continue
         data, ends = panels[[name]], probs[dim].values[[0, -1]]
-        collection.map(labelled_x, data=data, text=label, **settings)
+        text = label + further.get(name, "")
+        collection.map(labelled_x, data=data, text=text, **settings)
         collection.map(labelled_y, data=data, text="probability of the model", **settings)
         collection.map(set_ylim, data=data, limits=(-0.02, 1.02), **settings)
         if probs[name].isnull().all():
@@ -109,6 +114,17 @@ def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
     if "width_prob" in probs:
         ticks = logarithmic_ticks(probs["width"].values)
         collection.map(set_xticks, data=panels[["width_prob"]], **ticks, **settings)
+
+
+def _about_priors(probs: xr.Dataset) -> str:
+    """Further lines of the label: priors that were left out, or that leave the panel empty."""
+    notes = {
+        "without the prior of": probs.attrs.get("width_left_out"),
+        "mostly unknown due to the prior of": probs.attrs.get("width_unknown"),
+    }
+    return "".join(
+        "\n" + fill(f"{text} {names}", LABEL_WIDTH) for text, names in notes.items() if names
+    )
 
 
 def _note_missing(collection: PlotCollection, found: xr.Dataset) -> None:

@@ -20,6 +20,7 @@ from pymc_statespace_filters.plots.marks import (
     draw_bars,
     draw_data,
     draw_median,
+    over_draws,
     paths,
     points,
     thin_draws,
@@ -140,7 +141,8 @@ def plot_states(
     collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
     # Bands below the points, lines above them.
     as_bars = at_observations and data.sizes["time"] <= FEW
-    bands = (draw_bars if as_bars else draw_bands)(collection, data)
+    quantiles = over_draws(data)
+    bands = (draw_bars if as_bars else draw_bands)(collection, quantiles)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths else (points, DOTS)
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
@@ -148,7 +150,7 @@ def plot_states(
     if record is not None and set(shown) & set(measured):
         record = transformed(record, "observable", of_record(transform, functions))
         legend = draw_data(collection, observations_of(record, measured, shown))
-    lines = {} if as_bars else draw_median(collection, data)
+    lines = {} if as_bars else draw_median(collection, quantiles)
     if true is not None:
         collection.map(curve, "truth", data=true.to_dataset(name="truth"), **TRUTH)
         legend = {"truth": TRUTH} | legend

@@ -126,16 +126,12 @@ def forecast():
 
 @pytest.fixture(scope="session")
 def diagnostics():
-    """Of two observables, two inputs and particles, as of a good filter.
-
-    The first observable lacks an observation.
-    """
+    """Of two observables and particles, as of a good filter; the first lacks an observation."""
     residual = np.random.default_rng(4).normal(size=(41, 2))
     residual[3, 0] = np.nan
     over_time = ("d_time", "observable")
     effective = np.arange(1.0, 101).reshape(2, 50)[:, :, None] * np.ones(41)
     lags = np.arange(1, 11)
-    correlations = np.linspace(-0.4, 0.4, 44).reshape(11, 2, 2)
     group = xr.Dataset(
         {
             "d_residual": (over_time, residual),
@@ -144,19 +140,25 @@ def diagnostics():
             "d_innovation": (over_time, [0.5, 2.0] * residual),
             "d_innovation_cov": ((*over_time, "observable_bis"), [np.diag([0.25, 4.0])] * 41),
             "d_autocorrelation": (("lag", "observable"), np.outer(lags, [0.01, -0.02])),
-            "d_input_correlation": (("input_lag", "input", "observable"), correlations),
             "d_predicted": (("chain", "draw", *over_time), residual + np.full((2, 50, 1, 1), 7.0)),
         },
         coords={
             "d_time": TIMES,
             "observable": ["position", "speed"],
             "lag": lags,
-            "input_lag": [0, *lags],
-            "input": ["force", "heat"],
         },
     )
     stats = xr.Dataset({"n_failed": (("chain", "draw"), np.full((2, 3), 2))})
     return xr.DataTree.from_dict({"filter_diagnostics": group, "sample_stats": stats})
+
+
+@pytest.fixture(scope="session")
+def diagnostics_with_inputs(diagnostics):
+    lags, correlations = np.arange(11), np.linspace(-0.4, 0.4, 44).reshape(11, 2, 2)
+    group = diagnostics["filter_diagnostics"].to_dataset()
+    group["d_input_correlation"] = (("input_lag", "input", "observable"), correlations)
+    group = group.assign_coords(input_lag=lags, input=["force", "heat"])
+    return xr.DataTree.from_dict({"filter_diagnostics": group})
 
 
 @pytest.fixture(scope="session")

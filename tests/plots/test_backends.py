@@ -43,7 +43,7 @@ PLOTS = [
     (plot_forecast, "forecast"),
     (portrait, "states"),
     (plot_filter_health, "diagnostics"),
-    (plot_residuals, "diagnostics"),
+    (plot_residuals, "diagnostics_with_inputs"),
     (plot_states, "simulated"),
     (run_free, "free_run"),
     (errors_of, "free_run"),

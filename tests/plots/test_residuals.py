@@ -10,8 +10,8 @@ from tests.plots.drawn import drawn
 
 
 @pytest.fixture(scope="module")
-def collection(diagnostics):
-    return plot_residuals(diagnostics, backend="none")
+def collection(diagnostics_with_inputs):
+    return plot_residuals(diagnostics_with_inputs, backend="none")
 
 
 def standardised(diagnostics):
@@ -42,8 +42,8 @@ def test_autocorrelation_and_its_band(collection):
         np.testing.assert_allclose(band["y_bottom"], -1.96 / np.sqrt(n))
 
 
-def test_each_input_has_a_panel(collection, diagnostics):
-    found = diagnostics["filter_diagnostics"]["d_input_correlation"]
+def test_each_input_has_a_panel(collection, diagnostics_with_inputs):
+    found = diagnostics_with_inputs["filter_diagnostics"]["d_input_correlation"]
     for name in ("force", "heat"):
         seen = drawn(collection, "seen", f"input_{name}")["position"]
         np.testing.assert_array_equal(np.asarray(seen["x"])[::3], np.arange(11))
@@ -54,9 +54,7 @@ def test_each_input_has_a_panel(collection, diagnostics):
 
 
 def test_a_system_without_inputs_has_three_panels(diagnostics):
-    group = diagnostics["filter_diagnostics"].to_dataset().drop_vars("d_input_correlation")
-    tree = xr.DataTree.from_dict({"filter_diagnostics": group})
-    panels = plot_residuals(tree, backend="none").viz["plot"]
+    panels = plot_residuals(diagnostics, backend="none").viz["plot"]
     assert list(panels.data_vars) == ["innovation", "autocorrelation", "prediction"]
 
 
@@ -77,8 +75,8 @@ def test_innovations_against_the_prediction(has_record, diagnostics):
     assert set(band["y_top"]) == {1.96}
 
 
-def test_one_column_of_labelled_panels_for_each_observable(diagnostics):
-    tree = diagnostics.copy(deep=True)
+def test_one_column_of_labelled_panels_for_each_observable(diagnostics_with_inputs):
+    tree = diagnostics_with_inputs.copy(deep=True)
     tree["filter_diagnostics"]["d_innovation"].attrs["units"] = {"speed": "m/s"}
     tree["filter_diagnostics"]["d_time"].attrs["units"] = "s"
     axes = plot_residuals(tree).viz["figure"].item().axes
