@@ -21,7 +21,7 @@ LABELS = {
     "prob": ("exponent", "exponent α of the correction"),
     "width_prob": ("width", "width of the priors (factor)"),
 }
-LABEL_WIDTH = 44  # characters, of a line below a panel
+LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below a panel and inside it
 
 
 def plot_prior_sensitivity(
@@ -36,7 +36,7 @@ def plot_prior_sensitivity(
         `DimensionCorrection`, ignoring the correction in the table. Or the result of
         `prior_sensitivity`: a second panel, against the width of the priors, if it has one. Its
         label names the priors that were left out, or because of which the panel is empty. A curve
-        has no points where the draws do not determine the result; a note tells why.
+        has no points where the draws do not determine the result; an empty panel tells why.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -83,7 +83,7 @@ def plot_prior_sensitivity(
     collection.map(band, "band", data=interval(low, high), alpha=0.25)
     collection.map(curve, "curve", width=2)
     _label_axes(collection, probs)
-    _note_missing(collection, found)
+    _note_empty(collection, found)
     legend = {
         str(name): {**collection.get_aes_kwargs(["color"], "mapping", {"model": name}), "width": 2}
         for name in probs["model"].values
@@ -98,7 +98,7 @@ def plot_prior_sensitivity(
 def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
     panels = probs.fillna(0.0)  # a panel without results has axes too
-    further = {"width_prob": _about_priors(probs)}
+    further = {"width_prob": _about_priors(probs)} if "width_prob" in probs else {}
     for name, (dim, label) in LABELS.items():
         if name not in probs:
             continue
@@ -117,26 +117,24 @@ def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
 
 
 def _about_priors(probs: xr.Dataset) -> str:
-    """Further lines of the label: priors that were left out, or that leave the panel empty."""
+    """Further lines of the label: priors left out, or unknown; widths without a result."""
     notes = {
         "without the prior of": probs.attrs.get("width_left_out"),
         "mostly unknown due to the prior of": probs.attrs.get("width_unknown"),
     }
-    return "".join(
-        "\n" + fill(f"{text} {names}", LABEL_WIDTH) for text, names in notes.items() if names
-    )
+    lines = [fill(f"{text} {names}", LABEL_WIDTH) for text, names in notes.items() if names]
+    missing = probs["width_prob"].isnull().any("model")
+    if missing.any() and not missing.all():  # an empty panel has a note
+        lines.append(f"no result at {int(missing.sum())} of {missing.size} widths")
+    return "".join(f"\n{line}" for line in lines)
 
 
-def _note_missing(collection: PlotCollection, found: xr.Dataset) -> None:
-    """Write into the panel of widths at how many there is no result, and why."""
-    if "width_prob" not in found:
+def _note_empty(collection: PlotCollection, found: xr.Dataset) -> None:
+    """Write into the panel of widths why it is empty, if it is."""
+    if "width_prob" not in found or found["width_prob"].notnull().any():
         return
-    missing = found["width_prob"].isnull().any("model")
-    if not missing.any():
-        return
-    lines = [f"no result at {int(missing.sum())} of {missing.size} widths:", *_reasons(found)]
-    middle = found["width"].values[[0, -1]].mean()
-    data = xr.Dataset({"width_prob": middle})
+    lines = [fill(line, NOTE_WIDTH) for line in ("no result at any width:", *_reasons(found))]
+    data = xr.Dataset({"width_prob": found["width"].values[[0, -1]].mean()})
     collection.map(note, "note", data=data, ignore_aes="all", text="\n".join(lines), color="B2")
 
 

@@ -84,9 +84,11 @@ def test_a_panel_without_results_tells_why():
     collection = plot_prior_sensitivity(found, backend="none")
     note = collection.viz["note"]["width_prob"].item()
     assert note["string"].split("\n") == [
-        "no result at 3 of 3 widths:",
-        "a: draws reach the bounds of a prior",
-        "b: posterior about as wide as the prior",
+        "no result at any width:",
+        "a: draws reach the bounds of a",
+        "prior",
+        "b: posterior about as wide as",
+        "the prior",
     ]
     assert (note["x"], note["y"]) == (0.0, 0.5)
     axes = plot_prior_sensitivity(found).viz["figure"].item().axes[1]
@@ -98,13 +100,14 @@ def test_a_panel_without_results_tells_why():
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0.1", "0.3", "1", "3", "10"]
 
 
-def test_a_curve_with_gaps_has_a_note_and_a_full_one_none():
+def test_the_axis_tells_at_how_many_widths_there_is_no_result():
     half = [[0.5, 0.5]]
-    note = plot_prior_sensitivity(of_widths(NONE + half * 2), backend="none").viz["note"]
-    expected = "no result at 1 of 3 widths:\nthe draws do not determine it"
-    assert note["width_prob"].item()["string"] == expected
-    full = plot_prior_sensitivity(of_widths(half * 3), backend="none")
-    assert "note" not in full.viz.children
+    for values, lines in ((NONE + half * 2, ["no result at 1 of 3 widths"]), (half * 3, [])):
+        collection = plot_prior_sensitivity(of_widths(values), backend="none")
+        panel = collection.viz["plot"]["width_prob"].item()
+        (label,) = (thing["string"] for thing in panel if thing["function"] == "xlabel")
+        assert label.split("\n") == ["width of the priors (factor)", *lines]
+        assert "note" not in collection.viz.children
 
 
 def test_an_evidence_without_error_leaves_curves_without_bands(rivals, table):
