@@ -38,6 +38,7 @@ from .plots import (
     plot_model_probabilities,
     plot_phase,
     plot_prior_sensitivity,
+    plot_residuals,
     plot_states,
 )
 from .point_estimation import MaximumLikelihoodEstimate, maximum_likelihood
@@ -103,6 +104,7 @@ __all__ = [
     "plot_model_probabilities",
     "plot_phase",
     "plot_prior_sensitivity",
+    "plot_residuals",
     "plot_states",
     "prior_sensitivity",
     "run_filter",

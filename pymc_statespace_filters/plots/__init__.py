@@ -7,6 +7,7 @@ from pymc_statespace_filters.plots.forecast import plot_forecast
 from pymc_statespace_filters.plots.model_probabilities import plot_model_probabilities
 from pymc_statespace_filters.plots.phase import plot_phase
 from pymc_statespace_filters.plots.prior_sensitivity import plot_prior_sensitivity
+from pymc_statespace_filters.plots.residuals import plot_residuals
 from pymc_statespace_filters.plots.states import plot_states
 
 __all__ = [
@@ -17,5 +18,6 @@ __all__ = [
     "plot_model_probabilities",
     "plot_phase",
     "plot_prior_sensitivity",
+    "plot_residuals",
     "plot_states",
 ]

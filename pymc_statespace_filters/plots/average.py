@@ -7,15 +7,25 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from arviz_base import rcParams
-from arviz_base.labels import MapLabeller, NoVarLabeller
+from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, format_probability
+from pymc_statespace_filters.plots.axes import with_unit
+from pymc_statespace_filters.plots.canvas import (
+    BOUND,
+    band,
+    canvas,
+    curve,
+    format_probability,
+    size_of_panels,
+)
+from pymc_statespace_filters.plots.legend import add_legend
 
 AVERAGE = "average"
 N_GRID = 512
+ENDS = {"width": 1.5, "linestyle": "C1"}  # of the interval of the average
 PROB_SHOWN = 1e-3  # models above this probability determine the x range of densities
 
 
@@ -26,7 +36,9 @@ def plot_average(
 
     A curve (one dimension with numeric coordinates) is shown as mean and interval, a scalar as
     density; the densities of the models are multiplied by their weights and add up to that of the
-    average. Other dimensions become panels.
+    average. Other dimensions become panels. The bands are the intervals of the models, the dashed
+    lines that of the average. The axes are named by the array that the function returned:
+    ``attrs["long_name"]`` or else its name, and ``attrs["units"]``.
 
     Parameters
     ----------
@@ -81,13 +93,14 @@ def plot_average(
     data = _means(members, mixture) if along else _densities(members)
     panels = [dim for dim in members[name].dims if dim not in ("model", "chain", "draw", *along)]
     n_members = members.sizes["model"]
+    n_panels = math.prod(members.sizes[dim] for dim in panels)
     collection = canvas(
         data,
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={"color": ["model"], "width": ["model"]},
-        n_panels=math.prod(members.sizes[dim] for dim in panels),
-        legend=True,
+        size=size_of_panels(n_panels),
+        n_panels=n_panels,
         cols=panels,
         color=["B1", *(f"C{i}" for i in range(n_members))],
         width=[4, *[1.5] * n_members],
@@ -100,11 +113,19 @@ def plot_average(
         _draw_curves(collection, members, mixture)
     else:
         collection.map(line_xy, "density")
-    x_label, y_label = (along[0], name) if along else (name, "density")
-    collection.map(labelled_x, "x_label", ignore_aes="all", text=str(x_label))
-    collection.map(labelled_y, "y_label", ignore_aes="all", text=str(y_label))
-    collection.add_legend("model", aes=["color", "width"], labeller=_with_probabilities(members))
+    quantity = _axis_label(mixture[name])
+    labels = (_axis_label(mixture[along[0]]), quantity) if along else (quantity, "density")
+    collection.map(labelled_x, "x_label", ignore_aes="all", text=labels[0])
+    collection.map(labelled_y, "y_label", ignore_aes="all", text=labels[1])
+    legend = _legend_of_models(collection, members)
+    add_legend(collection, legend | (_legend_of_intervals() if along else {}), bool(panels))
     return collection
+
+
+def _axis_label(array: xr.DataArray) -> str:
+    """Return ``attrs["long_name"]`` or the name in words, with the unit if there is one."""
+    label = array.attrs.get("long_name", str(array.name).replace("_", " "))
+    return with_unit(label, array.attrs.get("units"))
 
 
 def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Dataset) -> None:
@@ -112,7 +133,7 @@ def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Da
     of_members, of_average = (
         getattr(draws.azstats, rcParams["stats.ci_kind"])() for draws in (members, mixture)
     )
-    styled = {"ignore_aes": {"width"}, "width": 1.5, "linestyle": "C1"}
+    styled = {"ignore_aes": {"width"}, **ENDS}
     collection.map(band, "band", data=of_members, ignore_aes={"width"}, alpha=0.2)
     collection.map(curve, "curve")
     for end in ("lower", "upper"):
@@ -161,11 +182,21 @@ def _densities(members: xr.Dataset) -> xr.Dataset:
     return densities.assign_coords(coords).to_dataset(name=kernel_densities.name)
 
 
-def _with_probabilities(members: xr.Dataset) -> MapLabeller:
+def _legend_of_models(collection: PlotCollection, members: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Return the styles of the average and of the models, these with their probabilities."""
     probs = zip(members["model"].values, members["prob"].values, strict=True)
-    return MapLabeller(
-        coord_map={
-            "model": {name: f"{name} ({format_probability(prob)})" for name, prob in probs}
-            | {AVERAGE: AVERAGE}
-        }
-    )
+    labels = {AVERAGE: AVERAGE} | {name: f"{name} ({format_probability(p)})" for name, p in probs}
+    return {
+        label: dict(collection.get_aes_kwargs(["color", "width"], "mapping", {"model": name}))
+        for name, label in labels.items()
+    }
+
+
+def _legend_of_intervals() -> dict[str, dict[str, Any]]:
+    """Return the styles of the intervals, whose kind and probability ArviZ sets."""
+    kind = "HDI" if rcParams["stats.ci_kind"] == "hdi" else "interval"
+    share = f"{100 * rcParams['stats.ci_prob']:g} %"
+    return {
+        f"{share} {kind} of the average": {"color": "B1", **ENDS},
+        f"{share} {kind} of a model": {"color": "B3", "alpha": 0.4, "width": 8},
+    }

@@ -1,8 +1,7 @@
-"""Elements shared by the plots: figures, labelled rows, curves, bands, annotations and ticks."""
+"""Elements shared by the plots: figures, labelled rows, curves, bands and annotations."""
 
 import math
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -11,9 +10,11 @@ from arviz_base import rcParams
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
+from pymc_statespace_filters.plots.axes import label_rows
+from pymc_statespace_filters.plots.legend import DOTS_PER_INCH
+
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
-DOTS_PER_INCH = 100  # of backends that measure in dots
 
 
 def canvas(
@@ -22,11 +23,9 @@ def canvas(
     backend: str | None,
     pc_kwargs: Mapping[str, Any],
     aes: Mapping[str, list[str]],
-    height: float = 2.5,
-    size: tuple[float, float] | None = None,
+    size: tuple[float, float],
     n_panels: int = 1,
     panels_in_line: int = PANELS_IN_LINE,
-    legend: bool = False,
     **defaults: Any,
 ) -> PlotCollection:
     """Make an empty figure for `data`; `pc_kwargs` of the user override the defaults.
@@ -37,33 +36,23 @@ def canvas(
         As in the public functions.
     aes : mapping of str to list of str
         Aesthetics and the dimensions that they encode.
-    height : float
-        Height of a panel in rows, the unit of ``scale_fig_size`` in arviz_plots.
-    size : tuple of float, optional
-        Width and height of the figure in inches; by default derived from the panels.
+    size : tuple of float
+        Width and height of the figure in inches.
     n_panels, panels_in_line : int
-    legend : bool
-        Whether to leave room for a legend beside the panels.
     **defaults
         Default arguments of `PlotCollection.wrap`.
     """
     backend = rcParams["plot.backend"] if backend is None else backend
-    drawing = import_module(f"arviz_plots.backend.{backend}")
     figure = dict(pc_kwargs.get("figure_kwargs", {}))
-    n_lines = math.ceil(n_panels / panels_in_line)
-    if "figsize" not in figure and size is not None and backend == "matplotlib":
-        figure["figsize"] = size
-    elif "figsize" not in figure:
-        n_columns = min(n_panels, panels_in_line) + (0.5 if legend else 0.0)
-        dots = size and (DOTS_PER_INCH * size[0], DOTS_PER_INCH * size[1])
-        figure["figsize"] = drawing.scale_fig_size(
-            dots, rows=height * n_lines, cols=n_columns, figsize_units=dots and "dots"
-        )
-        figure["figsize_units"] = "dots"
+    if "figsize" not in figure:
+        in_inches = backend == "matplotlib"
+        scale = 1.0 if in_inches else DOTS_PER_INCH
+        figure["figsize"] = (scale * size[0], scale * size[1])
+        figure["figsize_units"] = "inches" if in_inches else "dots"
     if backend == "matplotlib":  # the only backend that needs it to make room for a legend
         figure.setdefault("layout", "constrained")
-    if backend == "plotly" and size is not None:  # its default leaves room for titles
-        figure.setdefault("vertical_spacing", 0.25 / n_lines)
+    if backend == "plotly":  # its default leaves room for titles
+        figure.setdefault("vertical_spacing", 0.25 / math.ceil(n_panels / panels_in_line))
     given = {
         "col_wrap": panels_in_line,
         **defaults,
@@ -72,7 +61,17 @@ def canvas(
         "backend": backend,
     }
     given["aes"] = {**aes, **pc_kwargs.get("aes", {})}
-    return PlotCollection.wrap(data, **given)
+    collection = PlotCollection.wrap(data, **given)
+    if backend == "matplotlib":  # the others write numbers in full
+        for axes in collection.viz["figure"].item().axes:
+            axes.ticklabel_format(useOffset=False)
+    return collection
+
+
+def size_of_panels(n_panels: int) -> tuple[float, float]:
+    """Return the size in inches of a figure of panels side by side, below a legend."""
+    n_columns = min(n_panels, PANELS_IN_LINE)
+    return max(3.8 * n_columns, 6.0), 0.8 + 2.8 * math.ceil(n_panels / PANELS_IN_LINE)
 
 
 def canvas_of_rows(
@@ -86,19 +85,12 @@ def canvas_of_rows(
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={"y": [dim]},
-        height=0.6 + 0.3 * len(places),
+        size=(6.4, 1.3 + 0.6 * len(places)),
         y=places,
     )
     names = [str(name) for name in data[dim].values]
     collection.map(label_rows, ignore_aes="all", places=places, names=names, store_artist=False)
     return collection
-
-
-def label_rows(da: xr.DataArray, target: Any, *, places: np.ndarray, names: list[str]) -> None:
-    """Label the rows at the y axis, with space above and below."""
-    drawing = backend_from_object(target)
-    drawing.ylim((-0.5, len(names) - 0.3), target)
-    drawing.yticks(places, names, target)
 
 
 def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
@@ -145,16 +137,6 @@ def annotate(
         vertical_align="bottom",
         **kwargs,
     )
-
-
-def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
-    """Return tick positions (log10) and labels: decades, or finer if there are few decades."""
-    low, high = logs.min() - 1e-9, logs.max() + 1e-9
-    digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
-    decades = range(math.floor(low), math.ceil(high) + 1)
-    values = [digit * 10.0**decade for decade in decades for digit in digits]
-    shown = [value for value in values if low <= math.log10(value) <= high]
-    return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
 
 
 def format_probability(prob: float) -> str:

@@ -4,14 +4,18 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import labelled_x, line_x, scatter_x
+from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xticks
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence
+from pymc_statespace_filters.plots.axes import linear_ticks
 from pymc_statespace_filters.plots.canvas import annotate, canvas_of_rows, interval
+
+N_TICKS = 5  # numbers of many digits beside each other
 
 
 def plot_evidence(
@@ -63,6 +67,9 @@ def plot_evidence(
     texts = xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object])
     middle = (values.min() + values.max()).item() / 2
     collection.map(annotate, "text", texts=texts, middle=middle, color="B2")
+    ends = [(values + sign * 2 * table["se"].fillna(0.0)).values for sign in (-1, 1)]
+    ticks = linear_ticks(np.min(ends), np.max(ends), N_TICKS)
+    collection.map(set_xticks, ignore_aes="all", store_artist=False, **ticks)
     text = "log-evidence (nats), 1 and 2 standard errors"
     collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
     return collection

@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
-from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
 from arviz_stats.base import array_stats
 from arviz_stats.ecdf_utils import (
@@ -17,21 +16,16 @@ from arviz_stats.ecdf_utils import (
 )
 from scipy.stats import norm
 
-from pymc_statespace_filters.plots.canvas import (
-    PANELS_IN_LINE,
-    band,
-    canvas,
-    curve,
-    interval,
-    logarithmic_ticks,
-)
+from pymc_statespace_filters.plots.axes import label_ticks, logarithmic_ticks, time_label
+from pymc_statespace_filters.plots.canvas import PANELS_IN_LINE, band, canvas, curve, interval
+from pymc_statespace_filters.plots.legend import add_legend, legend_style
 from pymc_statespace_filters.plots.marks import (
-    add_legend,
     bars,
     draw_bands,
-    legend_style,
+    draw_median,
+    over_draws,
+    point_size,
     points,
-    time_label,
 )
 from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
@@ -151,7 +145,8 @@ def plot_filter_health(
         cols=["__variable__", "observable"],
     )
     collection.map(band, "expected", data=expected, **EXPECTED)
-    collection.map(points, "seen", data=seen[["residual"]], diameter=3, **SEEN)
+    size = point_size(residual)
+    collection.map(points, "seen", data=seen[["residual"]], **size, **SEEN)
     for correlation in CORRELATIONS & set(seen):
         lags = seen[[correlation]]
         collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
@@ -161,8 +156,8 @@ def plot_filter_health(
     if effective is not None:
         legend |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
-    _label_panels(collection, data, residual["time"])
-    add_legend(collection, legend, n_columns=in_line)
+    _label_panels(collection, data, time_label(residual))
+    add_legend(collection, legend, n_observables > 1)
     return collection
 
 
@@ -258,7 +253,9 @@ def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
 
 
 def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:
-    legend = draw_bands(collection, logs)
+    quantiles = over_draws(logs)
+    legend = draw_bands(collection, quantiles)
+    legend = draw_median(collection, quantiles) | legend
     limit = np.log10(COLLAPSED)
     collection.map(hline, "collapsed", data=xr.Dataset({"effective": limit}), **LIMIT)
     ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])
@@ -277,18 +274,13 @@ def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataT
         collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
 
 
-def label_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
-    """Set positions and labels of the ticks at the y axis."""
-    backend_from_object(target).yticks(ticks["values"], ticks["labels"], target)
-
-
-def _label_panels(collection: PlotCollection, data: xr.Dataset, time: xr.DataArray) -> None:
+def _label_panels(collection: PlotCollection, data: xr.Dataset, time: str) -> None:
     axes = {
-        "residual": (time_label(time), "standardised residual"),
+        "residual": (time, "standardised residual"),
         "autocorrelation": ("lag (observations)", "autocorrelation"),
-        "pit": ("PIT", "ECDF minus uniform"),
+        "pit": ("PIT: predicted probability below", "share below − expected"),
         "inputs": ("lag (observations)", "correlation with inputs"),
-        "effective": (time_label(time), "effective number"),
+        "effective": (time, "effective number"),
     }
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
     for panel in map(str, data):

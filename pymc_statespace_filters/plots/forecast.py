@@ -1,5 +1,6 @@
 """Plot of forecasts beside the observations."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -7,57 +8,78 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
 
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots.axes import label_axes, time_label
+from pymc_statespace_filters.plots.legend import add_legend, legend_style
 from pymc_statespace_filters.plots.marks import (
     DATA,
     TRUTH,
-    add_legend,
     canvas_over_time,
     draw_bands,
     draw_bars,
-    label_axes,
-    legend_style,
+    draw_data,
+    draw_median,
+    over_draws,
+    point_size,
     points,
 )
 from pymc_statespace_filters.plots.results import (
+    SAMPLE_DIMS,
     data_of,
     group_of,
     rename_last_dims,
     truth_of,
     variable_of,
 )
+from pymc_statespace_filters.plots.transforms import axis_label, functions_of, transformed
 from pymc_statespace_filters.system.checks import check_count
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations
+END = {"color": "B2", "linestyle": "C1"}
 
 
 def plot_forecast(
     idata: xr.DataTree,
     *,
+    group: str = "predictions",
     var_name: str | None = None,
     truth: Any = None,
     n_past: int | None = None,
+    transform: Callable[[Any], Any] | Mapping[str, Callable[[Any], Any]] | None = None,
+    errors: bool = False,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
-    """Plot predicted observations after the last observation, one panel per observable.
+    """Plot predicted observations, one panel per observable.
 
-    Bands contain 50 % and 90 % of the draws, which include the uncertainty of parameters and
-    states, the process noise and the observation noise. A vertical line marks the last observation.
+    Bands contain 50 % and 90 % of the draws of a group, after the last observation (`forecast`) or
+    beside the observations (a free run). Those of a forecast include the uncertainty of parameters
+    and states, the process noise and the observation noise. A vertical line marks the last
+    observation. Units are taken from the results as in `plot_states`.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Result of `forecast`.
+        Result of `forecast` or of `free_run`.
+    group : {"predictions", "free_run"}
+        The group with the predicted observations.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
         The actual observations: an array of shape (number of predictions, number of observables); a
         DataArray with a dimension ``observable`` and another whose coordinate is time; or the
-        result of `simulate`. Only values after the last observation are shown.
+        result of `simulate`. Only values after the last observation are shown, or from the first
+        prediction on.
     n_past : int, optional
-        Number of past observations to show; by default those in a time span twice as long as the
-        forecast, and at least ten.
+        Number of observations before the first prediction to show; by default those in a time span
+        twice as long as the forecast, and at least ten.
+    transform : callable or mapping of str to callable, optional
+        Function of an array, such as ``numpy.exp``, that is applied to predictions, observations
+        and truth before they are drawn; or a mapping from names of observables to such functions.
+    errors : bool
+        Show observation minus median prediction, with the bands around zero. The observations are
+        those at the times of the predictions: `truth`, and the record beside a free run.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -67,12 +89,13 @@ def plot_forecast(
     -------
     arviz_plots.PlotCollection
         Visuals ``band_90``, ``band_50`` and ``median`` (of a single time ``bar_90`` and
-        ``bar_50``), ``data``, ``end``, ``truth``, along ``observable``.
+        ``bar_50``), ``data``, ``end``, ``truth``, ``errors``, along ``observable``.
 
     Raises
     ------
     ModelError
-        If there is no forecast, or the truth does not match it.
+        If there is no forecast, the truth or the transform does not match it, or `errors` has no
+        observations.
 
     Examples
     --------
@@ -97,38 +120,112 @@ def plot_forecast(
     """
     if n_past is not None:
         check_count("n_past", n_past, 0)
-    _, results = group_of(idata, "predictions")
-    predicted = results[[name for name in results if not str(name).endswith("_states")]]
-    name = variable_of(predicted, var_name)
-    draws = rename_last_dims(predicted[name], "time", "observable")
+    _, results = group_of(idata, group)
+    name = variable_of(_predicted(results), var_name)
+    draws = rename_last_dims(results[name], "time", "observable")
+    record = data_of(idata, name)
     observables = [str(observable) for observable in draws["observable"].values]
+    functions = functions_of(transform, observables)
+    labels = [axis_label(one, functions, draws, record) for one in observables]
+    time = time_label(draws, record)
     if truth is not None:
         truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
-    record = data_of(idata, name)
+        truth = transformed(truth, "observable", functions)
+    draws = transformed(draws, "observable", functions)
+    record = None if record is None else transformed(record, "observable", functions)
+    observed = _observed_at(draws, truth, record) if errors else None
 
     data = draws.to_dataset(name="observations")
     collection = canvas_over_time(data, "observable", backend=backend, pc_kwargs=pc_kwargs)
-    legend = (draw_bars if data.sizes["time"] == 1 else draw_bands)(collection, data)
-    if record is not None:
-        past = record.tail(time=_n_past(record, draws) if n_past is None else n_past)
-        end = record["time"][-1].expand_dims(observable=observables).drop_vars("time")
-        if truth is not None:
-            truth = truth.where(truth["time"] > record["time"][-1], drop=True)
-        collection.map(vline, "end", data=end.to_dataset(name="end"), color="B2", linestyle="C1")
-        collection.map(points, "data", data=past.to_dataset(name="data"), diameter=4, **DATA)
-        legend["data"] = legend_style(DATA)
-        legend["end of record"] = {"color": "B2", "linestyle": "C1"}
-    if truth is not None:
-        actual = truth.reindex(observable=observables).to_dataset(name="truth")
-        collection.map(points, "truth", data=actual, diameter=4, color=TRUTH["color"])
-        legend["truth"] = legend_style(TRUTH)
-    label_axes(collection, draws["time"])
-    add_legend(collection, legend)
+    at_one_time = data.sizes["time"] == 1
+    quantiles = over_draws(data)
+    if observed is not None:
+        labels = [f"error of {label}" for label in labels]
+        median = quantiles.sel(quantile=0.5, drop=True)
+        quantiles, observed = quantiles - median, observed - median["observations"]
+    # Bands below the points, the median above them.
+    bands = (draw_bars if at_one_time else draw_bands)(collection, quantiles)
+    legend: dict[str, dict[str, Any]] = {}
+    if observed is not None:
+        legend |= _draw_errors(collection, observed)
+    elif record is not None:
+        legend |= draw_data(collection, _shown(record, draws, n_past))
+        legend |= _mark_end(collection, record, draws)
+    if truth is not None and not errors:
+        legend |= _draw_truth(collection, truth, record, draws)
+    lines = {} if at_one_time else draw_median(collection, quantiles)
+    label_axes(collection, labels, time)
+    add_legend(collection, lines | bands | legend)
     return collection
 
 
-def _n_past(record: xr.DataArray, draws: xr.DataArray) -> int:
-    """Return the number of observations in a time span `PAST` times that of the forecast."""
-    end = record["time"].values[-1]
-    begin = end - PAST * (draws["time"].values[-1] - end)
-    return max(int(np.sum(record["time"].values >= begin)), MIN_PAST)
+def _predicted(results: xr.Dataset) -> xr.Dataset:
+    """Return the predicted observations of each variable: (chain, draw, time, observable)."""
+    names = [str(name) for name in results if results[name].ndim == len(SAMPLE_DIMS) + 2]
+    return results[[name for name in names if not name.endswith("_states")]]
+
+
+def _shown(record: xr.DataArray, draws: xr.DataArray, n_past: int | None) -> xr.DataArray:
+    """Return the observations to show: those beside the predictions, and `n_past` before."""
+    first, last = draws["time"].values[[0, -1]]
+    times = record["time"].values
+    n_before = int(np.sum(times < first))
+    if n_past is None:
+        end = min(times[-1], first)
+        begin = end - PAST * (last - end)
+        n_past = max(int(np.sum((times >= begin) & (times < first))), MIN_PAST)
+    return record.isel(time=slice(max(n_before - n_past, 0), None))
+
+
+def _mark_end(
+    collection: PlotCollection, record: xr.DataArray, draws: xr.DataArray
+) -> dict[str, dict[str, Any]]:
+    """Draw a line at the last observation if predictions follow; return its legend entry."""
+    if record["time"][-1] >= draws["time"][-1]:
+        return {}
+    end = record["time"][-1].expand_dims(observable=draws["observable"]).drop_vars("time")
+    collection.map(vline, "end", data=end.to_dataset(name="end"), **END)
+    return {"end of record": END}
+
+
+def _draw_truth(
+    collection: PlotCollection,
+    truth: xr.DataArray,
+    record: xr.DataArray | None,
+    draws: xr.DataArray,
+) -> dict[str, dict[str, Any]]:
+    """Draw the actual observations from the predictions on; return their legend entry."""
+    if record is not None:
+        begin = np.minimum(draws["time"][0], np.nextafter(record["time"][-1], np.inf))
+        truth = truth.where(truth["time"] >= begin.item(), drop=True)
+    actual = truth.reindex(observable=draws["observable"])
+    style = {"color": TRUTH["color"], **point_size(actual)}
+    collection.map(points, "truth", data=actual.to_dataset(name="truth"), **style)
+    return {"truth": legend_style(TRUTH)}
+
+
+def _draw_errors(collection: PlotCollection, observed: xr.DataArray) -> dict[str, dict[str, Any]]:
+    """Draw observation minus median prediction as points; return their legend entry."""
+    data = observed.to_dataset(name="errors")
+    collection.map(points, "errors", data=data, **DATA, **point_size(observed))
+    return {"observed − median": legend_style(DATA)}
+
+
+def _observed_at(
+    draws: xr.DataArray, truth: xr.DataArray | None, record: xr.DataArray | None
+) -> xr.DataArray:
+    """Return the observations at the times of the draws: of the truth, else of the record."""
+    times = draws["time"].values
+    observed = xr.full_like(draws.isel(chain=0, draw=0, drop=True), np.nan)
+    for given in (truth, record):
+        if given is not None:
+            known = given.sortby("time").drop_duplicates("time")
+            tolerance = 1e-6 * np.min(np.diff(times), initial=1.0)
+            known = known.reindex(time=times, method="nearest", tolerance=tolerance)
+            observed = observed.fillna(known.reindex(observable=draws["observable"]))
+    if not observed.notnull().any():
+        raise ModelError(
+            "errors needs observations at the times of the predictions, "
+            f"{times[0]:g} to {times[-1]:g}, got none: give them as truth"
+        )
+    return observed

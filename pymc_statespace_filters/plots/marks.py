@@ -1,26 +1,26 @@
-"""Elements of plots over time: bands and bars of draws, points, paths, legend and axis labels."""
+"""Elements of plots over time: bands and bars of draws, points, paths."""
 
 from collections.abc import Hashable, Mapping
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
-from arviz_plots.visuals import labelled_x, labelled_y
 
 from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, interval
+from pymc_statespace_filters.plots.legend import legend_style
 from pymc_statespace_filters.plots.results import SAMPLE_DIMS
 
 # Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
 DRAWS = {"color": "C0"}
+MEDIAN = {**DRAWS, "width": 1.5}
 DATA = {"color": "C1"}
 TRUTH = {"color": "B1", "width": 0.9}
 PATHS = {"color": "C0", "alpha": 0.4, "width": 0.6}
 DOTS = {"color": "C0", "alpha": 0.4, "diameter": 2}
-MAX_IN_LINE = 5  # legend entries
+FEW = 200  # observations that fit beside each other as separate marks
+DIAMETER, LEAST_DIAMETER, LEAST_ALPHA = 4.0, 2.0, 0.6  # of points
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
@@ -43,23 +43,22 @@ def canvas_over_time(
     )
 
 
-def draw_bands(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw median, 50 % and 90 % bands of draws over time; return their legend entries."""
-    quantiles = over_draws(draws)
+def draw_bands(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw 50 % and 90 % bands over time; return their legend entries."""
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
         collection.map(band, f"band_{prob}", data=ends, alpha=OPACITIES[prob], **DRAWS)
-    median = quantiles.sel(quantile=0.5, drop=True)
-    collection.map(curve, "median", data=median, width=1.5, **DRAWS)
-    bands = {
-        f"{prob} %": {**DRAWS, "alpha": OPACITIES[prob] + 0.1, "width": 8} for prob in (50, 90)
-    }
-    return {"median": {**DRAWS, "width": 1.5}, **bands}
+    return {f"{prob} %": {**DRAWS, "alpha": OPACITIES[prob] + 0.1, "width": 8} for prob in (50, 90)}
 
 
-def draw_bars(collection: PlotCollection, draws: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Draw 50 % and 90 % bars of draws at separate times; return their legend entries."""
-    quantiles = over_draws(draws)
+def draw_median(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw the median over time; return its legend entry."""
+    collection.map(curve, "median", data=quantiles.sel(quantile=0.5, drop=True), **MEDIAN)
+    return {"median": MEDIAN}
+
+
+def draw_bars(collection: PlotCollection, quantiles: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Draw 50 % and 90 % bars at separate times; return their legend entries."""
     for prob in PROBABILITIES:
         ends = _ends(quantiles, prob)
         collection.map(bars, f"bar_{prob}", data=ends, width=WIDTHS[prob], **DRAWS)
@@ -90,6 +89,25 @@ def thin_draws(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
     stacked = stacked.dropna("path", how="all")
     n_draws = min(n_draws, stacked.sizes["path"])
     return stacked.isel(path=np.linspace(0, stacked.sizes["path"] - 1, n_draws).astype(int))
+
+
+def point_size(values: xr.DataArray) -> dict[str, Any]:
+    """Return size and opacity of points over time: the more, the smaller and paler."""
+    n_points = max(int(values.count("time").max()), 1)
+    share = min(1.0, FEW / n_points)
+    return {
+        "diameter": max(DIAMETER * share**0.5, LEAST_DIAMETER),
+        "alpha": max(share**0.25, LEAST_ALPHA),
+        "width": 0,  # of the edge
+    }
+
+
+def draw_data(collection: PlotCollection, record: xr.DataArray) -> dict[str, dict[str, Any]]:
+    """Draw a record as points; return its legend entry."""
+    collection.map(
+        points, "data", data=record.to_dataset(name="data"), **DATA, **point_size(record)
+    )
+    return {"data": legend_style(DATA)}
 
 
 def bars(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
@@ -145,59 +163,3 @@ def _scatter(x: np.ndarray, y: np.ndarray, target: Any, diameter: float, **kwarg
     size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # other backends: area
     known = np.isfinite(x) & np.isfinite(y)
     return drawing.scatter(x[known], y[known], target, size=size, **kwargs)
-
-
-def legend_style(style: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the legend style of points: a dotted line, as legends show lines only."""
-    return {**style, "linestyle": "C2", "width": 4}
-
-
-def add_legend(
-    collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], n_columns: int = 1
-) -> None:
-    """Write a legend above the panels, which form `n_columns` columns."""
-    in_line = -(-len(entries) // (1 + (len(entries) > MAX_IN_LINE)))  # a long one in two lines
-    places: dict[str, dict[str, Any]] = {
-        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": in_line},
-        "plotly": {
-            "legend_orientation": "h",
-            "legend_y": 1.02,
-            "legend_yanchor": "bottom",
-            "legend_traceorder": "normal",
-            "margin": {"t": 60, "b": 60, "r": 30},
-        },
-        "bokeh": {  # above the first panel, and no wider than it
-            "side": "above",
-            "border_line_alpha": 0.0,
-            "margin": 0,
-            "padding": 0,
-            "ncols": in_line if n_columns == 1 else 3,
-            "label_text_font_size": "12px" if n_columns == 1 else "10px",
-            "glyph_width": 20 if n_columns == 1 else 12,
-        },
-        "none": {},
-    }
-    drawing = import_module(f"arviz_plots.backend.{collection.backend}")
-    # arviz_plots does not translate "alpha" for legends.
-    alpha = "opacity" if collection.backend == "plotly" else "alpha"
-    styles = [{alpha if k == "alpha" else k: v for k, v in s.items()} for s in entries.values()]
-    drawing.legend(
-        collection, styles, list(entries), update_visuals=False, **places[collection.backend]
-    )
-
-
-def label_axes(collection: PlotCollection, time: xr.DataArray) -> None:
-    """Label the y axis of each panel, and the time axis below the lowest panels."""
-    collection.map(
-        labelled_y, "y_label", ignore_aes="all", subset_info=True, labeller=NoVarLabeller()
-    )
-    (dim,) = collection.viz["plot"].dims
-    n_columns = int(collection.viz["col_index"].max()) + 1
-    lowest = collection.data.isel({dim: slice(-n_columns, None)})
-    settings = {"ignore_aes": "all", "store_artist": False}
-    collection.map(labelled_x, data=lowest, text=time_label(time), **settings)
-
-
-def time_label(time: xr.DataArray) -> str:
-    """Return the label of the time axis, with the unit from the attributes if there is one."""
-    return f"time ({time.attrs['units']})" if "units" in time.attrs else "time"

@@ -1,10 +1,13 @@
 """Plot of model probabilities with their intervals."""
 
+import math
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
+from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from pymc_statespace_filters.errors import ModelError
@@ -14,14 +17,20 @@ from pymc_statespace_filters.plots.canvas import (
     format_probability,
     interval,
 )
+from pymc_statespace_filters.plots.legend import add_legend, legend_style
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
+STYLE = {"color": "C0"}
+END = 0.12  # half the length of the mark at an end of an interval
 
 
 def plot_model_probabilities(
     table: pd.DataFrame, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
     """Plot model probabilities with their intervals.
+
+    An interval shows the errors of the log-evidences. Its ends are marked and written beside the
+    probability, because that of precise evidences is narrower than the point.
 
     Parameters
     ----------
@@ -36,7 +45,7 @@ def plot_model_probabilities(
     Returns
     -------
     arviz_plots.PlotCollection
-        Visuals ``interval``, ``decided``, ``undecided``, ``text``, ``x_label``.
+        Visuals ``interval``, ``ends``, ``decided``, ``undecided``, ``text``, ``x_label``.
 
     Raises
     ------
@@ -60,8 +69,9 @@ def plot_model_probabilities(
     low, high = (data[[end]].rename({end: "prob"}) for end in ("prob_low", "prob_high"))
 
     collection = canvas_of_rows(prob, backend=backend, pc_kwargs=pc_kwargs)
-    collection.map(line_x, "interval", data=interval(low, high), width=2, color="C0")
-    collection.map(scatter_x, "decided", data=prob.where(~undecided), color="C0")
+    bounds = interval(low, high)
+    collection.map(line_x, "interval", data=bounds, width=2, **STYLE)
+    collection.map(scatter_x, "decided", data=prob.where(~undecided), **STYLE)
     collection.map(
         scatter_x,
         "undecided",
@@ -70,12 +80,47 @@ def plot_model_probabilities(
         edgecolor="C0",
         width=1.5,
     )
-    texts = xr.apply_ufunc(_text, data["prob"], undecided, vectorize=True, output_dtypes=[object])
+    collection.map(ends, "ends", data=bounds, width=2, **STYLE)
+    texts = xr.apply_ufunc(
+        _text,
+        *(data[column] for column in COLUMNS),
+        vectorize=True,
+        output_dtypes=[object],
+    )
     collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
     collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
     collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the model")
+    legend = {"probability": legend_style(STYLE)}
+    if bounds["prob"].notnull().any():
+        legend["interval of the evidences' errors"] = {**STYLE, "width": 2}
+    add_legend(collection, legend)
     return collection
 
 
-def _text(prob: float, undecided: bool) -> str:
-    return format_probability(prob) + (", undecided" if undecided else "")
+def ends(da: xr.DataArray, target: Any, *, y: Any, **kwargs: Any) -> Any:
+    """Mark the ends of an interval by vertical lines that are longer than a point."""
+    row = np.asarray(y).item()
+    low, high = da.values
+    return backend_from_object(target).line(
+        [low, low, np.nan, high, high],
+        [row - END, row + END, np.nan, row - END, row + END],
+        target,
+        **kwargs,
+    )
+
+
+def _text(prob: float, low: float, high: float, undecided: bool) -> str:
+    """Write a probability, its interval unless that has no width, and whether it is undecided."""
+    text = format_probability(prob)
+    if math.isfinite(high - low) and high > low:
+        digits = min(max(2, math.ceil(-math.log10(high - low)) + 1), 4)
+        text, *bounds = (_with_digits(value, digits) for value in (prob, low, high))
+        text = f"{text} ({' to '.join(bounds)})"
+    return text + (", undecided" if undecided else "")
+
+
+def _with_digits(prob: float, digits: int) -> str:
+    """Write a probability with so many decimals, or more near zero and one."""
+    if 1e-6 <= prob < 0.01:
+        return f"{prob:.2g}"
+    return f"{prob:.{digits}f}" if 0.01 <= prob < 0.99 else format_probability(prob)

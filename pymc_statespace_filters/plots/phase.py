@@ -9,12 +9,13 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, labelled_y, line_xy
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots.axes import unit_of, with_unit
 from pymc_statespace_filters.plots.canvas import canvas
+from pymc_statespace_filters.plots.legend import add_legend
 from pymc_statespace_filters.plots.marks import (
     DOTS,
     PATHS,
     TRUTH,
-    add_legend,
     over_draws,
     path_xy,
     points_xy,
@@ -118,8 +119,9 @@ def plot_phase(
         lines["truth"] = ({**TRUTH, "width": 1.2}, true)
     for label, (line_style, line) in lines.items():
         collection.map(line_xy, label, data=line, **line_style)
-    collection.map(labelled_x, "x_label", text=str(both[0].name))
-    collection.map(labelled_y, "y_label", text=str(both[1].name))
+    labels = [with_unit(str(one.name), one.attrs.get("units")) for one in both]
+    collection.map(labelled_x, "x_label", text=labels[0])
+    collection.map(labelled_y, "y_label", text=labels[1])
     add_legend(collection, legend | {label: style for label, (style, _) in lines.items()})
     return collection
 
@@ -143,7 +145,8 @@ def _quantity(argument: str, given: str | xr.DataArray, states: xr.DataArray) ->
         name = given.name or argument
         return given.rename({others[0]: "time"}).reset_coords(drop=True).rename(name)
     (state,) = select_names(argument, [given], [str(state) for state in states["state"].values])
-    return states.sel(state=state, drop=True).rename(state)
+    unit = unit_of(state, states)
+    return states.sel(state=state, drop=True).rename(state).assign_attrs(units=unit)
 
 
 def _truth(truth: Any, x: Any, y: Any, states: xr.DataArray) -> xr.Dataset:

@@ -1,6 +1,6 @@
 """Read and check the inputs of plots of states: groups, variables, observations, the truth."""
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ CALLS = {  # that make the groups
     "smoothed_states": "psf.smoothed_states(idata, model)",
     "filtered_states": "psf.filtered_states(idata, model)",
     "predictions": "psf.forecast(idata, model, n_steps=...)",
+    "free_run": "psf.free_run(idata, model)",
     "filter_diagnostics": "psf.filter_diagnostics(idata, model)",
 }
 
@@ -77,6 +78,26 @@ def select_names(argument: str, names: Any, available: Sequence[str]) -> list[st
     names = [names] if isinstance(names, str) else list(names)
     check_names(argument, names, available)
     return names
+
+
+def measured_by(
+    observables: Mapping[str, str] | None, states: Sequence[str], available: Sequence[str]
+) -> dict[str, str]:
+    """Return the observable of each measured state: the given ones, or those of its name."""
+    if observables is None:
+        return {state: state for state in states if state in available}
+    check_names("observables: its states", observables, states)
+    check_names("observables: its values", observables.values(), available)
+    return dict(observables)
+
+
+def observations_of(
+    record: xr.DataArray, measured: Mapping[str, str], states: Sequence[str]
+) -> xr.DataArray:
+    """Return the observations of each of `states`, over time and state; NaN if not measured."""
+    there = record.sel(observable=list(measured.values()))
+    there = there.rename(observable="state").assign_coords(state=list(measured))
+    return there.reindex(state=list(states))
 
 
 def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -> None:

@@ -1,40 +1,51 @@
 """Plot of states over time with observations and the truth (thesis, Fig. 12)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import xarray as xr
 from arviz_plots import PlotCollection
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots.axes import label_axes, time_label
 from pymc_statespace_filters.plots.canvas import curve
+from pymc_statespace_filters.plots.legend import add_legend
 from pymc_statespace_filters.plots.marks import (
-    DATA,
     DOTS,
+    FEW,
     PATHS,
     TRUTH,
-    add_legend,
     canvas_over_time,
     draw_bands,
     draw_bars,
-    label_axes,
-    legend_style,
+    draw_data,
+    draw_median,
+    over_draws,
     paths,
     points,
     thin_draws,
 )
 from pymc_statespace_filters.plots.results import (
-    check_names,
     data_of,
+    measured_by,
+    observations_of,
     select_names,
     states_of,
     truth_of,
+)
+from pymc_statespace_filters.plots.simulation import draw_simulation, refuse_without_draws
+from pymc_statespace_filters.plots.transforms import (
+    Functions,
+    axis_label,
+    functions_of,
+    of_record,
+    transformed,
 )
 from pymc_statespace_filters.system.checks import check_count
 
 
 def plot_states(
-    idata: xr.DataTree,
+    idata: xr.DataTree | xr.Dataset,
     *,
     group: str | None = None,
     var_name: str | None = None,
@@ -42,19 +53,26 @@ def plot_states(
     observables: Mapping[str, str] | None = None,
     truth: Any = None,
     n_draws: int = 0,
+    transform: Callable[[Any], Any] | Mapping[str, Callable[[Any], Any]] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
     """Plot states over time with their uncertainty, one panel per state.
 
     Bands contain 50 % and 90 % of the draws, which include the uncertainty of the parameters; the
-    line is their median. States at observation times only are shown as bars. Failed draws are
-    ignored; where all failed there is a gap.
+    line is their median. States at no more than 200 observation times are shown as bars. Failed
+    draws are ignored; where all failed there is a gap.
+
+    The path of `simulate` is shown as a line, and each observable that is no state in a panel of
+    its own.
+
+    Axes have units if the results have them in ``attrs["units"]``: of the variable or of its last
+    coordinate, as a text, a list or a mapping from names; and of the coordinate of time.
 
     Parameters
     ----------
-    idata : xarray.DataTree
-        Result of `filtered_states` or `smoothed_states`.
+    idata : xarray.DataTree or xarray.Dataset
+        Result of `filtered_states` or `smoothed_states`; or of `simulate`.
     group : {"smoothed_states", "filtered_states"}, optional
         By default the smoothed states if there are any.
     var_name : str, optional
@@ -71,6 +89,11 @@ def plot_states(
     n_draws : int
         Number of draws to show beside the bands: as lines for smoothed states at every step, as
         points for filtered states and for states at observation times only.
+    transform : callable or mapping of str to callable, optional
+        Function of an array that is applied to the states and the truth before they are drawn:
+        ``numpy.exp`` shows the abundance if the state is its logarithm. The observations are drawn
+        as they are. A mapping from names of states gives each its function, and may name
+        observables too, whose observations are then transformed.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -80,12 +103,12 @@ def plot_states(
     -------
     arviz_plots.PlotCollection
         Visuals ``band_90``, ``band_50`` and ``median`` (or ``bar_90`` and ``bar_50``), ``data``,
-        ``truth``, ``draws``, along ``state``.
+        ``truth``, ``draws``, along ``state``; of a simulation ``path`` and ``data``.
 
     Raises
     ------
     ModelError
-        If there are no such states, or a name or the truth does not match them.
+        If there are no such states, or a name, the truth or the transform does not match them.
 
     Examples
     --------
@@ -103,47 +126,59 @@ def plot_states(
     >>> collection.savefig("states.png")  # doctest: +SKIP
     """
     check_count("n_draws", n_draws, 0)
+    if isinstance(idata, xr.Dataset):
+        refuse_without_draws(group=group, var_name=var_name, truth=truth, n_draws=n_draws or None)
+        return draw_simulation(idata, states, observables, transform, backend, pc_kwargs)
     name, draws, at_observations, are_paths = states_of(idata, group, var_name)
     all_states = [str(state) for state in draws["state"].values]
     shown = select_names("states", states, all_states)
-    record = _record(idata, name, observables, all_states)
-    if truth is not None:
-        truth = truth_of(truth, "states", "state", all_states, draws["time"].values)
-        begin, end = draws["time"].values[[0, -1]]
-        truth = truth.where((truth["time"] >= begin) & (truth["time"] <= end), drop=True)
+    record, measured = _record(idata, name, observables, all_states)
+    seen = [] if record is None else [str(one) for one in record["observable"].values]
+    functions = functions_of(transform, all_states, seen)
+    true = None if truth is None else _truth(truth, draws, functions, shown)
 
-    data = draws.sel(state=shown).to_dataset(name="states")
+    data = transformed(draws.sel(state=shown), "state", functions).to_dataset(name="states")
     collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
+    # Bands below the points, lines above them.
+    as_bars = at_observations and data.sizes["time"] <= FEW
+    quantiles = over_draws(data)
+    bands = (draw_bars if as_bars else draw_bands)(collection, quantiles)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths else (points, DOTS)
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
-    legend = (draw_bars if at_observations else draw_bands)(collection, data)
-    if truth is not None:
-        true = truth.reindex(state=shown).to_dataset(name="truth")
-        collection.map(curve, "truth", data=true, **TRUTH)
-        legend["truth"] = TRUTH
-    if record is not None and set(shown) & set(record["state"].values):
-        seen = record.reindex(state=shown).to_dataset(name="data")
-        collection.map(points, "data", data=seen, diameter=4, **DATA)
-        legend["data"] = legend_style(DATA)
-    label_axes(collection, draws["time"])
-    add_legend(collection, legend)
+    legend = {}
+    if record is not None and set(shown) & set(measured):
+        record = transformed(record, "observable", of_record(transform, functions))
+        legend = draw_data(collection, observations_of(record, measured, shown))
+    lines = {} if as_bars else draw_median(collection, quantiles)
+    if true is not None:
+        collection.map(curve, "truth", data=true.to_dataset(name="truth"), **TRUTH)
+        legend = {"truth": TRUTH} | legend
+    labels = [axis_label(state, functions, draws) for state in shown]
+    label_axes(collection, labels, time_label(draws, record))
+    add_legend(collection, lines | bands | legend)
     return collection
+
+
+def _truth(
+    truth: Any, draws: xr.DataArray, functions: Functions, shown: Sequence[str]
+) -> xr.DataArray:
+    """Return the true states within the times of the draws."""
+    all_states = [str(state) for state in draws["state"].values]
+    true = truth_of(truth, "states", "state", all_states, draws["time"].values)
+    begin, end = draws["time"].values[[0, -1]]
+    true = true.where((true["time"] >= begin) & (true["time"] <= end), drop=True)
+    return transformed(true, "state", functions).reindex(state=shown)
 
 
 def _record(
     idata: xr.DataTree, name: str, observables: Mapping[str, str] | None, states: Sequence[str]
-) -> xr.DataArray | None:
-    """Return the observations of each measured state, over time and state."""
+) -> tuple[xr.DataArray | None, dict[str, str]]:
+    """Return the observations if idata has them, and the observable of each measured state."""
     record = data_of(idata, name)
     if record is None:
         if observables:
             raise ModelError(f"observables needs observed_data[{name!r}] in idata, got none")
-        return None
+        return None, {}
     there = [str(observable) for observable in record["observable"].values]
-    if observables is None:
-        observables = {state: state for state in states if state in there}
-    check_names("observables: its states", observables, states)
-    check_names("observables: its values", observables.values(), there)
-    measured = record.sel(observable=list(observables.values()))
-    return measured.rename(observable="state").assign_coords(state=list(observables))
+    return record, measured_by(observables, states, there)

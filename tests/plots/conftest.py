@@ -131,13 +131,67 @@ def diagnostics():
     residual[3, 0] = np.nan
     over_time = ("d_time", "observable")
     effective = np.arange(1.0, 101).reshape(2, 50)[:, :, None] * np.ones(41)
+    lags = np.arange(1, 11)
     group = xr.Dataset(
         {
             "d_residual": (over_time, residual),
             "d_pit": (over_time, norm.cdf(residual)),
             "d_n_effective": (("chain", "draw", "d_time"), effective),
+            "d_innovation": (over_time, [0.5, 2.0] * residual),
+            "d_innovation_cov": ((*over_time, "observable_bis"), [np.diag([0.25, 4.0])] * 41),
+            "d_autocorrelation": (("lag", "observable"), np.outer(lags, [0.01, -0.02])),
+            "d_predicted": (("chain", "draw", *over_time), residual + np.full((2, 50, 1, 1), 7.0)),
         },
-        coords={"d_time": TIMES, "observable": ["position", "speed"]},
+        coords={
+            "d_time": TIMES,
+            "observable": ["position", "speed"],
+            "lag": lags,
+        },
     )
     stats = xr.Dataset({"n_failed": (("chain", "draw"), np.full((2, 3), 2))})
     return xr.DataTree.from_dict({"filter_diagnostics": group, "sample_stats": stats})
+
+
+@pytest.fixture(scope="session")
+def diagnostics_with_inputs(diagnostics):
+    lags, correlations = np.arange(11), np.linspace(-0.4, 0.4, 44).reshape(11, 2, 2)
+    group = diagnostics["filter_diagnostics"].to_dataset()
+    group["d_input_correlation"] = (("input_lag", "input", "observable"), correlations)
+    group = group.assign_coords(input_lag=lags, input=["force", "heat"])
+    return xr.DataTree.from_dict({"filter_diagnostics": group})
+
+
+@pytest.fixture(scope="session")
+def simulated():
+    """As of `simulate`: two states, the first and a voltage observed at every fifth step."""
+    path = np.stack([np.sin(TIMES), 10 * np.cos(TIMES)], axis=1)
+    record = np.stack([path[::5, 0] + 0.1, np.arange(9.0)], axis=1)
+    return xr.Dataset(
+        {
+            "states": (("step", "state"), path),
+            "observations": (("obs", "observable"), record),
+        },
+        coords={
+            "step": np.arange(41),
+            "state": ["position", "speed"],
+            "obs": np.arange(0, 41, 5),
+            "observable": ["position", "voltage"],
+            "time": ("step", TIMES),
+            "obs_time": ("obs", TIMES[::5]),
+        },
+    )
+
+
+@pytest.fixture(scope="session")
+def free_run(forecast):
+    """A free run at the times of the record: draws -49.5, ..., 49.5 around it."""
+    record = forecast["observed_data"].to_dataset()
+    steps = np.arange(100.0).reshape(2, 50)[:, :, None, None] - 49.5
+    group = xr.Dataset(
+        {
+            "d": (("chain", "draw", "d_time", "observable"), steps + record["d"].values + 0.25),
+            "d_rmse_of_draws": (("chain", "draw", "observable"), np.ones((2, 50, 2))),
+        },
+        coords=record.coords,
+    )
+    return xr.DataTree.from_dict({"free_run": group, "observed_data": record})

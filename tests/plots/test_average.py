@@ -62,7 +62,23 @@ def test_names_become_panels(average_in_panels):
 def test_the_legend_tells_the_probabilities(curve_average):
     figure = plot_average(curve_average).viz["figure"].item()
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["average", "linear (0.25)", "cubic (0.75)"]
+    assert labels[:3] == ["average", "linear (0.25)", "cubic (0.75)"]
+    assert labels[3:] == ["89 % interval of the average", "89 % interval of a model"]
+
+
+def test_axes_are_named_in_words_with_units(draws):
+    x = xr.DataArray([0.0, 1.0, 2.0], coords=[("u", [0.0, 1.0, 2.0], {"units": "m"})])
+
+    def labelled(posterior):
+        return (posterior["k"] * x).assign_attrs(units="N", long_name="spring force")
+
+    def restoring_force(posterior):
+        return (posterior["k"] * x).drop_attrs(deep=False)
+
+    for function, label in ((restoring_force, "restoring force"), (labelled, "spring force (N)")):
+        average = average_models(draws, {"linear": 1, "cubic": 1}, function, random_seed=1)
+        (axes,) = plot_average(average).viz["figure"].item().axes
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("u (m)", label)
 
 
 def test_two_dimensions_with_numbers_are_refused(draws):

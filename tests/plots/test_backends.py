@@ -5,6 +5,7 @@ import pytest
 from arviz_plots import PlotCollection
 
 from pymc_statespace_filters import (
+    compare_evidence,
     plot_average,
     plot_evidence,
     plot_filter_health,
@@ -12,6 +13,7 @@ from pymc_statespace_filters import (
     plot_model_probabilities,
     plot_phase,
     plot_prior_sensitivity,
+    plot_residuals,
     plot_states,
     prior_sensitivity,
 )
@@ -19,6 +21,14 @@ from pymc_statespace_filters import (
 
 def portrait(idata, **settings):
     return plot_phase(idata, "position", "speed", **settings)
+
+
+def run_free(idata, **settings):
+    return plot_forecast(idata, group="free_run", **settings)
+
+
+def errors_of(idata, **settings):
+    return plot_forecast(idata, group="free_run", errors=True, **settings)
 
 
 PLOTS = [
@@ -33,6 +43,10 @@ PLOTS = [
     (plot_forecast, "forecast"),
     (portrait, "states"),
     (plot_filter_health, "diagnostics"),
+    (plot_residuals, "diagnostics_with_inputs"),
+    (plot_states, "simulated"),
+    (run_free, "free_run"),
+    (errors_of, "free_run"),
 ]
 
 
@@ -81,10 +95,46 @@ def test_nothing_in_a_picture_overlaps(plot, table):
         assert figure.bbox.containsx(box.x1)
 
 
-@pytest.mark.parametrize(("plot", "result"), PLOTS[-4:])
+@pytest.mark.parametrize(("plot", "result"), PLOTS[2:])
 def test_the_key_is_beside_the_panels(plot, result, request):
     figure = plot(request.getfixturevalue(result)).viz["figure"].item()
     figure.canvas.draw()
     (key,) = (legend.get_window_extent() for legend in figure.legends)
     assert figure.bbox.x0 <= key.x0 < key.x1 <= figure.bbox.x1
     assert not any(key.overlaps(axes.get_tightbbox()) for axes in figure.axes)
+
+
+LONG = {name: f"a rather long name of the {name} model" for name in ("linear", "cubic", "quintic")}
+
+
+@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
+def test_a_key_of_long_names_is_inside_the_figure(backend, rivals):
+    evidences = {LONG[name]: evidence for name, evidence in rivals.items()}
+    collection = plot_prior_sensitivity(compare_evidence(evidences), backend=backend)
+    if backend == "matplotlib":
+        figure = collection.viz["figure"].item()
+        figure.canvas.draw()
+        key = figure.legends[0].get_window_extent()
+        assert figure.bbox.x0 <= key.x0 < key.x1 <= figure.bbox.x1
+    elif backend == "plotly":  # it breaks a horizontal legend into lines as wide as the figure
+        layout = collection.viz["figure"].item().layout
+        assert (layout.legend.orientation, layout.legend.yanchor) == ("h", "bottom")
+        assert layout.legend.y > 1.0
+    else:
+        panel = collection.iget_target(0, -1)
+        (key,) = panel.legend
+        assert key in panel.above
+        longest = max(len(item.label.value) for item in key.items)
+        # A letter of 11 px is 5 px wide at least.
+        assert key.ncols * (key.glyph_width + 5 * longest) <= panel.width
+
+
+@pytest.mark.parametrize("backend", ["plotly", "bokeh"])
+def test_a_short_key_is_one_line(backend, states):
+    collection = plot_states(states, backend=backend)
+    if backend == "plotly":
+        names = [trace.name for trace in collection.viz["figure"].item().data if trace.showlegend]
+        assert names == ["median", "50 %", "90 %", "data"]
+    else:
+        (key,) = collection.iget_target(0, -1).legend
+        assert key.ncols == len(key.items) == 4

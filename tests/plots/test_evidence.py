@@ -1,5 +1,7 @@
 """Log-evidences and their errors, as drawn."""
 
+from itertools import pairwise
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +9,8 @@ import xarray as xr
 
 from pymc_statespace_filters import ModelError, plot_evidence
 from pymc_statespace_filters.evidence.evidence import store_evidence
+from pymc_statespace_filters.plots.axes import linear_ticks
+from tests.plots.conftest import an_evidence
 from tests.plots.drawn import drawn
 
 
@@ -35,6 +39,40 @@ def test_numbers_beside_the_points(table, estimates):
 def test_a_small_error_is_not_written_as_none(table):
     collection = plot_evidence(table.assign(se=0.004), backend="none")
     assert drawn(collection, "text")["cubic"]["string"] == "-5.000 ± 0.004"
+
+
+def test_numbers_at_the_axis_do_not_overlap():
+    evidences = {"a": an_evidence(-4919.75, 0.004), "b": an_evidence(-4919.66, 0.004)}
+    figure = plot_evidence(evidences).viz["figure"].item()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    labels = axes.get_xticklabels()
+    assert [label.get_text() for label in labels] == [
+        "-4919.74",
+        "-4919.72",
+        "-4919.70",
+        "-4919.68",
+        "-4919.66",
+    ]
+    boxes = [label.get_window_extent() for label in labels]
+    gaps = [right.x0 - left.x1 for left, right in pairwise(boxes)]
+    assert min(gaps) > 5
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (0.0, 1.0, ["0.0", "0.5", "1.0"]),
+        (-3.0, 41.0, ["0", "20", "40"]),
+        (-0.011, 0.004, ["-0.010", "-0.005", "0.000"]),
+        (7.0, 7.0, ["7.0"]),
+        (1e6, 5e6, ["2000000", "4000000"]),
+    ],
+)
+def test_round_numbers(low, high, labels):
+    ticks = linear_ticks(low, high, 3)
+    assert ticks["labels"] == labels
+    np.testing.assert_allclose(ticks["values"], [float(label) for label in labels])
 
 
 def test_an_estimate_without_error_has_no_bar(estimates):

@@ -133,7 +133,7 @@ def test_names_of_axes_and_panels(diagnostics):
     assert found[:3] == [
         ("position", "time", "standardised residual"),
         ("position", "lag (observations)", "autocorrelation"),
-        ("position", "PIT", "ECDF minus uniform"),
+        ("position", "PIT: predicted probability below", "share below − expected"),
     ]
     assert found[3][1:] == ("time", "effective number")
 

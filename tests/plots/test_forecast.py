@@ -65,7 +65,94 @@ def test_dimensions_of_the_users_names(forecast):
     np.testing.assert_array_equal(one["speed"]["y"], other["speed"]["y"])
 
 
+@pytest.mark.parametrize("transform", [np.exp, {"position": np.exp, "speed": np.exp}])
+def test_a_function_of_predictions_record_and_truth(transform, forecast):
+    truth = np.zeros((10, 2))
+    collection = plot_forecast(forecast, truth=truth, transform=transform, backend="none")
+    band = drawn(collection, "band_90")["speed"]
+    np.testing.assert_allclose(band["y_bottom"], np.quantile(np.exp(np.arange(100)), 0.05))
+    data = drawn(collection, "data")["speed"]
+    np.testing.assert_allclose(data["y"], np.exp(np.cos(TIMES[10:31])))
+    np.testing.assert_array_equal(drawn(collection, "truth")["speed"]["y"], np.ones(10))
+    assert drawn(collection, "y_label")["speed"]["string"] == "exp(speed)"
+
+
+def test_errors_are_observations_minus_the_median(forecast):
+    truth = np.stack([np.arange(10.0), np.full(10, np.nan)], axis=1)
+    collection = plot_forecast(forecast, truth=truth, errors=True, backend="none")
+    seen = drawn(collection, "errors")
+    np.testing.assert_allclose(seen["position"]["y"], np.arange(10) - 49.5)
+    np.testing.assert_array_equal(seen["position"]["x"], TIMES[31:])
+    assert seen["speed"] is None
+    band = drawn(collection, "band_50")["speed"]
+    np.testing.assert_allclose(band["y_top"], 99 * 0.75 - 49.5)
+    np.testing.assert_allclose(drawn(collection, "median")["speed"]["y"], 0.0, atol=1e-12)
+    assert drawn(collection, "y_label")["position"]["string"] == "error of position"
+    assert not {"data", "truth", "end"} & set(collection.viz.children)
+    functions = [thing["function"] for thing in collection.viz["plot"].item(0) if "x" in thing]
+    assert functions[:4] == ["fill_between_y", "fill_between_y", "scatter", "line"]
+
+
+def test_errors_of_a_simulated_truth_at_some_of_the_times(forecast):
+    times = np.append(TIMES[:36] + 1e-12, 99.0)
+    simulated = xr.Dataset(
+        {"observations": (("obs", "observable"), np.tile(np.arange(37.0), (2, 1)).T)},
+        coords={"obs_time": ("obs", times), "observable": ["speed", "position"]},
+    )
+    seen = drawn(plot_forecast(forecast, truth=simulated, errors=True, backend="none"), "errors")
+    np.testing.assert_array_equal(seen["speed"]["x"], TIMES[31:36])
+    np.testing.assert_allclose(seen["speed"]["y"], np.arange(31, 36) - 49.5)
+
+
+def test_a_free_run_beside_the_record(free_run, forecast):
+    collection = plot_forecast(free_run, group="free_run", backend="none")
+    data = drawn(collection, "data")["speed"]
+    np.testing.assert_array_equal(data["x"], TIMES[:31])
+    np.testing.assert_allclose(data["y"], np.cos(TIMES[:31]))
+    median = drawn(collection, "median")["speed"]
+    np.testing.assert_allclose(median["y"], np.cos(TIMES[:31]) + 0.25)
+    assert "end" not in collection.viz.children  # nothing is predicted after the record
+    errors = plot_forecast(free_run, group="free_run", errors=True, backend="none")
+    np.testing.assert_allclose(drawn(errors, "errors")["speed"]["y"], -0.25)
+    truth = np.ones((31, 2))
+    errors = plot_forecast(free_run, group="free_run", truth=truth, errors=True, backend="none")
+    np.testing.assert_allclose(
+        drawn(errors, "errors")["speed"]["y"], 0.75 - np.cos(TIMES[:31])
+    )  # the truth goes before the record
+    shown = plot_forecast(free_run, group="free_run", truth=truth, backend="none")
+    np.testing.assert_array_equal(drawn(shown, "truth")["speed"]["x"], TIMES[:31])
+
+
+def test_a_free_run_on_the_second_part_of_the_record(free_run):
+    part = free_run.copy(deep=True)
+    part["free_run"] = part["free_run"].isel(d_time=slice(20, None))
+    for n_past, first in ((None, 0), (3, 17), (0, 20)):
+        data = drawn(plot_forecast(part, group="free_run", n_past=n_past, backend="none"), "data")
+        np.testing.assert_array_equal(data["speed"]["x"], TIMES[first:31])
+
+
+def test_units_of_observables(forecast):
+    forecast = forecast.copy(deep=True)
+    forecast["observed_data"]["d"].attrs["units"] = ["m", "m/s"]
+    forecast["observed_data"]["d_time"].attrs["units"] = "s"
+    axes = plot_forecast(forecast).viz["figure"].item().axes
+    assert [one.get_ylabel() for one in axes] == ["position (m)", "speed (m/s)"]
+    assert axes[-1].get_xlabel() == "time (s)"
+    label = drawn(
+        plot_forecast(forecast, truth=np.ones((10, 2)), errors=True, backend="none"), "y_label"
+    )
+    assert label["speed"]["string"] == "error of speed (m/s)"
+
+
 def test_what_is_refused(forecast):
+    with pytest.raises(ModelError, match=r"no group 'free_run': run psf.free_run\(idata, model\)"):
+        plot_forecast(forecast, group="free_run")
+    with pytest.raises(
+        ModelError, match=r"times of the predictions, 3\.1 to 4, got none: give them"
+    ):
+        plot_forecast(forecast, errors=True)
+    with pytest.raises(ModelError, match=r"transform must be among \['position', 'speed'\], got"):
+        plot_forecast(forecast, transform={"x": np.exp})
     with pytest.raises(ModelError, match=r"no group 'predictions': run psf.forecast\(idata, model"):
         plot_forecast(xr.DataTree())
     with pytest.raises(ModelError, match="idata must be a DataTree of draws, got Dataset"):

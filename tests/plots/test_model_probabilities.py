@@ -1,10 +1,12 @@
 """Probabilities, their intervals and the mark of what is undecided, as drawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from pymc_statespace_filters import ModelError, plot_model_probabilities
+from pymc_statespace_filters import ModelError, compare_evidence, plot_model_probabilities
 from tests.plots.drawn import drawn
 
 
@@ -46,6 +48,29 @@ def test_the_number(prob, text):
     )
     collection = plot_model_probabilities(one, backend="none")
     assert drawn(collection, "text")["a"]["string"] == text
+
+
+def test_the_ends_of_a_narrow_interval_are_seen(rivals):
+    precise = {name: replace(one, se=0.01) for name, one in rivals.items()}
+    table = compare_evidence(precise)
+    collection = plot_model_probabilities(table, backend="none")
+    row = table.loc["cubic"]
+    ends = drawn(collection, "ends")["cubic"]
+    low, high = row["prob_low"], row["prob_high"]
+    assert high - low < 0.02
+    np.testing.assert_array_equal(ends["x"], [low, low, np.nan, high, high])
+    np.testing.assert_allclose(ends["y"], [1.88, 2.12, np.nan, 1.88, 2.12])
+    expected = f"{row['prob']:.3f} ({low:.3f} to {high:.3f})"
+    assert drawn(collection, "text")["cubic"]["string"] == expected
+
+
+def test_the_legend_tells_what_the_bar_is(table):
+    figure = plot_model_probabilities(table).viz["figure"].item()
+    key = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert key == ["probability", "interval of the evidences' errors"]
+    unknown = plot_model_probabilities(table.assign(prob_low=np.nan, prob_high=np.nan))
+    key = [text.get_text() for text in unknown.viz["figure"].item().legends[0].get_texts()]
+    assert key == ["probability"]
 
 
 def test_unknown_intervals_are_not_drawn(table):

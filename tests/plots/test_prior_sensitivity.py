@@ -57,6 +57,59 @@ def test_widths_have_a_panel_of_their_own_with_a_logarithmic_axis():
     assert ticks["labels"] == ["0.1", "0.3", "1", "3", "10"]
 
 
+def of_widths(values, **more):
+    """Curves of two models against three widths, without those of the exponent."""
+    models = ("width", "model")
+    return xr.Dataset(
+        {
+            **{name: (("exponent", "model"), np.full((3, 2), 0.5)) for name in PROBS},
+            **{f"width_{name}": (models, np.array(values)) for name in PROBS},
+            **{name: (models, np.array(value)) for name, value in more.items()},
+        },
+        coords={"exponent": [0, 1, 2], "width": [0.1, 1.0, 10.0], "model": ["a", "b"]},
+    )
+
+
+PROBS = ("prob", "prob_low", "prob_high")
+NONE = [[np.nan, np.nan]]
+
+
+def test_a_panel_without_results_tells_why():
+    found = of_widths(
+        NONE * 3,
+        width_log_evidence=[[np.nan, -2.0], [np.nan, -2.0], [np.nan, np.nan]],
+        width_beyond=[[0.5, 0.0]] * 3,
+        width_pareto_k=[[0.2, 0.1], [0.2, 0.1], [0.2, 0.8]],
+    )
+    collection = plot_prior_sensitivity(found, backend="none")
+    note = collection.viz["note"]["width_prob"].item()
+    assert note["string"].split("\n") == [
+        "no result at any width:",
+        "a: draws reach the bounds of a",
+        "prior",
+        "b: posterior about as wide as",
+        "the prior",
+    ]
+    assert (note["x"], note["y"]) == (0.0, 0.5)
+    axes = plot_prior_sensitivity(found).viz["figure"].item().axes[1]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (
+        "width of the priors (factor)",
+        "probability of the model",
+    )
+    np.testing.assert_allclose(axes.get_xlim(), (-1.1, 1.1))
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.1", "0.3", "1", "3", "10"]
+
+
+def test_the_axis_tells_at_how_many_widths_there_is_no_result():
+    half = [[0.5, 0.5]]
+    for values, lines in ((NONE + half * 2, ["no result at 1 of 3 widths"]), (half * 3, [])):
+        collection = plot_prior_sensitivity(of_widths(values), backend="none")
+        panel = collection.viz["plot"]["width_prob"].item()
+        (label,) = (thing["string"] for thing in panel if thing["function"] == "xlabel")
+        assert label.split("\n") == ["width of the priors (factor)", *lines]
+        assert "note" not in collection.viz.children
+
+
 def test_an_evidence_without_error_leaves_curves_without_bands(rivals, table):
     unknown = table.assign(se=[np.nan, 0.1, 0.1])
     collection = plot_prior_sensitivity(unknown, backend="none")

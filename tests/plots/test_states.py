@@ -137,6 +137,143 @@ def test_many_states():
     assert collection.viz["median"]["states"].size == 12
 
 
+def many_states(n_times, at="observations"):
+    """States at so many observations, around 4499.3, observed with an error of 1e-3."""
+    times = np.arange(n_times) / 100
+    values = 4499.3 + 1e-4 * np.arange(10.0).reshape(1, 10, 1, 1) + np.zeros((1, 10, n_times, 1))
+    record = 4499.3 + 1e-3 * np.random.default_rng(1).normal(size=(n_times, 1))
+    observed = xr.Dataset(
+        {"d": (("d_time", "observable"), record)},
+        coords={"d_time": times, "observable": ["position"]},
+    )
+    return xr.DataTree.from_dict(
+        {
+            "filtered_states": states_group(values, ["position"], times, at=at),
+            "observed_data": observed,
+        }
+    )
+
+
+def test_bands_at_more_observations_than_bars_fit():
+    few, many = (plot_states(many_states(n), backend="none").viz for n in (200, 201))
+    assert "bar_90" in few.children
+    assert "band_90" not in few.children
+    assert {"band_90", "band_50", "median"} <= set(many.children)
+    assert "bar_90" not in many.children
+    assert many["band_90"]["states"].item()["x"].size == 201
+
+
+def test_points_do_not_hide_the_median():
+    sizes, opacities = [], []
+    for n_times in (40, 3200):
+        collection = plot_states(many_states(n_times, at="steps"), backend="none")
+        things = collection.viz["plot"].item(0)
+        drawn_first_to_last = [thing["function"] for thing in things if "x" in thing]
+        assert drawn_first_to_last[:4] == ["fill_between_y", "fill_between_y", "scatter", "line"]
+        point = drawn(collection, "data")["position"]
+        sizes.append(point["size"])
+        opacities.append(point["alpha"])
+    assert sizes == [16, 4]  # areas
+    assert opacities == [1.0, 0.6]
+
+
+def test_numbers_at_the_axes_are_written_in_full():
+    figure = plot_states(many_states(40)).viz["figure"].item()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    assert axes.yaxis.get_offset_text().get_text() == ""
+    assert axes.get_yticklabels()[1].get_text().startswith("4499.")
+
+
+@pytest.mark.parametrize(
+    ("transform", "data"),
+    [
+        (np.exp, SINE[::5]),
+        ({"speed": np.exp}, SINE[::5]),
+        ({"speed": np.exp, "position": np.exp}, np.exp(SINE[::5])),
+    ],
+)
+def test_a_function_of_states_and_truth(transform, data, states):
+    both = np.stack([SINE, SINE / 2], axis=1)
+    collection = plot_states(
+        states,
+        group="filtered_states",
+        observables={"speed": "position"},
+        truth=both[::5],
+        transform=transform,
+        backend="none",
+    )
+    seen = np.delete(np.arange(9), 3)
+    np.testing.assert_allclose(drawn(collection, "data")["speed"]["y"], data[seen])
+    np.testing.assert_allclose(drawn(collection, "truth")["speed"]["y"], np.exp(SINE[::5] / 2))
+    bar = np.asarray(drawn(collection, "bar_90")["speed"]["y"]).reshape(-1, 3)
+    draws = np.exp(10 * np.cos(TIMES[::5]) - np.arange(100)[:, None])
+    np.testing.assert_allclose(bar[:, 0], np.quantile(draws, 0.05, axis=0))
+    np.testing.assert_allclose(bar[:, 1], np.quantile(draws, 0.95, axis=0))
+    assert drawn(collection, "y_label")["speed"]["string"] == "exp(speed)"
+
+
+def test_transforms_that_are_refused(states):
+    with pytest.raises(ModelError, match=r"transform must be a function of an array.*got 'exp'"):
+        plot_states(states, transform="exp")
+    with pytest.raises(ModelError, match=r"transform must be among \['position', 'speed'\], got"):
+        plot_states(states, transform={"voltage": np.exp})
+    with pytest.raises(
+        ModelError, match=r"the shape it is given, \(2, 50, 41\) of 'position', got"
+    ):
+        plot_states(states, transform=lambda x: x.mean(axis=0))
+
+
+@pytest.mark.parametrize("where", ["variable", "coordinate"])
+@pytest.mark.parametrize("units", [["m", "m/s"], {"speed": "m/s", "position": "m"}])
+def test_units_of_states(where, units, states):
+    states = states.copy(deep=True)
+    states["smoothed_states"]["d_states" if where == "variable" else "state"].attrs["units"] = units
+    labels = drawn(plot_states(states, backend="none"), "y_label")
+    assert {name: label["string"] for name, label in labels.items()} == {
+        "position": "position (m)",
+        "speed": "speed (m/s)",
+    }
+    changed = plot_states(states, transform={"speed": np.square}, backend="none")
+    assert drawn(changed, "y_label")["speed"]["string"] == "square(speed)"
+
+
+def test_a_simulation(simulated):
+    collection = plot_states(simulated, backend="none")
+    path, data = drawn(collection, "path"), drawn(collection, "data")
+    assert list(path) == ["position", "speed", "voltage"]
+    np.testing.assert_array_equal(path["speed"]["x"], TIMES)
+    np.testing.assert_array_equal(path["speed"]["y"], 10 * np.cos(TIMES))
+    assert path["voltage"] is None  # no state: a panel of its own
+    assert data["speed"] is None
+    np.testing.assert_array_equal(data["position"]["y"], SINE[::5] + 0.1)
+    np.testing.assert_array_equal(data["voltage"]["x"], TIMES[::5])
+    np.testing.assert_array_equal(data["voltage"]["y"], np.arange(9))
+    axes = plot_states(simulated).viz["figure"].item().axes
+    assert [one.get_ylabel() for one in axes] == ["position", "speed", "voltage"]
+    assert axes[-1].get_xlabel() == "time"
+
+
+def test_a_simulation_with_chosen_states_and_observables(simulated):
+    moved = {"speed": "voltage", "position": "position"}
+    collection = plot_states(simulated, observables=moved, transform=np.square, backend="none")
+    assert list(drawn(collection, "path")) == ["position", "speed"]
+    np.testing.assert_array_equal(drawn(collection, "data")["speed"]["y"], np.arange(9))
+    np.testing.assert_allclose(drawn(collection, "path")["position"]["y"], SINE**2)
+    one = plot_states(simulated, states="speed", backend="none")
+    assert list(drawn(one, "path")) == ["speed"]
+    assert "data" not in one.viz.children
+
+
+def test_what_is_refused_of_a_simulation(simulated):
+    with pytest.raises(ModelError, match="a DataTree of draws or a result of simulate, got a Data"):
+        plot_states(xr.Dataset({"a": 1.0}))
+    given = {"group": "smoothed_states", "var_name": "d", "truth": SINE, "n_draws": 3}
+    for name, value in given.items():
+        with pytest.raises(ModelError, match=f"{name} is for draws of states, got it with a res"):
+            plot_states(simulated, **{name: value})
+
+
 def test_what_is_refused(states):
     with pytest.raises(ModelError, match=r"no group 'smoothed_states': run psf.smoothed_states\("):
         plot_states(xr.DataTree())

@@ -115,7 +115,13 @@ def average_models(
     label = _label(arrays, function)
     quantity = _without_samples(next(iter(arrays.values())))
     posterior = xr.Dataset(
-        {label: ((*SAMPLE_DIMS, *quantity.dims), np.concatenate(chosen)[order][None])},
+        {
+            label: (
+                (*SAMPLE_DIMS, *quantity.dims),
+                np.concatenate(chosen)[order][None],
+                quantity.attrs,
+            )
+        },
         coords={"chain": [0], "draw": np.arange(n_draws), **quantity.coords},
     ).assign_coords(model=(SAMPLE_DIMS, origin[order][None]))
     members = xr.Dataset(

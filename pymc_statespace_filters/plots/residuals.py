@@ -1,0 +1,233 @@
+"""Plot of the innovations of a filter: over time, and against what they should not depend on."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from arviz_base.labels import NoVarLabeller
+from arviz_plots import PlotCollection
+from arviz_plots.plot_collection import backend_from_object
+from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
+
+from pymc_statespace_filters.diagnostics.innovations import standardised
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots.axes import few_ticks, label_x, time_label, unit_of, with_unit
+from pymc_statespace_filters.plots.canvas import band, canvas, interval
+from pymc_statespace_filters.plots.legend import add_legend
+from pymc_statespace_filters.plots.marks import bars, point_size, points, points_xy
+from pymc_statespace_filters.plots.results import (
+    SAMPLE_DIMS,
+    data_of,
+    group_of,
+    rename_last_dims,
+    variable_of,
+)
+
+TAIL = 1.96  # of the 95 % band of a standard normal
+SEEN = {"color": "C0"}
+EXPECTED = {"color": "B3", "alpha": 0.3}
+ZERO = {"color": "B2", "width": 0.8}
+WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.1  # inches of a column, of a single one, of a panel
+N_TICKS = 4  # of the axis of predictions
+
+
+def plot_residuals(
+    idata: xr.DataTree,
+    *,
+    var_name: str | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> PlotCollection:
+    r"""Plot the innovations of a filter: observations minus their one-step-ahead predictions.
+
+    One column of panels per observable, with the innovations divided by their standard deviations.
+    Of a right model they are white noise, independent of everything before; grey is where 95 % of
+    them, or of their correlations, are expected:
+
+    * over time;
+    * their autocorrelation, within :math:`\pm 1.96 / \sqrt{J}`: what is outside is dynamics that
+      the model lacks;
+    * for a system with inputs, their correlation with each input so many observations earlier:
+      outside, that input acts otherwise than in the model;
+    * against the prediction: a curve shows a wrong restoring force or sensor law, a spread that
+      grows with the amplitude shows noise that does.
+
+    Parameters
+    ----------
+    idata : xarray.DataTree
+        With the group ``filter_diagnostics``.
+    var_name : str, optional
+        Name of the StateSpace variable, if there are several.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        Default: ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        Passed to ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``expected``, ``zero`` and ``seen`` of the variables ``innovation``,
+        ``autocorrelation``, ``prediction`` and, for each input, ``input_NAME``, along
+        ``observable``.
+
+    Raises
+    ------
+    ModelError
+        If `idata` has no such group, or `var_name` is none of its variables.
+
+    See Also
+    --------
+    plot_filter_health : the calibration of the predictions, and the particles behind them.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> record = psf.simulate(system, {"a": 0.8}, steps=range(40), random_seed=1)
+    >>> with pm.Model() as model:
+    ...     a = pm.Normal("a", 0, 0.5)
+    ...     d = psf.StateSpace(
+    ...         "d", system, psf.EKF(), steps=range(40), observed=record["observations"]
+    ...     )
+    ...     idata = psf.sample_dram(500, tune=500, random_seed=1, progressbar=False)
+    >>> idata = psf.filter_diagnostics(idata, model, random_seed=2)
+    >>> collection = psf.plot_residuals(idata)
+    >>> collection.savefig("residuals.png")  # doctest: +SKIP
+    """
+    _, results = group_of(idata, "filter_diagnostics")
+    if not any(str(name).endswith("_innovation") for name in results):
+        raise ModelError(
+            "idata's group 'filter_diagnostics' has no innovations: run "
+            "psf.filter_diagnostics(idata, model) again"
+        )
+    name = variable_of(results, var_name, "_innovation")
+    record = data_of(idata, name)
+    found = _innovations(results, name, record)
+    panels = _panels(results, name, found)
+    n_columns = found.z.sizes["observable"]
+    width = WIDTH_ALONE if n_columns == 1 else WIDTH * n_columns
+    collection = canvas(
+        panels,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aes={},
+        size=(width, 0.8 + HEIGHT * len(panels)),
+        n_panels=len(panels) * n_columns,
+        panels_in_line=n_columns,
+        cols=["__variable__", "observable"],
+    )
+    _draw_points(collection, panels)
+    _draw_correlations(collection, panels, found.z)
+    predicted = [
+        f"predicted {with_unit(str(one), unit_of(one, found.z, record))}"
+        for one in found.z["observable"].values
+    ]
+    _label_panels(collection, panels, predicted, time_label(found.z, record))
+    add_legend(collection, {"95 % if the model is right": {**EXPECTED, "width": 8}}, n_columns > 1)
+    return collection
+
+
+class Innovations(NamedTuple):
+    """Standardised innovations and the predictions, both over time and observable."""
+
+    z: xr.DataArray
+    predicted: xr.DataArray
+
+
+def _innovations(results: xr.Dataset, name: str, record: xr.DataArray | None) -> Innovations:
+    """Return standardised innovations and predictions."""
+    innovation = rename_last_dims(results[f"{name}_innovation"], "time", "observable")
+    cov = results[f"{name}_innovation_cov"].values
+    z = innovation.copy(data=standardised(innovation.values, cov))
+    if record is None:
+        predicted = results[f"{name}_predicted"].mean(SAMPLE_DIMS)
+        return Innovations(z, rename_last_dims(predicted, "time", "observable"))
+    return Innovations(z, innovation.copy(data=record.values - innovation.values))
+
+
+def _panels(results: xr.Dataset, name: str, found: Innovations) -> xr.Dataset:
+    """Return what is drawn, one variable for each row of panels."""
+    autocorrelation = results[f"{name}_autocorrelation"]
+    rows = {
+        "innovation": found.z,
+        "autocorrelation": rename_last_dims(autocorrelation, "observable"),
+    }
+    correlation = results.get(f"{name}_input_correlation")
+    if correlation is not None:
+        correlation = rename_last_dims(correlation, "observable")
+        for one in correlation["input"].values:
+            rows[f"input_{one}"] = correlation.sel(input=one, drop=True)
+    rows["prediction"] = xr.concat([found.predicted, found.z], "plot_axis").assign_coords(
+        plot_axis=["x", "y"]
+    )
+    return xr.Dataset({row: values.drop_attrs() for row, values in rows.items()})
+
+
+def _draw_points(collection: PlotCollection, panels: xr.Dataset) -> None:
+    """Draw the innovations over time and against the predictions."""
+    over_time, against = panels[["innovation"]], panels[["prediction"]]
+    bound = xr.full_like(over_time, TAIL)
+    collection.map(band, "expected", data=interval(-bound, bound), **EXPECTED)
+    collection.map(strip, "expected", data=against, **EXPECTED)
+    size = point_size(panels["innovation"])
+    collection.map(points, "seen", data=over_time, **size, **SEEN)
+    collection.map(points_xy, "seen", data=against, **size, **SEEN)
+    for rows in (over_time, against):
+        collection.map(hline, "zero", data=_zeros(rows), **ZERO)
+
+
+def _draw_correlations(collection: PlotCollection, panels: xr.Dataset, z: xr.DataArray) -> None:
+    """Draw correlations as bars over lags, with the band of as many independent pairs."""
+    bound = TAIL * z.count("time") ** -0.5
+    for row in set(panels) - {"innovation", "prediction"}:
+        lags = panels[[row]]
+        bounds = xr.ones_like(lags) * bound
+        collection.map(band, "expected", data=interval(-bounds, bounds), **EXPECTED)
+        collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
+        collection.map(hline, "zero", data=_zeros(lags), **ZERO)
+
+
+def _zeros(rows: xr.Dataset) -> xr.Dataset:
+    """Return a zero for each panel."""
+    others = [dim for dim in rows.dims if dim != "observable"]
+    return xr.zeros_like(rows.isel(dict.fromkeys(others, 0), drop=True))
+
+
+def strip(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
+    """Fill the band of a standard normal along the values on the x axis."""
+    x = da.sel(plot_axis="x").values
+    ends = np.array([np.nanmin(x), np.nanmax(x)])
+    fill = backend_from_object(target).fill_between_y
+    return fill(ends, np.full(2, -TAIL), np.full(2, TAIL), target, **kwargs)
+
+
+def _label_panels(
+    collection: PlotCollection, panels: xr.Dataset, predicted: list[str], time: str
+) -> None:
+    """Label the axes of each panel, and the columns if there are several."""
+    settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
+    for row in map(str, panels):
+        data, lag = panels[[row]], "lag (observations)"
+        x_label, y_label = {
+            "innovation": (time, "standardised innovation"),
+            "autocorrelation": (lag, "autocorrelation"),
+        }.get(row, (lag, f"correlation with {row.removeprefix('input_')}"))
+        if row == "prediction":
+            y_label = "standardised innovation"
+            texts = panels["observable"].copy(data=predicted)
+            collection.map(label_x, data=data, texts=texts, **settings)
+            collection.map(few_ticks, data=data, n_ticks=N_TICKS, **settings)
+        else:
+            collection.map(labelled_x, data=data, text=x_label, **settings)
+        collection.map(labelled_y, data=data, text=y_label, **settings)
+    if panels.sizes["observable"] > 1:
+        titles = {"labeller": NoVarLabeller(), "subset_info": True}
+        collection.map(labelled_title, data=panels[["innovation"]], **titles, **settings)
