@@ -19,7 +19,6 @@ from pymc_statespace_filters.evidence.comparison.compare import (
     compare_evidence,
 )
 from pymc_statespace_filters.evidence.comparison.probabilities import (
-    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
@@ -29,6 +28,7 @@ from pymc_statespace_filters.evidence.comparison.scaled_prior import (
     ReweightedEvidence,
     ScaledPrior,
 )
+from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 EXPONENTS = np.linspace(0, 4, 41)
