@@ -13,7 +13,13 @@ from scipy.stats import halfnorm, multivariate_normal, norm
 from pymc_statespace_filters import progress
 from pymc_statespace_filters.compiler.native import parallel_map
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov, estimate_evidence
+from pymc_statespace_filters.evidence import (
+    Evidence,
+    chib_jeliazkov,
+    compare_evidence,
+    estimate_evidence,
+    runner,
+)
 from tests.evidence.analytic import Regression, autoregressive
 
 RNG = np.random.default_rng(20)
@@ -173,7 +179,17 @@ def test_only_estimates_from_draws_are_told_that_chains_disagree(regression_mode
             idata, regression_model, estimators=("bridge", "laplace"), random_seed=1
         )
     assert "chains disagree" in beside["bridge"].doubts
-    assert beside["laplace"] == alone["laplace"]
+    assert beside["laplace"].log_evidence == alone["laplace"].log_evidence
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_evidence_tells_whether_the_likelihood_is_exact(regression_model, monkeypatch, exact):
+    """Which filters are exact for which systems is tested with the filters."""
+    monkeypatch.setattr(runner, "exactness", lambda model: exact)
+    idata = exact_draws((2, 200))
+    found = chib_jeliazkov(idata, regression_model, random_seed=1, n_proposals=200)
+    assert found.approximate is not exact
+    assert compare_evidence({"a": idata}).loc["a", "approximate"] == (not exact)
 
 
 @pytest.mark.parametrize("cores", [1, 3])
