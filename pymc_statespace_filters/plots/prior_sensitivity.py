@@ -1,5 +1,6 @@
 """Plot of model probabilities against the correction's exponent and the width of priors."""
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ LABELS = {
     "prob": "exponent α of the correction",
     "width_prob": "width of the priors (factor)",
 }
+LABEL_WIDTH = 44  # characters, of a line below a panel
 
 
 def plot_prior_sensitivity(
@@ -28,7 +30,8 @@ def plot_prior_sensitivity(
     table : pandas.DataFrame or xarray.Dataset
         The table of `compare_evidence`: one panel, the probabilities against the exponent of
         `DimensionCorrection`, ignoring the correction in the table. Or the result of
-        `prior_sensitivity`: a second panel, against the width of the priors, if it has one.
+        `prior_sensitivity`: a second panel, against the width of the priors, if it has one. Its
+        label names the priors that were left out, or because of which the panel is empty.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -80,14 +83,27 @@ def plot_prior_sensitivity(
 
 
 def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
+    labels = LABELS | {"width_prob": LABELS["width_prob"] + _about_priors(probs)}
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
-    for name in probs:
-        collection.map(labelled_x, data=probs[[name]], text=LABELS[str(name)], **settings)
-        collection.map(labelled_y, data=probs[[name]], text="probability of the model", **settings)
-    collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
-    if "width_prob" in probs:
-        ticks = logarithmic_ticks(probs["width"].values)
-        collection.map(set_xticks, data=probs[["width_prob"]], **ticks, **settings)
+    panels = probs.fillna(0.0)  # arviz_plots draws nothing, labels neither, where all is missing
+    for name in panels:
+        collection.map(labelled_x, data=panels[[name]], text=labels[str(name)], **settings)
+        collection.map(labelled_y, data=panels[[name]], text="probability of the model", **settings)
+    collection.map(set_ylim, data=panels, limits=(-0.02, 1.02), **settings)
+    if "width_prob" in panels:
+        ticks = logarithmic_ticks(panels["width"].values)
+        collection.map(set_xticks, data=panels[["width_prob"]], **ticks, **settings)
+
+
+def _about_priors(probs: xr.Dataset) -> str:
+    """Further lines of the label: priors that were left out, or that leave the panel empty."""
+    notes = {
+        "without the prior of": probs.attrs.get("width_left_out"),
+        "mostly unknown due to the prior of": probs.attrs.get("width_unknown"),
+    }
+    return "".join(
+        "\n" + fill(f"{text} {names}", LABEL_WIDTH) for text, names in notes.items() if names
+    )
 
 
 def _sensitivity(table: pd.DataFrame | xr.Dataset) -> xr.Dataset:
