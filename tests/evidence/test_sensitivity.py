@@ -230,30 +230,31 @@ class TestWhatIsRefused:
 
 
 class Undetermined:
-    """Draws of a parameter that the data determine, and of one that fills its Uniform prior."""
+    """Draws of w, which the data determine, and of k, uniform from 0 to 1."""
 
-    def __init__(self, log_evidence, **priors):
+    def __init__(self, log_evidence, upper):
         rng = np.random.default_rng(1)
-        draws = {"w": rng.normal(0.5, 0.2, SHAPE), "k": rng.uniform(0, 1, SHAPE)}
         with pm.Model() as self.model:
             pm.Normal("w", 0, 2)
-            if "k" in priors:
-                pm.Uniform("k", 0, priors["k"])
-        posterior = {rv.name: draws[rv.name] for rv in self.model.free_RVs}
-        self.idata = az.from_dict({"posterior": posterior})
+            pm.Uniform("k", 0, upper)
+        draws = {"w": rng.normal(0.5, 0.2, SHAPE), "k": rng.uniform(0, 1, SHAPE)}
+        self.idata = az.from_dict({"posterior": draws})
         store_evidence(self.idata, evidence(log_evidence), {})
+
+
+@pytest.fixture(scope="module")
+def rivals():
+    return {"tight": Undetermined(-8, upper=1), "loose": Undetermined(-9, upper=9)}
 
 
 class TestPriorsThatSpoilTheCurves:
     """In one model k fills its prior; in the other its prior is wide enough."""
 
-    def rivals(self):
-        tight, loose = Undetermined(-8, k=1), Undetermined(-9, k=9)
-        return {"tight": tight, "loose": loose, "none": Undetermined(-9)}
+    WIDTHS = (0.5, 1, 2)
 
-    def test_one_is_left_out_of_all_models_and_named(self):
+    def test_one_is_left_out_of_all_models_and_named(self, rivals):
         with pytest.warns(EvidenceWarning) as caught:
-            curves = curves_of(self.rivals())
+            curves = curves_of(rivals, widths=self.WIDTHS)
         assert len(caught) == 1
         assert caught[0].filename == __file__
         assert (
@@ -267,14 +268,14 @@ class TestPriorsThatSpoilTheCurves:
         assert curves.attrs["width_left_out"] == "k"
         assert curves.attrs["width_unknown"] == ""
         assert curves.attrs["ci_prob"] == 0.95
-        of_w = curves_of(self.rivals(), var_names="w")
+        of_w = curves_of(rivals, widths=self.WIDTHS, var_names="w")
         assert of_w["width_prob"].notnull().all()
         assert of_w.attrs["width_note"] == ""
         xr.testing.assert_equal(curves, of_w)
 
-    def test_one_that_is_asked_for_is_named_and_not_left_out(self):
+    def test_one_that_is_asked_for_is_named_and_not_left_out(self, rivals):
         for names in ("k", ["w", "k"]):
-            curves = curves_of(self.rivals(), var_names=names)
+            curves = curves_of(rivals, widths=self.WIDTHS, var_names=names)
             assert curves["width_prob"].sel(width=slice(1.01, None)).isnull().all()
             assert curves.attrs["width_left_out"] == ""
             assert curves.attrs["width_unknown"] == "k"
@@ -283,12 +284,12 @@ class TestPriorsThatSpoilTheCurves:
             )
 
     def test_priors_that_are_too_many_together(self):
-        """Each of eight alone is known at half the width, all together are not."""
+        """Each alone is known at half the width, all together are not."""
         rng = np.random.default_rng(2)
         with pm.Model() as model:
-            for i in range(8):
+            for i in range(6):
                 pm.Normal(f"x{i}", 0, 1)
-        draws = {f"x{i}": rng.normal(1.2, 0.6, SHAPE) for i in range(8)}
+        draws = {f"x{i}": rng.normal(1.2, 0.6, SHAPE) for i in range(6)}
         idata = az.from_dict({"posterior": draws})
         store_evidence(idata, evidence(-8), {})
         curves = prior_sensitivity({"a": idata}, models={"a": model}, widths=[0.5, 1])
