@@ -13,7 +13,7 @@ from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
 from rich.theme import Theme
 
-# Below this fraction of accepted proposals a bar turns red.
+# Below this fraction of accepted proposals a bar turns red, and the end of a chain has a warning.
 MIN_ACCEPT_RATE = 0.01
 
 PATIENCE = 2.0  # seconds without a progress bar

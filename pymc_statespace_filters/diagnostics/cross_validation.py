@@ -80,7 +80,9 @@ def leave_future_out(
     arviz_stats.ELPDDataLFO
         ``elpd`` with ``se``, the sampling error due to the number of observations, not that of the
         computation; ``elpd_i`` and ``pareto_k`` by time; ``refits``; ``p``, the amount by which the
-        score is below that with parameters given all observations. ``az.compare`` compares several.
+        score is below that with parameters given all observations. ``az.compare`` compares several;
+        a result with missing scores raises a `ModelError` there, because a sum over the others
+        would favour the model whose scores are missing.
 
     Raises
     ------
@@ -193,21 +195,23 @@ def _score_by_reweighting(
     elpd_i = np.where(known, scores, np.nan)
     p_i = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
     if not known.all():
-        _warn(known, good_k, min_observations)
+        message = _missing(known, good_k, min_observations)
+        warnings.warn(message, EvidenceWarning, stacklevel=3)
 
     def by_time(values: NDArray[np.float64]) -> xr.DataArray:
         time = terms.dims[-1]
         coords = {time: terms[time][min_observations:]} if time in terms.coords else {}
         return xr.DataArray(values, dims=[time], coords=coords)
 
-    return ELPDDataLFO(
+    complete = bool(known.all())
+    return (ELPDDataLFO if complete else IncompleteScores)(
         elpd=float(elpd_i.sum()),
         se=float(np.sqrt(elpd_i.size) * elpd_i.std()),
         p=float(p_i.sum()),
         n_samples=len(rows),
         n_data_points=elpd_i.size,
         scale="log",
-        warning=not known.all(),
+        warning=not complete,
         good_k=good_k,
         elpd_i=by_time(elpd_i),
         pareto_k=by_time(pareto_k),
@@ -237,17 +241,37 @@ def _efficiency(idata: xr.DataTree) -> float:
     return float(np.nanmean(np.concatenate([np.ravel(v) for v in sizes.values()])) / n_draws)
 
 
-def _warn(known: NDArray[np.bool_], good_k: float, min_observations: int) -> None:
-    last_unknown = int(np.flatnonzero(~known)[-1])
+def _missing(known: NDArray[np.bool_], good_k: float, min_observations: int) -> str:
+    """Say which scores are missing, why, and what would give them."""
+    n_missing, last_unknown = int(np.sum(~known)), int(np.flatnonzero(~known)[-1])
     least = min_observations + last_unknown + 1
     remedy = f"set min_observations={least}, or " if last_unknown < known.size - 1 else ""
-    warnings.warn(
-        f"{np.sum(~known)} of the {known.size} scores are NaN, as is their sum, because the "
+    return (
+        f"{n_missing} of the {known.size} scores are NaN, as is their sum, because the "
         f"weights of the draws are unreliable (Pareto k above {good_k:.2f}): {remedy}give refit= "
-        "to sample the posteriors given fewer observations",
-        EvidenceWarning,
-        stacklevel=4,
+        "to sample the posteriors given fewer observations"
     )
+
+
+class IncompleteScores(ELPDDataLFO):
+    """Scores of which some are NaN, because the draws do not determine them.
+
+    ``az.compare`` asks every result for its ``kind`` before it computes anything. Otherwise it
+    would end in an error about NaN, or give weights without meaning.
+    """
+
+    @property
+    def kind(self) -> str:
+        """Raise, with what would complete the scores."""
+        known = (self.pareto_k <= self.good_k).values
+        time = self.pareto_k.dims[0]
+        first = self.pareto_k[time].values[~known][:5].tolist()
+        raise ModelError(
+            f"scores cannot be compared while some are missing ({time} "
+            f"{', '.join(map(str, first))}{', ...' if (~known).sum() > 5 else ''}): "
+            f"{_missing(known, self.good_k, self.min_observations)}. All models need the same "
+            "min_observations"
+        )
 
 
 class _Refits(SamplingWrapper):

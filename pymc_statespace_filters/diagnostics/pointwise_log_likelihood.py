@@ -29,8 +29,10 @@ def compute_log_likelihood(
     r"""Evaluate the log-likelihood terms at every draw, with the draw's own noise.
 
     The terms :math:`\log p(d_j \mid d_1 \dots d_{j-1}, \theta)` are **sequential**: each is
-    conditional on all earlier observations. `leave_future_out` uses them. ``az.loo`` is invalid
-    with them, because the terms of later observations depend on the observation that is left out.
+    conditional on all earlier observations. `leave_future_out` uses them. ``az.loo``, and with it
+    ``az.compare`` of DataTrees, is invalid with them, because the terms of later observations
+    depend on the observation that is left out. ArviZ does not warn; ``elpd_i`` of its pointwise
+    result has the attribute ``terms``, which says so.
 
     The likelihood by a particle or ensemble filter is an estimate that depends on a noise seed.
     `sample_dram` stores the seed of each draw, and with it the terms add up to the estimate by

@@ -20,7 +20,8 @@ from pymc_statespace_filters.evidence.estimators.protocol import Estimator
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
 from pymc_statespace_filters.evidence.evidence import Evidence
 from pymc_statespace_filters.evidence.runner import run_estimators
-from pymc_statespace_filters.system.checks import check_positive
+from pymc_statespace_filters.parallel.cpu_affinity import cores_set_to
+from pymc_statespace_filters.system.checks import check_count, check_positive
 
 _BUILT_IN: tuple[Estimator, ...] = (
     ChibJeliazkov(),
@@ -43,6 +44,7 @@ def chib_jeliazkov(
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    cores: int | None = None,
 ) -> Evidence:
     """Estimate the evidence of a model from draws of its posterior (thesis, 3.3.2 and Eq. 3.44).
 
@@ -70,6 +72,9 @@ def chib_jeliazkov(
         Whether to store the result in the group ``evidence`` of `idata`.
     progressbar : bool
         Whether to show a progress bar if the evaluations take more than two seconds.
+    cores : int, optional
+        Number of threads, on which no number depends; by default one for each core that the process
+        may use.
 
     Returns
     -------
@@ -113,14 +118,15 @@ def chib_jeliazkov(
     >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
     True
     """
-    found = run_estimators(
-        idata,
-        model,
-        [ChibJeliazkov(n_proposals, n_blocks)],
-        random_seed=random_seed,
-        extend_inferencedata=extend_inferencedata,
-        progressbar=progressbar,
-    )
+    with cores_set_to(_checked_cores(cores)):
+        found = run_estimators(
+            idata,
+            model,
+            [ChibJeliazkov(n_proposals, n_blocks)],
+            random_seed=random_seed,
+            extend_inferencedata=extend_inferencedata,
+            progressbar=progressbar,
+        )
     return found["chib_jeliazkov"]
 
 
@@ -175,6 +181,7 @@ def estimate_evidence(
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    cores: int | None = None,
 ) -> EvidenceEstimates:
     """Estimate the evidence of a model by several estimators and test whether they agree.
 
@@ -205,6 +212,9 @@ def estimate_evidence(
         Whether to store the results in the group ``evidence`` of `idata`, dimension ``estimator``.
     progressbar : bool
         Whether to show a progress bar if the evaluations take more than two seconds.
+    cores : int, optional
+        Number of threads, on which no number depends; by default one for each core that the process
+        may use.
 
     Returns
     -------
@@ -252,8 +262,8 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
-    found = EvidenceEstimates(
-        run_estimators(
+    with cores_set_to(_checked_cores(cores)):
+        estimates = run_estimators(
             idata,
             model,
             _select_estimators(estimators, check_positive("target_se", target_se)),
@@ -261,7 +271,7 @@ def estimate_evidence(
             extend_inferencedata=extend_inferencedata,
             progressbar=progressbar,
         )
-    )
+    found = EvidenceEstimates(estimates)
     if not found.agreement:
         warnings.warn(
             f"the estimates of the log-evidence disagree: {found.agreement.diagnosis}",
@@ -269,6 +279,10 @@ def estimate_evidence(
             stacklevel=2,
         )
     return found
+
+
+def _checked_cores(cores: int | None) -> int | None:
+    return None if cores is None else check_count("cores", cores, 1)
 
 
 def _select_estimators(

@@ -1,9 +1,11 @@
 """The result `Evidence`, and the DataTree group ``evidence`` in which it is stored."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from html import escape
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
@@ -52,6 +54,10 @@ class Evidence:
     improper : str
         Names of the free variables whose prior is improper, like ``pm.Flat``, or is not normalised,
         as under an ordering transform.
+    approximate : bool, optional
+        Whether a filter's likelihood is neither exact nor unbiased for its system, as that of an
+        EKF for a nonlinear one: the evidence is then that of the filter's approximation. None if
+        unknown, as in files of earlier versions.
 
     Raises
     ------
@@ -78,6 +84,7 @@ class Evidence:
     log_volume: float = 0.0
     uniform: str = ""
     improper: str = ""
+    approximate: bool | None = None
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.log_evidence):
@@ -133,6 +140,8 @@ def store_evidence(idata: xr.DataTree, evidence: Evidence, settings: dict[str, f
     """
     record = {field.name: getattr(evidence, field.name) for field in fields(evidence)} | settings
     name = record.pop("estimator")
+    # netCDF has no None, and a missing entry of a field becomes NaN too.
+    record["approximate"] = np.nan if evidence.approximate is None else float(evidence.approximate)
     new = xr.Dataset(
         {key: ("estimator", [value]) for key, value in record.items()},
         coords={"estimator": [name]},
@@ -156,11 +165,23 @@ def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
             f"its groups are {sorted(idata.children)}"
         )
     group = idata[GROUP].to_dataset()
-    # Groups stored by earlier versions lack some fields.
-    known = [field.name for field in fields(Evidence) if field.name in group]
-    found = {}
-    for i, estimator in enumerate(map(str, group["estimator"].values)):
-        values = {key: group[key].values[i] for key in known if key != "estimator"}
-        record = {key: v.item() if hasattr(v, "item") else v for key, v in values.items()}
-        found[estimator] = Evidence(estimator=estimator, **record)
-    return found
+    names = map(str, group["estimator"].values)
+    return {one: Evidence(estimator=one, **_record(group, i)) for i, one in enumerate(names)}
+
+
+def _record(group: xr.Dataset, row: int) -> dict[str, Any]:
+    """The fields of one estimate, except its estimator.
+
+    Those with a default may be missing, or NaN, in groups stored by earlier versions.
+    """
+    record = {}
+    for one in fields(Evidence):
+        if one.name == "estimator" or one.name not in group:
+            continue
+        value = group[one.name].values[row]
+        value = value.item() if hasattr(value, "item") else value
+        if one.default is MISSING or value == value:
+            record[one.name] = value
+    if "approximate" in record:
+        record["approximate"] = bool(record["approximate"])
+    return record

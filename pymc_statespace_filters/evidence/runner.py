@@ -1,7 +1,7 @@
 """Run estimators on the draws of a model and turn each `Estimate` into an `Evidence`."""
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 from zlib import crc32
@@ -17,7 +17,11 @@ from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     N_EVALUATIONS,
     max_log_likelihood,
 )
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
+from pymc_statespace_filters.evidence.estimators.protocol import (
+    Estimate,
+    Estimator,
+    uses_draws,
+)
 from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, build_posterior
 from pymc_statespace_filters.evidence.posterior.observed_data import (
@@ -26,17 +30,19 @@ from pymc_statespace_filters.evidence.posterior.observed_data import (
 )
 from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.inspection import exactness
 from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
 from pymc_statespace_filters.pymc_model.support import Support
 
 MAXIMUM = "maximum likelihood"
 SHARED = "shared proposals"
+LESS_CERTAIN = "{} is less certain than its standard error suggests"
 
 
 def run_estimators(
     idata: xr.DataTree,
     model: pm.Model | None,
-    estimators: Iterable[Estimator],
+    estimators: Sequence[Estimator],
     *,
     random_seed: int | np.random.Generator | None,
     extend_inferencedata: bool,
@@ -49,8 +55,9 @@ def run_estimators(
     Warns
     -----
     EvidenceWarning
-        Once for all problems that do not depend on the estimator, once for each unreliable
-        estimate, and once for each estimator that cannot treat the model while another can.
+        Once for all problems that do not depend on the estimator, once for estimates that rest on
+        chains that disagree, once for each unreliable estimate, and once for each estimator that
+        cannot treat the model while another can.
     """
     if not isinstance(model, pm.Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
@@ -58,11 +65,8 @@ def run_estimators(
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = build_posterior(idata, density)
     support = Support.of(density.model)
-    common = (
-        *support.check(),
-        *check_convergence(posterior),
-        *check_discretisation(density.model, idata, posterior.draws),
-    )
+    common = (*support.check(), *check_discretisation(density.model, idata, posterior.draws))
+    of_chains = tuple(check_convergence(posterior, idata))
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
 
@@ -75,26 +79,34 @@ def run_estimators(
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
 
-    _warn("the log-evidence is less certain than its standard error suggests", common)
+    _warn(LESS_CERTAIN.format("the log-evidence"), common)
+    rest_on_draws = [one.name for one in estimators if one.name in estimates and uses_draws(one)]
+    if rest_on_draws:
+        of_which = f"the log-evidence from draws ({', '.join(rest_on_draws)})"
+        _warn(LESS_CERTAIN.format(of_which), of_chains)
     for name, refusal in refusals.items():
         _warn(f"no estimate by {name}", [str(refusal)])
     of_model = _model_fields(density.model, posterior, support)
     of_model |= {"max_log_likelihood": largest, "noise": noise}
     found = {}
     for name, estimate in estimates.items():
-        number = f"{estimate.log_evidence:.2f} ({name})"
-        _warn(
-            f"log-evidence {number} is less certain than its standard error suggests",
-            estimate.doubts,
-        )
-        if estimate.shortfall:
-            error = f"has a standard error of {estimate.se:.2g}, above target_se"
-            _warn(f"log-evidence {number} {error}", [estimate.shortfall])
-        doubts = "; ".join((*common, *estimate.doubts))
-        found[name] = Evidence(estimate.log_evidence, estimate.se, name, doubts=doubts, **of_model)
+        for message, reasons in _problems(name, estimate):
+            _warn(message, reasons)
+        doubts = (*common, *(of_chains if name in rest_on_draws else ()), *estimate.doubts)
+        numbers = estimate.log_evidence, estimate.se
+        found[name] = Evidence(*numbers, name, doubts="; ".join(doubts), **of_model)
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
     return found
+
+
+def _problems(name: str, estimate: Estimate) -> Iterator[tuple[str, Sequence[str]]]:
+    """The warnings about one estimate, each a message and its reasons, which may be none."""
+    number = f"log-evidence {estimate.log_evidence:.2f} ({name})"
+    yield LESS_CERTAIN.format(number), estimate.doubts
+    if estimate.shortfall:
+        error = f"has a standard error of {estimate.se:.2g}, above target_se"
+        yield f"{number} {error}", [estimate.shortfall]
 
 
 def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> dict[str, Any]:
@@ -106,11 +118,12 @@ def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> di
         "log_volume": support.log_volume,
         "uniform": support.uniform,
         "improper": support.improper,
+        "approximate": not exactness(model),
     }
 
 
 def _estimates(
-    estimators: Iterable[Estimator],
+    estimators: Sequence[Estimator],
     posterior: Posterior,
     stream: Callable[[str], np.random.Generator],
     announce: Callable[[str, int], None],

@@ -1,8 +1,12 @@
 """The processor cores that this process may use."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from fractions import Fraction
+
+_chosen: ContextVar[int | None] = ContextVar("chosen cores", default=None)
 
 
 def allowed_cores() -> set[int]:
@@ -13,8 +17,25 @@ def allowed_cores() -> set[int]:
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(allowed_cores())
+    """Number of cores that this process may use, or the number set by `cores_set_to`."""
+    return _chosen.get() or len(allowed_cores())
+
+
+@contextmanager
+def cores_set_to(cores: int | None) -> Iterator[None]:
+    """Set the number that `available_cores` returns inside the block; None leaves it as it is.
+
+    Examples
+    --------
+    >>> with cores_set_to(3):
+    ...     available_cores()
+    3
+    """
+    token = _chosen.set(cores)
+    try:
+        yield
+    finally:
+        _chosen.reset(token)
 
 
 def cores_per_process(process: int, allowed: Sequence[set[int]]) -> int:

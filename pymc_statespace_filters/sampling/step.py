@@ -130,7 +130,10 @@ class DRAM(BlockedStep):
         whether the chain targets the posterior itself, without the bias of a filter
 
     PyMC's logger warns at the end of a chain that hardly moved after warm-up, or whose evaluations
-    often failed.
+    often failed. PyMC calls a step method for one chain at a time, so that no chain can be compared
+    with another one: PyMC's own warning of R-hat is all that a chain in a lower mode gives rise to.
+    `sample_dram` compares the chains, and names one that stays far below the others;
+    ``idata.sample_stats.lp.median("draw")`` does so for draws of ``pm.sample``.
 
     References
     ----------

@@ -1,5 +1,7 @@
 """Scores one step ahead: exact by quadrature, whoever finds them; and what draws cannot tell."""
 
+import pickle
+
 import arviz as az
 import numpy as np
 import pytest
@@ -131,6 +133,24 @@ def test_what_the_draws_cannot_tell_is_missing(exact):
     enough = 2 + int(np.flatnonzero(unknown)[-1]) + 1
     assert f"set min_observations={enough}, or" in str(caught[0].message)
     assert np.isfinite(psf.leave_future_out(few, exact, min_observations=enough).elpd)
+
+
+def test_missing_scores_are_not_compared(exact, idata):
+    """With an estimate of the complete scores beside it; without an error it would have won."""
+    few = posterior_draws(STEPS.size, np.random.default_rng(1), (2, 50))
+    with pytest.warns(EvidenceWarning, match="scores are NaN") as caught:
+        found = psf.leave_future_out(few, exact, min_observations=2)
+    complete = psf.leave_future_out(idata, exact, min_observations=2)
+    first = int(found.elpd_i["d_time"][np.isnan(found.elpd_i)][0])
+    for round_to in ("auto", "none"):
+        with pytest.raises(ModelError) as refused:
+            az.compare({"few": found, "many": complete}, round_to=round_to)
+        assert f"some are missing (d_time {first}" in str(refused.value)
+        assert str(caught[0].message) in str(refused.value)  # which names the remedies
+    assert isinstance(found, az.ELPDDataLFO)
+    assert "nan" in repr(found)
+    assert "lfo" in repr(found)
+    assert np.isnan(pickle.loads(pickle.dumps(found)).elpd)
 
 
 def test_stored_terms_are_used_if_they_are_sequential_and_ours(exact, idata):

@@ -84,6 +84,15 @@ def test_they_say_that_they_are_sequential(terms, tmp_path):
     terms.to_dataset().to_netcdf(tmp_path / "terms.nc")
 
 
+@pytest.mark.filterwarnings("ignore:.*Pareto")
+def test_arviz_passes_this_on(idata, terms):
+    """It does not warn, and computes scores; a row that is missing has no term."""
+    seen = terms.to_dataset().isel(d_time=[0, 1])
+    posterior = idata["posterior"].to_dataset()
+    tree = xr.DataTree.from_dict({"posterior": posterior, "log_likelihood": seen})
+    assert az.loo(tree, pointwise=True).elpd_i.attrs["terms"] == terms["d"].attrs["terms"]
+
+
 def test_pymc_gives_all_draws_one_seed(model, idata, terms):
     of_pymc = pm.compute_log_likelihood(
         idata.copy(), model=model, progressbar=False, extend_inferencedata=False

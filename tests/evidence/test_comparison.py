@@ -12,12 +12,12 @@ from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, comp
 from pymc_statespace_filters.evidence.evidence import store_evidence
 
 COLUMNS = [
-    "log_evidence",
-    "se",
-    "correction",
     "prob",
     "prob_low",
     "prob_high",
+    "log_evidence",
+    "se",
+    "correction",
     "log_bayes_factor",
     "n_parameters",
     "n_observations",
@@ -28,6 +28,8 @@ COLUMNS = [
     "prior",
     "strength",
     "warning",
+    "max_log_likelihood",
+    "approximate",
 ]
 
 

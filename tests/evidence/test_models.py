@@ -1,5 +1,6 @@
 """Evidence of PyMC models: conjugate, transformed, truncated; exact draws and sampled ones."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
 import arviz as az
@@ -10,8 +11,15 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal, norm
 
 from pymc_statespace_filters import progress
+from pymc_statespace_filters.compiler.native import parallel_map
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
+from pymc_statespace_filters.evidence import (
+    Evidence,
+    chib_jeliazkov,
+    compare_evidence,
+    estimate_evidence,
+    runner,
+)
 from tests.evidence.analytic import Regression, autoregressive
 
 RNG = np.random.default_rng(20)
@@ -156,6 +164,60 @@ def test_chains_that_disagree_are_a_warning(regression_model):
     idata["posterior"]["w"][0, :, -1] += 0.1
     with pytest.warns(EvidenceWarning, match="chains disagree"):
         chib_jeliazkov(idata, regression_model, random_seed=1)
+
+
+def test_only_estimates_from_draws_are_told_that_chains_disagree(regression_model, recwarn):
+    idata = exact_draws((2, 1000))
+    idata["posterior"]["w"][0, :, -1] += 0.1
+    alone = estimate_evidence(
+        idata, regression_model, estimators=("tempered_smc", "laplace"), random_seed=1
+    )
+    assert not any("chains disagree" in str(one.message) for one in recwarn)
+    assert not any("chains disagree" in one.doubts for one in alone.values())
+    with pytest.warns(EvidenceWarning, match=r"from draws \(bridge\) .* the chains disagree \(R-"):
+        beside = estimate_evidence(
+            idata, regression_model, estimators=("bridge", "laplace"), random_seed=1
+        )
+    assert "chains disagree" in beside["bridge"].doubts
+    assert beside["laplace"].log_evidence == alone["laplace"].log_evidence
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_evidence_tells_whether_the_likelihood_is_exact(regression_model, monkeypatch, exact):
+    """Which filters are exact for which systems is tested with the filters."""
+    monkeypatch.setattr(runner, "exactness", lambda model: exact)
+    idata = exact_draws((2, 200))
+    found = chib_jeliazkov(idata, regression_model, random_seed=1, n_proposals=200)
+    assert found.approximate is not exact
+    assert compare_evidence({"a": idata}).loc["a", "approximate"] == (not exact)
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_the_number_of_threads_changes_no_number(regression_model, monkeypatch, cores):
+    pools = []
+
+    def pool(n_threads):
+        pools.append(n_threads)
+        return ThreadPoolExecutor(n_threads)
+
+    monkeypatch.setattr(parallel_map, "ThreadPoolExecutor", pool)
+    idata = exact_draws((2, 500))
+    settings = {"n_proposals": 400, "random_seed": 1}
+    of_cores = chib_jeliazkov(idata, regression_model, cores=cores, **settings)
+    assert set(pools) == {cores}
+    assert chib_jeliazkov(idata, regression_model, **settings) == of_cores
+    pools.clear()
+    settings = {"estimators": "bridge", "random_seed": 1}
+    of_cores = estimate_evidence(idata, regression_model, cores=cores, **settings)
+    assert set(pools) == {cores}
+    assert estimate_evidence(idata, regression_model, **settings) == of_cores
+
+
+@pytest.mark.parametrize("cores", [0, -1, 1.5, "two"])
+def test_bad_numbers_of_threads(regression_model, cores):
+    for function in (chib_jeliazkov, estimate_evidence):
+        with pytest.raises(ModelError, match=r"cores must be an integer of at least 1, got"):
+            function(exact_draws((2, 20)), regression_model, cores=cores)
 
 
 def test_halves_that_disagree_are_a_warning(regression_model):

@@ -1,5 +1,8 @@
 """From draws in a DataTree to the unconstrained space of their model."""
 
+import math
+import re
+
 import arviz as az
 import numpy as np
 import pymc as pm
@@ -181,3 +184,31 @@ def test_a_parameter_that_does_not_vary_hides_no_disagreement():
     values[1, :, 1] += 10
     (doubt,) = check_convergence(Posterior(values, values[..., 1], lambda x, rng: x[:, 1]))
     assert "the chains disagree" in doubt
+
+
+def normal_chains(shift):
+    """Four chains of 500 independent draws, the last shifted; and their log-densities."""
+    values = np.random.default_rng(1).standard_normal((4, 500, 1))
+    values[3] += shift
+    return Posterior(values, -0.5 * values[..., 0] ** 2, lambda x, rng: -0.5 * x[:, 0] ** 2)
+
+
+def test_chains_that_disagree_are_told_how_many_more_draws_would_do():
+    posterior = normal_chains(2.0)
+    (doubt,) = check_convergence(posterior)
+    ess = float(az.ess(posterior.draws[..., 0]))
+    assert 5 < ess < 50
+    assert f"effective sample size is {ess:.0f}; about {math.ceil(400 / ess)} times as" in doubt
+    assert "until_ess" not in doubt
+    drawn_by_dram = xr.DataTree()
+    drawn_by_dram.attrs["refresh_noise"] = 1
+    (doubt,) = check_convergence(posterior, drawn_by_dram)
+    assert "would give 400 (until_ess=400 of sample_dram)" in doubt
+    assert not list(check_convergence(normal_chains(0.0)))
+
+
+def test_a_chain_far_below_the_others_needs_no_more_draws():
+    (doubt,) = check_convergence(normal_chains(50.0))
+    assert re.search(r"chain 3 stayed 1\d{3} nats below chain \d \(median log-density\)", doubt)
+    assert "initvals" in doubt
+    assert "times as many" not in doubt

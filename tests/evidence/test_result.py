@@ -13,7 +13,7 @@ from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
 from pymc_statespace_filters.evidence.evidence import store_evidence, stored_evidences
 
 EVIDENCE = Evidence(-8.0, 0.1, "bridge", 2, 21, -5.0, "0c5f")
-TOLD = replace(EVIDENCE, log_volume=5.3, uniform="a, b", improper="c")
+TOLD = replace(EVIDENCE, log_volume=5.3, uniform="a, b", improper="c", approximate=True)
 
 
 def empty():
@@ -30,9 +30,22 @@ def test_what_is_stored_is_read(evidence):
 def test_a_group_of_an_earlier_version_is_read():
     idata = empty()
     store_evidence(idata, TOLD, {})
-    older = idata["evidence"].to_dataset().drop_vars(["log_volume", "uniform", "improper"])
-    idata["evidence"] = xr.DataTree(older)
+    recent = ["log_volume", "uniform", "improper", "approximate"]
+    idata["evidence"] = xr.DataTree(idata["evidence"].to_dataset().drop_vars(recent))
     assert stored_evidences(idata, "a") == {EVIDENCE.estimator: EVIDENCE}
+    # Beside an estimate of this version, which has them.
+    newer = replace(TOLD, estimator="chib_jeliazkov")
+    store_evidence(idata, newer, {})
+    assert stored_evidences(idata, "a") == {"bridge": EVIDENCE, "chib_jeliazkov": newer}
+
+
+@pytest.mark.parametrize("approximate", [None, False, True])
+def test_a_file_holds_all_fields(tmp_path, approximate):
+    idata, evidence = empty(), replace(TOLD, approximate=approximate)
+    store_evidence(idata, evidence, {"scale": 1.0})
+    idata.to_netcdf(tmp_path / "draws.nc")
+    with xr.open_datatree(tmp_path / "draws.nc") as read:
+        assert stored_evidences(read, "a") == {evidence.estimator: evidence}
 
 
 def test_every_field_is_in_the_group():

@@ -7,6 +7,7 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
@@ -16,7 +17,7 @@ from pymc_statespace_filters import (
     compare_evidence,
     prior_sensitivity,
 )
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.evidence.analytic import Regression
@@ -226,3 +227,72 @@ class TestWhatIsRefused:
             prior_sensitivity(RIVALS, prior={"small": 1})
         with pytest.raises(ModelError, match="evidences"):
             prior_sensitivity({"a": 3.0})
+
+
+class Undetermined:
+    """Draws of w, which the data determine, and of k, uniform from 0 to 1."""
+
+    def __init__(self, log_evidence, upper):
+        rng = np.random.default_rng(1)
+        with pm.Model() as self.model:
+            pm.Normal("w", 0, 2)
+            pm.Uniform("k", 0, upper)
+        draws = {"w": rng.normal(0.5, 0.2, SHAPE), "k": rng.uniform(0, 1, SHAPE)}
+        self.idata = az.from_dict({"posterior": draws})
+        store_evidence(self.idata, evidence(log_evidence), {})
+
+
+@pytest.fixture(scope="module")
+def rivals():
+    return {"tight": Undetermined(-8, upper=1), "loose": Undetermined(-9, upper=9)}
+
+
+class TestPriorsThatSpoilTheCurves:
+    """In one model k fills its prior; in the other its prior is wide enough."""
+
+    WIDTHS = (0.5, 1, 2)
+
+    def test_one_is_left_out_of_all_models_and_named(self, rivals):
+        with pytest.warns(EvidenceWarning) as caught:
+            curves = curves_of(rivals, widths=self.WIDTHS)
+        assert len(caught) == 1
+        assert caught[0].filename == __file__
+        assert (
+            str(caught[0].message)
+            == curves.attrs["width_note"]
+            == (
+                "The prior of k keeps its width: in 'tight' the posterior reaches the end of the "
+                "support, and no draws lie beyond it."
+            )
+        )
+        assert curves.attrs["width_left_out"] == "k"
+        assert curves.attrs["width_unknown"] == ""
+        assert curves.attrs["ci_prob"] == 0.95
+        of_w = curves_of(rivals, widths=self.WIDTHS, var_names="w")
+        assert of_w["width_prob"].notnull().all()
+        assert of_w.attrs["width_note"] == ""
+        xr.testing.assert_equal(curves, of_w)
+
+    def test_one_that_is_asked_for_is_named_and_not_left_out(self, rivals):
+        for names in ("k", ["w", "k"]):
+            curves = curves_of(rivals, widths=self.WIDTHS, var_names=names)
+            assert curves["width_prob"].sel(width=slice(1.01, None)).isnull().all()
+            assert curves.attrs["width_left_out"] == ""
+            assert curves.attrs["width_unknown"] == "k"
+            assert curves.attrs["width_note"].startswith(
+                "The prior of k leaves most widths unknown"
+            )
+
+    def test_priors_that_are_too_many_together(self):
+        """Each alone is known at half the width, all together are not."""
+        rng = np.random.default_rng(2)
+        with pm.Model() as model:
+            for i in range(6):
+                pm.Normal(f"x{i}", 0, 1)
+        draws = {f"x{i}": rng.normal(1.2, 0.6, SHAPE) for i in range(6)}
+        idata = az.from_dict({"posterior": draws})
+        store_evidence(idata, evidence(-8), {})
+        curves = prior_sensitivity({"a": idata}, models={"a": model}, widths=[0.5, 1])
+        assert curves["width_prob"].sel(width=0.5).isnull().all()
+        assert curves.attrs["width_unknown"] == "several parameters of 'a' together"
+        assert "name fewer of them in var_names" in curves.attrs["width_note"]

@@ -110,6 +110,31 @@ def test_the_axis_tells_at_how_many_widths_there_is_no_result():
         assert "note" not in collection.viz.children
 
 
+@pytest.mark.parametrize(
+    ("attrs", "lines"),
+    [
+        ({}, ["width of the priors (factor)"]),
+        ({"width_left_out": "k, c"}, ["width of the priors (factor)", "without the prior of k, c"]),
+        (
+            {"width_left_out": "", "width_unknown": "k"},
+            ["width of the priors (factor)", "mostly unknown due to the prior of k"],
+        ),
+    ],
+)
+def test_the_panel_of_widths_names_the_priors_that_it_is_without(attrs, lines):
+    values = np.full((3, 2), np.nan if attrs.get("width_unknown") else 0.5)
+    curves = {f"{of}prob{end}": values for of in ("", "width_") for end in ("", "_low", "_high")}
+    dims = {True: ("width", "model"), False: ("exponent", "model")}
+    found = xr.Dataset(
+        {name: (dims[name.startswith("width")], curve) for name, curve in curves.items()},
+        coords={"exponent": [0, 1, 2], "width": [0.5, 1, 2], "model": ["a", "b"]},
+        attrs=attrs,
+    )
+    collection = plot_prior_sensitivity(found, backend="none")
+    panel = collection.viz["plot"]["width_prob"].item()
+    assert [one["string"].split("\n") for one in panel if one["function"] == "xlabel"] == [lines]
+
+
 def test_an_evidence_without_error_leaves_curves_without_bands(rivals, table):
     unknown = table.assign(se=[np.nan, 0.1, 0.1])
     collection = plot_prior_sensitivity(unknown, backend="none")

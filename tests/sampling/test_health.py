@@ -48,6 +48,12 @@ def both_ways(model, caplog, **settings):
             "accepted 0 of 100 proposals",
             "proposal_cov",
         ),
+        (  # frozen proposals so wide that 0.6 to 0.7 % are accepted
+            simple_model(),
+            {"proposal_cov": 8.5**2 * np.eye(2), "stages": 1, "draws": 4000, "tune": 0},
+            "of 4000 proposals after warm-up: the chain hardly moves",
+            "proposal_cov",
+        ),
         (runaway(), {"draws": 500, "tune": 1000}, "proposals of free have become", "proper prior"),
         (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "truncated"),
     ],
@@ -102,6 +108,15 @@ def test_a_stay_of_a_fifth_of_the_draws_is_said():
     # Of few draws a fifth is soon passed by chance.
     few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])
     assert closing_warning(PhaseStatistics.from_draws(draws_with(few), 0, len(few))) is None
+
+
+def test_a_chain_hardly_moves_below_the_rate_at_which_its_bar_turns_red():
+    stages = np.zeros(6000, dtype=int)
+    stages[:: 6000 // 59] = 1
+    record = PhaseStatistics.from_draws(draws_with(stages[:5950]), 0, 5950)
+    assert record.moved == 59
+    assert "accepted 59 of 5950 proposals" in closing_warning(record).message
+    assert closing_warning(record._replace(iterations=5900)) is None
 
 
 def test_growth_below_the_limit_is_silent():

@@ -79,13 +79,22 @@ def test_it_is_for_those_who_watch(report_of, progressbar, level, capfd):
     assert "chains of" not in capfd.readouterr().out
 
 
-def test_a_chain_in_a_lower_mode_is_named(report_of):
-    record, _, messages = report_of(two_modes(1290.0), draws=500, **IN_BOTH)
+@pytest.mark.parametrize("adaptation", ["chain", "continuous"])
+def test_a_chain_in_a_lower_mode_is_named(report_of, adaptation):
+    record, _, messages = report_of(two_modes(1290.0), draws=500, adaptation=adaptation, **IN_BOTH)
     assert "Chain 1 stayed 1290 nats below chain 0 (median log-density)." in record.message
     assert "Chain 0 " not in record.message
     assert "find_starts" in record.message
     (warning,) = [text for text in messages if text.startswith("Chain 1: ")]
     assert "1290 nats below that of chain 0" in warning
+
+
+def test_chains_share_a_warm_up_which_leads_out_of_a_lower_mode(report_of):
+    """Continuous adaptation alone leaves it 1290 nats below."""
+    settings = IN_BOTH | {"tune": 300, "adaptation": "continuous"}
+    record, tree, _ = report_of(two_modes(1290.0), draws=500, **settings)
+    assert "nats below" not in record.message
+    assert float(tree["sample_stats"]["lp"].median("draw").min()) > -5.0
 
 
 def test_modes_of_one_height_are_no_shortfall(report_of):

@@ -1,19 +1,60 @@
 """Convergence of the chains, on which every estimate from their draws relies."""
 
+import math
 from collections.abc import Iterator
 
 import arviz as az
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 
 MAX_RHAT = 1.05
+# Effective draws of all chains with which R-hat and ESS are reliable (Vehtari et al. 2021).
+ENOUGH_EFFECTIVE = 400
+# Nats, plus one for each parameter, by which the median log-density of a chain may lie below that
+# of another: the log-density of a Gaussian posterior has a standard deviation of (d / 2)^(1 / 2).
+TOLERATED_SHORTFALL = 10.0
 
 
-def check_convergence(posterior: Posterior) -> Iterator[str]:
-    """Yield a reason to distrust every estimate if the chains disagree."""
+def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) -> Iterator[str]:
+    """Yield a reason to distrust every estimate from the draws if the chains disagree.
+
+    As a rule of thumb, the effective sample size grows with the number of draws: the factor by
+    which draws are missing is `ENOUGH_EFFECTIVE` over the smallest one, at least 2. More draws do
+    not help where a chain stays far below another one. ``idata`` tells which sampler drew them.
+    """
+    parameters = np.moveaxis(posterior.draws, -1, 0)
     with np.errstate(invalid="ignore"):  # R-hat of a constant parameter is 0 / 0
-        rhats = [float(az.rhat(values)) for values in np.moveaxis(posterior.draws, -1, 0)]
+        rhats = [float(az.rhat(values)) for values in parameters]
     rhat = max((one for one in rhats if not np.isnan(one)), default=1.0)
-    if rhat > MAX_RHAT:
-        yield f"the chains disagree (R-hat {rhat:.2f}): run them longer"
+    if rhat <= MAX_RHAT:
+        return
+    found = f"the chains disagree (R-hat {rhat:.2f})"
+    if low := _lower_chain(posterior.log_density, len(parameters)):
+        yield f"{found}: {low}: start it where the others are (initvals), or tune longer"
+        return
+    ess = min(float(az.ess(v)) for v, one in zip(parameters, rhats, strict=True) if one > MAX_RHAT)
+    factor = max(2, math.ceil(ENOUGH_EFFECTIVE / max(ess, 1.0)))
+    how = f" (until_ess={ENOUGH_EFFECTIVE} of sample_dram)" if _drawn_by_us(idata) else ""
+    yield (
+        f"{found}: their effective sample size is {ess:.0f}; about {factor} times as many draws "
+        f"would give {ENOUGH_EFFECTIVE}{how}. If R-hat stays above {MAX_RHAT}, start the chains "
+        "elsewhere (initvals) or tune longer"
+    )
+
+
+def _lower_chain(log_density: NDArray[np.float64], n_parameters: int) -> str:
+    """Name the chain that stays furthest below the highest one, if it is too far; else empty."""
+    levels = np.median(log_density, axis=1)
+    low, high = int(levels.argmin()), int(levels.argmax())
+    below = levels[high] - levels[low]
+    if not below > TOLERATED_SHORTFALL + n_parameters:
+        return ""
+    return f"chain {low} stayed {below:.0f} nats below chain {high} (median log-density)"
+
+
+def _drawn_by_us(idata: xr.DataTree | None) -> bool:
+    """Whether the draws are those of `sample_dram`, which notes whether they are exact."""
+    return idata is not None and "refresh_noise" in idata.attrs

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,13 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.probabilities import (
-    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
-    select_evidences,
 )
+from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike, select_evidences
+from pymc_statespace_filters.evidence.comparison.sentences import needs_warning, sentences
+from pymc_statespace_filters.evidence.comparison.table import EvidenceTable
 from pymc_statespace_filters.evidence.evidence import Evidence
 
 # Kass and Raftery (1995), section 3.2: lower limits of twice the log Bayes factor.
@@ -75,7 +76,7 @@ def compare_evidence(
     correction: DimensionCorrection | None = None,
     ci_prob: float = 0.95,
     estimator: str | None = None,
-) -> pd.DataFrame:
+) -> EvidenceTable:
     """Compare models by their evidences: probabilities, Bayes factors and criteria (Eq. 3.3).
 
     Parameters
@@ -90,20 +91,25 @@ def compare_evidence(
     ci_prob : float
         Probability of the intervals.
     estimator : str, optional
-        Estimator whose evidences are compared, such as ``"bridge"``, if the models have several.
+        Estimator whose evidences are compared, such as ``"bridge"``, if the models have several. By
+        default the estimates of each model must agree. Of the estimators that all models with
+        several have, the one with the smallest standard errors is then taken, of those whose
+        estimates have no ``doubts`` if there are any.
 
     Returns
     -------
     pandas.DataFrame
-        Index ``model``, most probable first. Columns:
+        Index ``model``, most probable first. Its display shows the first five columns, and below
+        them sentences: which estimator was chosen, what is undecided, how AIC and BIC disagree with
+        the evidence, and the reason of each warning. ``table.to_string()`` shows all columns:
 
+        ``prob``, ``prob_low``, ``prob_high``
+            Probability, and its central interval under normal errors of the log-evidences (from
+            50 000 fixed draws, so that the same evidences give the same table).
         ``log_evidence``, ``se``
             As estimated, without prior and correction.
         ``correction``
             The term that the correction adds to the log-evidence.
-        ``prob``, ``prob_low``, ``prob_high``
-            Probability, and its central interval under normal errors of the log-evidences (from
-            50 000 fixed draws, so that the same evidences give the same table).
         ``log_bayes_factor``
             Log-evidence minus that of the first row.
         ``n_parameters``, ``n_observations``
@@ -130,6 +136,11 @@ def compare_evidence(
         ``warning``
             Whether the evidence has ``doubts``, no standard error, an improper prior, or chains
             that held a noise seed, whose error ``se`` excludes.
+        ``max_log_likelihood``
+            The largest log-likelihood found, as in `Evidence`.
+        ``approximate``
+            Whether the likelihood is a filter's approximation, neither exact nor unbiased; missing
+            where this is unknown, as in files of earlier versions.
 
         If an evidence has no standard error (``se`` is NaN, as for Laplace's), the probabilities
         are those of the estimates, and all intervals are NaN, because each depends on every
@@ -138,7 +149,8 @@ def compare_evidence(
     Raises
     ------
     ModelError
-        If an argument is invalid, or a model has several evidences and no estimator is chosen.
+        If an argument is invalid; if no estimator is chosen and several estimates of a model
+        disagree, or none of them has a standard error.
     DataMismatchError
         If the models belong to different data.
 
@@ -162,18 +174,35 @@ def compare_evidence(
     {'cubic': 0.881, 'linear': 0.119}
     >>> table.loc["linear", "strength"]
     'positive'
+    >>> table
+            prob prob_low prob_high log_evidence     se
+    model
+    cubic  0.881    0.875     0.887      -39.000  0.020
+    linear 0.119    0.113     0.125      -41.000  0.020
+    Further columns, shown by .to_string(): correction, log_bayes_factor,
+      n_parameters, n_observations, bic, undecided, aic, log_evidence_flat, prior,
+      strength, warning, max_log_likelihood, approximate.
     """
-    found = select_evidences(evidences, estimator)
+    found, how_chosen = select_evidences(evidences, estimator)
     check_ci_prob(ci_prob)
     if not (correction is None or isinstance(correction, DimensionCorrection)):
         raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")
-    names, models = list(found), list(found.values())
-    weights = prior_weights(prior, names)
+    weights = prior_weights(prior, list(found))
     _warn_of_improper(found)
+    added = [correction.log_prior(one) if correction else 0.0 for one in found.values()]
+    table = _columns(found, weights, np.array(added), ci_prob)
+    in_order = {name: found[name] for name in table.index}
+    said = [how_chosen] if how_chosen else []
+    return EvidenceTable(table, sentences=[*said, *sentences(table, in_order, ci_prob)])
 
+
+def _columns(
+    found: Mapping[str, Evidence], weights: Array, added: Array, ci_prob: float
+) -> pd.DataFrame:
+    """All columns, most probable model first, for prior weights and corrections of the models."""
+    models = list(found.values())
     log_evidence = np.array([one.log_evidence for one in models])
     se = np.array([one.se for one in models])
-    added = np.array([correction.log_prior(one) if correction else 0.0 for one in models])
     log_weight = log_evidence + added + np.log(weights)
     probs = probabilities(log_weight, se, ci_prob)
     best = int(np.argmax(log_weight))
@@ -181,12 +210,12 @@ def compare_evidence(
     log_bayes_factor = log_evidence - log_evidence[best]
     table = pd.DataFrame(
         {
-            "log_evidence": log_evidence,
-            "se": se,
-            "correction": added,
             "prob": probs.prob,
             "prob_low": probs.low,
             "prob_high": probs.high,
+            "log_evidence": log_evidence,
+            "se": se,
+            "correction": added,
             "log_bayes_factor": log_bayes_factor,
             "n_parameters": [one.n_parameters for one in models],
             "n_observations": [one.n_observations for one in models],
@@ -196,18 +225,21 @@ def compare_evidence(
             "log_evidence_flat": [one.log_evidence + one.log_volume for one in models],
             "prior": weights,
             "strength": _strength(-log_bayes_factor, error, best),
-            "warning": [_needs_warning(one) for one in models],
+            "warning": [needs_warning(one) for one in models],
+            "max_log_likelihood": [one.max_log_likelihood for one in models],
+            "approximate": _approximate(models),
         },
-        index=pd.Index(names, name="model"),
+        index=pd.Index(found, name="model"),
     )
     return table.iloc[np.argsort(-log_weight, kind="stable")]
 
 
-def _needs_warning(evidence: Evidence) -> bool:
-    """Whether the evidence is less reliable than its standard error suggests."""
-    return bool(
-        evidence.doubts or evidence.improper or math.isnan(evidence.se) or evidence.noise == "held"
-    )
+def _approximate(models: Sequence[Evidence]) -> pd.api.extensions.ExtensionArray | list[bool]:
+    """Whether each likelihood is an approximation; missing where it is unknown."""
+    known = [one.approximate for one in models if one.approximate is not None]
+    if len(known) == len(models):
+        return known
+    return pd.array([one.approximate for one in models], dtype="boolean")
 
 
 def _warn_of_improper(found: Mapping[str, Evidence]) -> None:

@@ -4,8 +4,8 @@ The model probabilities of the thesis depend strongly on its correction for the 
 (after Eq. 3.7), and on the priors. These curves show both.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+import warnings
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -13,22 +13,19 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.compare import (
     DimensionCorrection,
     compare_evidence,
 )
 from pymc_statespace_filters.evidence.comparison.probabilities import (
-    EvidenceLike,
     check_ci_prob,
     prior_weights,
     probabilities,
 )
-from pymc_statespace_filters.evidence.comparison.scaled_prior import (
-    UNCHANGED,
-    ReweightedEvidence,
-    ScaledPrior,
-)
+from pymc_statespace_filters.evidence.comparison.scaled_prior import ReweightedEvidence
+from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike
+from pymc_statespace_filters.evidence.comparison.width_curve import WidthCurves, width_curves
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 EXPONENTS = np.linspace(0, 4, 41)
@@ -36,7 +33,6 @@ WIDTHS = np.geomspace(0.25, 4, 17)
 REQUIRED_COLUMNS = ("log_evidence", "se", "n_parameters", "n_observations", "prior")
 
 Array = NDArray[np.float64]
-Reweighting = Callable[[float], ReweightedEvidence]
 
 
 def prior_sensitivity(
@@ -72,7 +68,8 @@ def prior_sensitivity(
     widths : array_like of float, optional
         Positive factors w, one-dimensional; 0.25 to 4 by default.
     var_names : str or iterable of str, optional
-        The free variables whose priors are scaled, in the models that have them; all by default.
+        The free variables whose priors are scaled, in the models that have them. By default all,
+        except those that alone would leave half of the widths or more unknown.
     prior, ci_prob, estimator
         As for `compare_evidence`.
 
@@ -94,6 +91,11 @@ def prior_sensitivity(
         of a bounded support, provided that likelihood and prior do not increase outwards from
         there. Where one evidence is NaN, the probabilities of all models are.
 
+        The attribute ``width_left_out`` names the priors that keep their width, in all models,
+        because the draws of one do not determine the evidence under another width.
+        ``width_unknown`` names those that leave most widths unknown although they are scaled,
+        because `var_names` asks for it or there are no others. ``width_note`` gives the reasons.
+
     Raises
     ------
     ModelError
@@ -101,6 +103,11 @@ def prior_sensitivity(
         a probability, an angle, a simplex or a covariance.
     DataMismatchError
         If the models belong to different data, or the draws to another model.
+
+    Warns
+    -----
+    EvidenceWarning
+        If a prior is left out.
 
     Examples
     --------
@@ -136,11 +143,18 @@ def prior_sensitivity(
             "models must be given with widths or var_names: the pm.Model of each idata"
         )
     names = list(table.index)
-    reweighted = None if models is None else _reweightings(evidences, models, names, var_names)
+    curves = models and _width_curves(evidences, models, names, var_names, factors)
     found = _over_exponents(table, alphas, ci_prob)
-    if reweighted is not None:
-        found = found.merge(_over_widths(table, reweighted, factors, ci_prob))
-    return found.assign_attrs(ci_prob=ci_prob)
+    if not curves:
+        return found.assign_attrs(ci_prob=ci_prob)
+    if curves.left_out:
+        warnings.warn(curves.note, EvidenceWarning, stacklevel=2)
+    return found.merge(_over_widths(table, curves.points, factors, ci_prob)).assign_attrs(
+        ci_prob=ci_prob,
+        width_left_out=curves.left_out,
+        width_unknown=curves.unknown,
+        width_note=curves.note,
+    )
 
 
 def _over_exponents(table: pd.DataFrame, exponents: Array, ci_prob: float) -> xr.Dataset:
@@ -152,9 +166,12 @@ def _over_exponents(table: pd.DataFrame, exponents: Array, ci_prob: float) -> xr
 
 
 def _over_widths(
-    table: pd.DataFrame, reweighted: Mapping[str, Reweighting], widths: Array, ci_prob: float
+    table: pd.DataFrame,
+    of_models: Mapping[str, list[ReweightedEvidence]],
+    widths: Array,
+    ci_prob: float,
 ) -> xr.Dataset:
-    found = [[reweighted[name](width) for width in widths.tolist()] for name in table.index]
+    found = [of_models[name] for name in table.index]
     known = np.array([[one.is_reliable for one in of_model] for of_model in found])
     ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
     log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
@@ -219,13 +236,14 @@ def _table(
     return evidences.assign(prior=prior_weights(prior, list(evidences.index)))
 
 
-def _reweightings(
+def _width_curves(
     evidences: Mapping[str, EvidenceLike] | pd.DataFrame,
     models: Mapping[str, pm.Model],
     names: list[str],
     var_names: str | Iterable[str] | None,
-) -> dict[str, Reweighting]:
-    """For each model, the function from a width to the evidence under its scaled priors."""
+    widths: Array,
+) -> WidthCurves:
+    """For each model, the evidence under its scaled priors."""
     if not (
         isinstance(models, Mapping)
         and set(models) == set(names)
@@ -242,13 +260,12 @@ def _reweightings(
     chosen = [var_names] if isinstance(var_names, str) else list(var_names or [])
     if unknown := [one for one in chosen if not any(one in of_model for of_model in free.values())]:
         raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
-    found: dict[str, Reweighting] = {}
-    for name in names:
-        unconstrained_draws(idatas[name], models[name])  # checks that draws and model match
-        scaled = [one for one in free[name] if not chosen or one in chosen]
-        if scaled:
-            priors, posterior = ScaledPrior(models[name], scaled), idatas[name]["posterior"]
-            found[name] = partial(priors.reweighted, posterior.to_dataset())
-        else:
-            found[name] = lambda width: UNCHANGED
-    return found
+    for name in names:  # check that draws and model match
+        unconstrained_draws(idatas[name], models[name])
+    return width_curves(
+        models,
+        {name: idatas[name]["posterior"].to_dataset() for name in names},
+        {name: [one for one in free[name] if not chosen or one in chosen] for name in names},
+        widths.tolist(),
+        may_leave_out=not chosen,
+    )

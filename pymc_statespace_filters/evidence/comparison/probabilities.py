@@ -1,20 +1,17 @@
-"""Select one evidence per model; model probabilities from log weights with errors (Eq. 3.3)."""
+"""Model probabilities from log weights with errors (Eq. 3.3)."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.evidence import Evidence, stored_evidences
+from pymc_statespace_filters.errors import ModelError
 
 N_NORMALS = 50_000
 
 Array = NDArray[np.float64]
-EvidenceLike = Evidence | Mapping[str, Evidence] | xr.DataTree
 
 
 class Probabilities(NamedTuple):
@@ -63,60 +60,3 @@ def check_ci_prob(ci_prob: float) -> None:
     """Raise a `ModelError` unless it is a probability."""
     if not (isinstance(ci_prob, int | float) and 0 < ci_prob < 1):
         raise ModelError(f"ci_prob must be a number between 0 and 1, got {ci_prob!r}")
-
-
-def select_evidences(
-    given: Mapping[str, EvidenceLike], estimator: str | None = None
-) -> dict[str, Evidence]:
-    """Select one evidence for each model, and check that all belong to the same data.
-
-    The name of the estimator may be omitted if each model has only one evidence.
-
-    Raises
-    ------
-    ModelError
-        If an entry is of another type, or the estimator is ambiguous or missing.
-    DataMismatchError
-        If the models belong to different data.
-    """
-    if not isinstance(given, Mapping) or not given:
-        raise ModelError(
-            "evidences must be a mapping of model names to Evidence or DataTree with at least one "
-            f"entry, got {given!r}"
-        )
-    found = {
-        name: _chosen(name, _by_estimator(name, one), estimator) for name, one in given.items()
-    }
-    by_data: dict[str, list[str]] = {}
-    for name, evidence in found.items():
-        by_data.setdefault(evidence.data_fingerprint, []).append(name)
-    if len(by_data) > 1:
-        groups = " | ".join(", ".join(map(repr, names)) for names in by_data.values())
-        raise DataMismatchError(
-            f"evidences must belong to the same data, got models grouped by their data: {groups}"
-        )
-    return found
-
-
-def _by_estimator(name: str, given: EvidenceLike) -> Mapping[str, Evidence]:
-    if isinstance(given, xr.DataTree):
-        return stored_evidences(given, name)
-    found: object = {given.estimator: given} if isinstance(given, Evidence) else given
-    if isinstance(found, Mapping) and all(isinstance(one, Evidence) for one in found.values()):
-        return found
-    raise ModelError(f"evidences[{name!r}] must be an Evidence or a DataTree, got {given!r}")
-
-
-def _chosen(name: str, found: Mapping[str, Evidence], estimator: str | None) -> Evidence:
-    if estimator is None and len(found) == 1:
-        return next(iter(found.values()))
-    if estimator is None:
-        raise ModelError(
-            f"estimator must be given, because {name!r} has evidences by several: choose one of "
-            f"{list(found)}"
-        )
-    if estimator not in found:
-        raise ModelError(
-            f"estimator must be one of {list(found)}, those of {name!r}, got {estimator!r}"
-        )
-    return found[estimator]

@@ -67,6 +67,7 @@ class Laplace:
     """
 
     name: ClassVar[str] = "laplace"
+    uses_draws: ClassVar[bool] = False  # the search for the mode starts from them
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """The finite differences of about ten Newton steps from each starting point."""

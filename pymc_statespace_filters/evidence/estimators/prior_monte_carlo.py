@@ -52,6 +52,7 @@ class PriorMonteCarlo:
     """
 
     name: ClassVar[str] = "prior_monte_carlo"
+    uses_draws: ClassVar[bool] = False
     n_draws: int = 10_000
     target_se: float | None = None
 

@@ -91,6 +91,7 @@ class TemperedSMC:
     """
 
     name: ClassVar[str] = "tempered_smc"
+    uses_draws: ClassVar[bool] = False
     n_particles: int = 250
     n_runs: int = 16
 

@@ -7,6 +7,7 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
+from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
     LOG_DENSITY,
@@ -24,9 +25,6 @@ from pymc_statespace_filters.sampling.target.target import Growth
 # Fraction of evaluations after warm-up that may fail without a warning: a chain that touches the
 # edge of the region where its filter works is normal.
 TOLERATED_FAILURES = 0.05
-
-# Fraction of accepted proposals at and below which the draws say nothing about the target.
-STUCK = 0.005
 
 # Fraction of a chain's draws, and their number, above which a dwell time is not by chance: at an
 # acceptance of 5 % one dwell time in 170 is longer than a hundred iterations.
@@ -167,7 +165,7 @@ def sampler_warning(message: str) -> SamplerWarning:
 
 def _mobility_problem(statistics: PhaseStatistics) -> str | None:
     n, screened = statistics.iterations, statistics.screened
-    if statistics.moved <= STUCK * n:
+    if statistics.accept_rate < MIN_ACCEPT_RATE:
         screen = " or, with a screen, lower screen_power" if screened else ""
         return (
             f"DRAM accepted {statistics.moved} of {n} proposals after warm-up: the chain hardly "

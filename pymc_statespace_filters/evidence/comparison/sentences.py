@@ -1,0 +1,129 @@
+"""What the table of `compare_evidence` says below its columns."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+
+import pandas as pd
+
+from pymc_statespace_filters.evidence.evidence import Evidence
+
+
+def sentences(
+    table: pd.DataFrame, evidences: Mapping[str, Evidence], ci_prob: float
+) -> Iterator[str]:
+    """Yield what applies to the compared models; ``table`` is in order of probability."""
+    yield from _undecided(table, ci_prob)
+    yield from _criteria(table)
+    yield from _warnings(evidences)
+    yield from _approximate(evidences)
+
+
+def needs_warning(evidence: Evidence) -> bool:
+    """Whether the evidence is less reliable than its standard error suggests."""
+    return any(_reasons(evidence))
+
+
+def _undecided(table: pd.DataFrame, ci_prob: float) -> Iterator[str]:
+    best, *others = table.index
+    rivals = [name for name in others if table.loc[name, "undecided"]]
+    if not rivals:
+        return
+    errors = table.loc[[best, *rivals], "se"]
+    remedy = ": smaller errors, from more draws or a smaller target_se, would decide"
+    if not (errors > 0).all():  # unknown, or a tie of exact numbers
+        remedy = ""
+    which = f"whether {best!r} or {rivals[0]!r} is more probable"
+    if len(rivals) > 1:
+        which = f"which of {_names([best, *rivals])} is the most probable"
+    yield f"Undecided at {100 * ci_prob:g} %: {which}{remedy}."
+
+
+def _criteria(table: pd.DataFrame) -> Iterator[str]:
+    """Say that AIC or BIC choose another model than the evidence, and why."""
+    chosen = str(table["log_evidence"].idxmax())
+    rivals = {
+        name.upper(): str(table[name].idxmin())
+        for name in ("aic", "bic")
+        if table.loc[chosen, name] > table[name].min()
+    }
+    if not rivals:
+        return
+    if len(set(rivals.values())) == 1:
+        choices = f"{' and '.join(rivals)} choose {next(iter(rivals.values()))!r}"
+        choices = choices if len(rivals) > 1 else choices.replace("choose", "chooses")
+    else:
+        choices = " and ".join(f"{name} chooses {rival!r}" for name, rival in rivals.items())
+    compared = list(dict.fromkeys([*rivals.values(), chosen]))
+    why = _against_bic(table, compared) if "BIC" in rivals else _against_aic(table, compared)
+    yield f"{choices}, the evidence {chosen!r}: {why}."
+
+
+def _against_bic(table: pd.DataFrame, names: list[str]) -> str:
+    parts = []
+    for name in names:
+        row = table.loc[name]
+        excess = _penalty(row) - row["n_parameters"] / 2 * math.log(row["n_observations"])
+        parts.append(f"{name!r} by {abs(excess):.1f} nats {'more' if excess > 0 else 'less'}")
+    return (
+        f"the priors penalise {_joined(parts)} than BIC's k/2 ln J does; the wider a prior, the "
+        "larger its penalty"
+    )
+
+
+def _against_aic(table: pd.DataFrame, names: list[str]) -> str:
+    parts = [
+        f"{name!r} by {_penalty(table.loc[name]):.1f} for {table.loc[name, 'n_parameters']}"
+        for name in names
+    ]
+    return (
+        "AIC penalises each parameter by 1 nat, the priors penalise "
+        f"{_joined(parts)}; the wider a prior, the larger its penalty"
+    )
+
+
+def _penalty(row: pd.Series) -> float:
+    """By how many nats the evidence is below the maximum of the likelihood."""
+    return float(row["max_log_likelihood"] - row["log_evidence"])
+
+
+def _warnings(evidences: Mapping[str, Evidence]) -> Iterator[str]:
+    """Name the models with a warning, those with the same one together."""
+    models: dict[str, list[str]] = {}
+    for name, evidence in evidences.items():
+        reasons = list(_reasons(evidence))
+        if reasons:
+            models.setdefault(f"({evidence.estimator}): {'; '.join(reasons)}", []).append(name)
+    for text, names in models.items():
+        yield f"Warning for {_names(names)} {text}."
+
+
+def _reasons(evidence: Evidence) -> Iterator[str]:
+    if evidence.doubts:
+        yield evidence.doubts
+    if evidence.improper and "improper" not in evidence.doubts:
+        yield f"the prior of {evidence.improper} is improper or not normalised"
+    if math.isnan(evidence.se):
+        yield "the estimate has no standard error, so that no interval is known"
+    if evidence.noise == "held":
+        yield "the chains held one noise seed, and se excludes the error of the filter"
+
+
+def _approximate(evidences: Mapping[str, Evidence]) -> Iterator[str]:
+    names = [name for name, evidence in evidences.items() if evidence.approximate]
+    if not names:
+        return
+    of_whom = "all models" if len(names) == len(evidences) > 1 else _names(names)
+    yield (
+        f"The likelihood of {of_whom} is a filter's approximation, neither exact nor unbiased; se "
+        "excludes its error."
+    )
+
+
+def _names(names: Iterable[str]) -> str:
+    return _joined([repr(name) for name in names])
+
+
+def _joined(parts: list[str]) -> str:
+    """Join as in "a, b and c"."""
+    *others, last = parts
+    return f"{', '.join(others)} and {last}" if others else last
