@@ -58,7 +58,8 @@ def free_run(
     times : array_like, shape (R,), optional
         The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
     observed : array_like, shape (R, p) or (R,), optional
-        Measurements at these steps, to compare the predictions with; NaN where missing.
+        Measurements at these steps, to compare the predictions with; NaN where missing. By default
+        the record of the model, if the run has its inputs and steps, else none.
     noise : bool
         Whether the initial state, process noise and measurement noise are drawn. By default none
         is: a run starts at the initial mean, and its observations are those of `simulate` with
@@ -69,14 +70,14 @@ def free_run(
     xarray.DataTree
         With the group ``free_run``. For a variable "d": observations ``d`` (chain, draw, d_time,
         observable) and states ``d_states`` (chain, draw, d_time, state); NaN for a draw whose run
-        leaves the finite numbers. With `observed`, over the times where it is not missing:
+        leaves the finite numbers. With measurements, over the times where they are not missing:
 
         * ``d_rmse`` (observable): root-mean-square error of the mean of ``d`` over all draws.
-        * ``d_relative_error`` (observable): the same divided by the standard deviation of
-          `observed`; 1 is the error of a constant.
+        * ``d_relative_error`` (observable): the same divided by the standard deviation of the
+          measurements; 1 is the error of a constant.
         * ``d_rmse_of_draws`` (chain, draw, observable): root-mean-square error of ``d`` at each
           draw.
-        * ``d_coverage`` (interval, observable): the fraction of `observed` inside the central
+        * ``d_coverage`` (interval, observable): the fraction of them inside the central
           intervals of 50 % and 90 % of the predicted measurements, at each time over all draws.
           These have measurement noise, also where ``d`` has none.
 
@@ -131,12 +132,14 @@ def free_run(
             "observed must be that of one variable: give var_name, one of "
             f"{[variable.name for variable in variables]}"
         )
+    is_own_run = inputs is None and steps is None and times is None
+    is_compared = observed is not None or is_own_run
     dims = state_dims(observed_variables(model))
     parts = []
     for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
         at = _steps(at_draws, steps, times)
-        record = None if observed is None else check_observed(observed, variable.system, at.size)
+        record = _record(variable, observed, at) if is_compared else None
         rows = _input_rows(at_draws, inputs, at)
         paths, seen = _simulate(at_draws, at, rows, with_noise, draws.shape[0], rng)
         _warn_of_failed_runs(variable.name, paths)
@@ -156,6 +159,13 @@ def _steps(at_draws: VariableAtDraws, steps: Any, times: Any) -> NDArray[np.int6
     if steps is not None and times is not None:
         raise ModelError("give at most one of steps and times, got both")
     return steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
+
+
+def _record(variable: StateSpaceVariable, observed: Any, steps: NDArray[np.int64]) -> Array:
+    """The measurements (R, p) to compare with: those given, else those of the model."""
+    if observed is None:
+        return np.asarray(variable.observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
+    return check_observed(observed, variable.system, steps.size)
 
 
 def _input_rows(at_draws: VariableAtDraws, inputs: Any, steps: NDArray[np.int64]) -> Array:

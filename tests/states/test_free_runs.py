@@ -63,8 +63,8 @@ def test_without_noise_a_run_is_the_equations():
     assert group["d_states"].dims == ("chain", "draw", "d_time", "state")
     np.testing.assert_array_equal(group["d_time"], T0 + DT * STEPS)
     assert group.attrs == {"noise": 0}
-    assert set(group) == {"d", "d_states"}
     later = runs(posterior(a=A), model, steps=LATER, inputs=LONG_FORCE)
+    assert set(later) == {"d", "d_states"}
     assert_runs_of_pushed(later, A, LATER, LONG_FORCE)
     by_times = runs(posterior(a=A), model, times=T0 + DT * LATER, inputs=LONG_FORCE)
     assert by_times.identical(later)
@@ -254,7 +254,13 @@ def two_variables():
 def test_several_variables():
     model = two_variables()
     group = runs(posterior(a=A), model)
-    assert set(group) == {"d", "d_states", "push", "push_states"}
+    errors = ("rmse", "relative_error", "rmse_of_draws", "coverage")
+    names = ("d", "push")  # each compared with its own record
+    assert set(group) == {*names, *(f"{n}_{of}" for n in names for of in ("states", *errors))}
+    np.testing.assert_array_equal(
+        group["d_rmse"], runs(posterior(a=A), model, var_name="d", observed=PAIR_DATA)["d_rmse"]
+    )
+    assert set(runs(posterior(a=A), model, var_name="d", steps=STEPS)) == {"d", "d_states"}
     assert group["push"].dims == ("chain", "draw", "push_time", "pushed")
     one = runs(posterior(a=A), model, var_name="push", observed=FORCED_DATA)
     np.testing.assert_array_equal(one["push"], group["push"])
