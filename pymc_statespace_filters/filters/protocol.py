@@ -336,8 +336,8 @@ def check_states_filter(filter: Filter) -> StatesFilter:
     """Return the filter, or raise if it gives no states."""
     if not isinstance(filter, StatesFilter):
         raise ModelError(
-            f"{filter!r} gives no states: it has no compile_states; name a filter that does, such "
-            f"as filter=psf.EKF()"
+            f"{filter!r} gives no states: it has no compile_states; name a filter of the package "
+            f"instead (filter=...)"
         )
     return filter
 
