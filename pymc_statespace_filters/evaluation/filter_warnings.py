@@ -24,6 +24,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 type Arguments = tuple[Any, ...]
 
 _MOST_LISTED = 8  # observations
+_N_SEEDS = 5  # at which a collapsed estimate is repeated, to say how noisy it is
 
 
 def warn_about(
@@ -78,13 +79,23 @@ def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:
                 f"{where}, together {_below(missing[few].sum())} those of {short_form(exact)}; the "
                 f"log-likelihood is {_below(missing.sum())}, by a different amount for every seed"
             )
-    # The variance of the log of a mean of weights is at least the inverse of their effective
-    # number, of which the particles at hand give an overestimate.
-    noise = np.sqrt(np.sum(1.0 / n_effective[few]))
+    estimates = _at_other_seeds(system, filter, arguments, terms.sum())
+    n_failed = _N_SEEDS - estimates.size
+    failed = f" and was -inf at {n_failed} of them" if n_failed else ""
     return (
-        f"{where}; by them alone the log-likelihood varies from seed to seed with a standard "
-        f"deviation of at least {noise:.1f} nats, and is too low more often than not"
+        f"{where}; at {_N_SEEDS} seeds the log-likelihood ranged over {np.ptp(estimates):.1f} nats"
+        f"{failed}, and it is too low more often than not"
     )
+
+
+def _at_other_seeds(
+    system: StateSpaceModel, filter: Any, arguments: Arguments, first: float
+) -> np.ndarray:
+    """The finite estimates of the log-likelihood at a seed, ``first``, and at some others."""
+    *record, seed = arguments
+    evaluate = evaluator(LogLikelihood(system, filter))
+    others = [evaluate(*record, int(seed) ^ other)[0].sum() for other in range(1, _N_SEEDS)]
+    return np.array([value for value in (first, *others) if np.isfinite(value)])
 
 
 def _below(missing: float) -> str:

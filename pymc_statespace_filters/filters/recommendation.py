@@ -86,9 +86,9 @@ def collapse_remedy(system: System, filter: Any) -> str:
         )
     if isinstance(filter, GuidedPF):
         return (
-            "Use more particles, whose number psf.suggest_particles finds; or, if several states "
-            "explain the data equally well (a sensor of abs(x)), BootstrapPF with many more."
+            "Use more particles; psf.suggest_particles finds how many. If several states explain "
+            "the data equally well (a sensor of abs(x)), use BootstrapPF with many more."
         )
     guided = next((f for f in filters if isinstance(f, GuidedPF)), None)
-    instead = "" if guided is None else f"{short_form(guided)}, whose particles the data lead, or "
-    return f"Use {instead}more particles, whose number psf.suggest_particles finds."
+    instead = "" if guided is None else f"{short_form(guided)}, which moves particles to the data, or "
+    return f"Use {instead}more particles; psf.suggest_particles finds how many."
