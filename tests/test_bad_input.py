@@ -207,7 +207,7 @@ def test_a_function_that_draws_is_told_where_noise_belongs(name):
 
 
 def test_a_drift_that_draws_is_told_of_the_diffusion():
-    with pytest.raises(psf.ModelError, match="normal.* made inside it: .*diffusion"):
+    with pytest.raises(psf.ModelError, match=r"normal.* made inside it: .*diffusion"):
         euler(drift=lambda x: [pm.Normal.dist(x[0], 1.0), x[1]])
 
 

@@ -1,4 +1,4 @@
-"""The warning that a filter failed, or that too few particles decided its terms."""
+"""Warnings of failed filters, of terms decided by too few particles, and of equations that jump."""
 
 import warnings
 from collections import Counter
@@ -14,6 +14,7 @@ from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.filters.recommendation import (
     collapse_remedy,
     exact_filter,
+    jump_problem,
     short_form,
 )
 from pymc_statespace_filters.ops.base import evaluator
@@ -45,7 +46,8 @@ def warn_about(
         reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
         listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
         warnings.warn(
-            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
+            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations: "
+            f"{listed}",
             FilterWarning,
             stacklevel=stacklevel,
         )
@@ -61,6 +63,13 @@ def warn_about(
             FilterWarning,
             stacklevel=stacklevel,
         )
+
+
+def warn_of_jumps(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:
+    """Warn if the filter linearises an equation that jumps as the state moves."""
+    problem = jump_problem(compile_system(system), filter)
+    if problem is not None:
+        warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:

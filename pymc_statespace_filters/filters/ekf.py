@@ -35,6 +35,12 @@ class EKF(GaussianFilterBase):
 
     Notes
     -----
+    A tangent does not see a kink or a jump of an equation in the state (`freeplay`, ``pt.switch``).
+    Over 60 observations of one state the filter was 20 to 55 nats off where a transition jumps, 22
+    to 26 where a drift does (``-pt.sign(x)``), and with `freeplay` 4 to 6 nats off for a soft and
+    27 to 37 for a stiff spring. `UKF` and `IPLF` were 4 to 14, 1 to 2, and at most 1.5 nats off. A
+    jump is warned of, a kink is not.
+
     Thesis, Eqs. 4.3-4.14. Differences: the forecast starts from the analysis of the step before
     (the thesis prints: from its forecast); the noise of the observation enters the innovation
     covariance;

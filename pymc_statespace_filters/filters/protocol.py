@@ -115,6 +115,10 @@ class System(Protocol):
         """Whether the transition is known to have no kink and no jump."""
 
     @property
+    def jumping_equations(self) -> tuple[str, ...]:
+        """Those of "transition" and "observation" that are known to jump in the state."""
+
+    @property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` is known to depend on neither inputs nor time."""
 

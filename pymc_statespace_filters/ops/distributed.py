@@ -78,8 +78,8 @@ def check_ranks(filter: Filter, n_ranks: int) -> None:
         )
     if n_ranks > (most := filter.max_ranks()):
         raise ModelError(
-            f"{short_form(filter)} has members for {most} of {n_ranks} ranks only: a rank takes whole blocks "
-            f"of 64 members"
+            f"{short_form(filter)} has members for {most} of {n_ranks} ranks only: a rank takes "
+            f"whole blocks of 64 members"
         )
 
 

@@ -19,7 +19,6 @@ from pymc_statespace_filters.ops.batch import vectorized
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV, draw_in_python
 
-
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
 
 

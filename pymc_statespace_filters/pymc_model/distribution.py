@@ -13,6 +13,7 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.filter_warnings import warn_of_jumps
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
@@ -68,6 +69,11 @@ class StateSpace(Continuous):
     ModelError
         If data, steps or inputs do not fit the system, or a parameter has no value.
 
+    Warns
+    -----
+    FilterWarning
+        If the filter linearises an equation that jumps as the state moves.
+
     Examples
     --------
     >>> import pymc as pm
@@ -107,6 +113,7 @@ class StateSpace(Continuous):
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
         check_system_and_filter(system, filter)
+        warn_of_jumps(system, filter)
         given = {} if params is None else params
         check_names(system, given)
         values = dict(system.defaults) | _model_variables(system, model) | dict(given)

@@ -25,7 +25,6 @@ from pytensor.tensor.subtensor import Subtensor, unflatten_index_variables
 
 from pymc_statespace_filters.errors import ModelError
 
-
 # Where the noise of a function belongs, by the function's name in messages.
 _NOISE_OF = {
     "transition": "the noise of a step is the argument q of the transition, with the covariance "
@@ -66,10 +65,11 @@ def _drawn_from(generator: Variable, outputs: Sequence[Variable]) -> Variable | 
 def _check_made_before(drawn: Variable, inputs: Sequence[Variable], role: str) -> None:
     """Raise if a random variable was made inside the function that was called with ``inputs``."""
     if _serial_number(drawn) > min(map(_serial_number, inputs)):
-        remedy = _NOISE_OF.get(role)
+        remedy = f": {_NOISE_OF[role]}" if role in _NOISE_OF else ""
+        name = getattr(drawn.owner.op, "name", None) or drawn
         raise ModelError(
             f"{role} must be a deterministic function of its arguments, got the random variable "
-            f"{getattr(drawn.owner.op, 'name', None) or drawn}, made inside it{'' if remedy is None else f': {remedy}'}"
+            f"{name}, made inside it{remedy}"
         )
 
 

@@ -80,8 +80,9 @@ class EulerMaruyama:
     Parameters
     ----------
     drift : callable
-        ``f(x, u, t, ...)``, one expression per state; for one state a scalar will do. ``x`` (state), ``u`` (inputs) and ``t``
-        (time) are passed by name if they are arguments; every other argument is a parameter.
+        ``f(x, u, t, ...)``, one expression per state, for one state a scalar. ``x`` (state), ``u``
+        (inputs) and ``t`` (time) are passed by name if they are arguments; every other argument is
+        a parameter.
     diffusion : callable or array_like, shape (n, m)
         ``G(x, u, t, ...)``, one row per state and one column per independent Wiener process, per
         square root of time. Correlated noises share columns. One state and one noise: a scalar.

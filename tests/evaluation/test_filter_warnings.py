@@ -63,12 +63,12 @@ def test_a_filter_is_not_its_own_remedy(monkeypatch):
 
 def test_the_spread_over_seeds_is_that_of_the_system_at_hand():
     record = np.array([0.1, 0.3, -0.5, 2.0])
+    arguments = (BENT, psf.BootstrapPF(64), {}, record)
     with pytest.warns(psf.FilterWarning) as caught:
-        psf.log_likelihood(BENT, psf.BootstrapPF(64), {}, record, steps=[1, 2, 3, 4], seed=8)
-        seeds = [8 ^ i for i in range(5)]
-        at_seeds = psf.log_likelihood(
-            BENT, psf.BootstrapPF(64), {}, record, steps=[1, 2, 3, 4], seed=seeds
-        )
+        psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=8)
+    seeds = [8 ^ i for i in range(5)]
+    with pytest.warns(psf.FilterWarning):
+        at_seeds = psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=seeds)
     spread = np.ptp(at_seeds.sum(axis=1))
     assert f"at 5 seeds the log-likelihood ranged over {spread:.1f} nats" in str(caught[0].message)
     assert str(caught[0].message).startswith("BootstrapPF(64): fewer than 3")

@@ -110,7 +110,10 @@ def test_declared_shapes():
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        (None, r"params must .*\['a'\] \(optional, with a default: \['b'\]\), got no value for .* \['a'\]"),
+        (
+            None,
+            r"params must .*\['a'\] \(optional, with a default: \['b'\]\), got no .* \['a'\]",
+        ),
         ({"a": 1.0, "c": 2.0}, r"params must name parameters .*\['a', 'b'\], got \['c'\]"),
         ({"a": [0.1, 0.2]}, r"'a' must have shape \(\), got \(2,\)"),
         ({"a": pt.dvector("v")}, r"'a' must have shape \(\)"),
