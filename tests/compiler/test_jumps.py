@@ -73,8 +73,10 @@ def test_steps_of_time_and_inputs_are_no_jumps_of_the_state():
 
 def test_observations_and_drifts():
     assert jumping_equations(system(observation=lambda x: 3 * pt.round(x[0]))) == ("observation",)
-    # A drift moves the state of a step by dt times its jump: 0.9 and 0.06 standard deviations.
+    # A drift moves the state of a step by dt times its jump: 0.9, 0.4 (of which the sign 0 at the
+    # threshold itself leaves a half) and 0.06 standard deviations.
     assert jumping_equations(drift(lambda x: -pt.sign(x))) == ("transition",)
+    assert jumping_equations(drift(lambda x: -pt.sign(x), dt=0.01)) == ("transition",)
     assert jumping_equations(drift(lambda x: -pt.sign(x), dt=0.0002)) == ()
     assert jumping_equations(drift(lambda x: -psf.freeplay(x, 2.0, 0.5))) == ()
 
