@@ -50,7 +50,8 @@ SYSTEMS = {
     "noise of other size": (dict(observation_noise=np.eye(2)), r"observation_noise .*\(1, 1\)"),
     "initial_cov of other size": (dict(initial_cov=[[1.0]]), r"initial_cov .*\(2, 2\).*\(1, 1\)"),
     "initial_cov a vector": (dict(initial_cov=[1.0, 1.0]), r"initial_cov .*square.*\(2,\)"),
-    "initial_mean a number": (dict(initial_mean=0.0), "initial_mean .*vector"),
+    "initial_mean a number": (dict(initial_mean=0.0), r"initial_cov .*\(1, 1\), got \(2, 2\)"),
+    "initial_mean a matrix": (dict(initial_mean=[[0.0, 1.0]]), "initial_mean .*vector"),
     "initial_mean empty": (dict(initial_mean=[]), "initial_mean"),
     "covariance function": (
         dict(process_noise=lambda s: [[s, 0.0]]), r"process_noise .*(\(1, 1\)|square|\(2, 2\))",
@@ -69,7 +70,11 @@ SYSTEMS = {
     "noiseless": (dict(observation_noise=[[0.0]]), "observation_noise .*positive definite"),
     "not finite": (dict(observation_noise=[[np.nan]]), "observation_noise .*finite"),
     "words": (dict(observation_noise=[["a"]]), "observation_noise .*numbers"),
-    "a bare variance": (dict(observation_noise=0.5), r"observation_noise .*square matrix.*\(\)"),
+    "a bare variance": (
+        dict(observation=lambda x: x, observation_noise=0.5),
+        r"observation_noise .*square matrix.*\(\)",
+    ),
+    "a bare variance of two states": (dict(initial_cov=1.0), r"initial_cov .*square matrix.*\(\)"),
     "infinite mean": (dict(initial_mean=[0.0, np.inf]), "initial_mean .*finite"),
     # reserved names and signatures
     "e in the transition": (dict(transition=lambda x, e: x), "transition.*'e' is reserved"),
@@ -80,6 +85,10 @@ SYSTEMS = {
     "star keywords": (dict(transition=lambda x, **kw: x), r"transition.*\*\*kw"),
     "a word as default": (dict(transition=lambda x, q, a="b": x), "default of 'a' .*'b'"),
     "None as default": (dict(transition=lambda x, q, a=None: x), "default of 'a' .*None"),
+    "an infinite default": (
+        dict(transition=lambda x, q, K=np.inf: x * (1 - x / K)),
+        r"default of 'K' .*finite number, got inf; .*inverse_K = 1 / K, and the default 0",
+    ),
     "two defaults": (
         dict(transition=lambda x, q, a=1.0: a * x, observation=lambda x, a=2.0: [a * x[0]]),
         "'a' must have one default",
@@ -161,7 +170,51 @@ def test_a_wrong_system_is_refused_when_it_is_made(name):
     assert isinstance(caught.value, ValueError)
 
 
+DRAWS_INSIDE = {
+    "transition": (
+        dict(transition=lambda x, q: [x[0] + q[0], pm.Binomial.dist(10, 0.5)]),
+        "transition must be a deterministic .*binomial.* made inside it: .*argument q.*diffusion",
+    ),
+    "own generator": (
+        dict(transition=lambda x, q: [pm.Normal.dist(rng=GENERATOR), x[1]]),
+        "transition must be a deterministic .*normal.* made inside it",
+    ),
+    "observation": (
+        dict(observation=lambda x: [pm.Normal.dist(x[0], 1.0)]),
+        "observation must be a deterministic .*normal.*: noise of .*observation_dist",
+    ),
+    "initial_mean": (
+        dict(initial_mean=lambda: [pm.Normal.dist(), 0.0]), "initial_mean .*normal.*initial_cov",
+    ),
+    "process_noise": (dict(process_noise=lambda: [[pm.Normal.dist()]]), "process_noise .*inside"),
+    "a rate": (
+        dict(
+            observation_dist=lambda x: [pm.Poisson.dist(pm.Gamma.dist(2.0, 1.0))],
+            observation=..., observation_noise=...,
+        ),
+        "observation_dist must be a deterministic .*gamma.*NegativeBinomial",
+    ),
+}  # fmt: skip
+GENERATOR = pytensor.shared(np.random.default_rng(1), name="generator")
+
+
+@pytest.mark.parametrize("name", DRAWS_INSIDE)
+def test_a_function_that_draws_is_told_where_noise_belongs(name):
+    changes, words = DRAWS_INSIDE[name]
+    with pytest.raises(psf.ModelError, match=words) as caught:
+        make(**changes)
+    assert "as a parameter" not in str(caught.value)
+
+
+def test_a_drift_that_draws_is_told_of_the_diffusion():
+    with pytest.raises(psf.ModelError, match=r"normal.* made inside it: .*diffusion"):
+        euler(drift=lambda x: [pm.Normal.dist(x[0], 1.0), x[1]])
+
+
 def test_pymc_variables_are_not_constants():
+    unnamed = pm.Normal.dist()
+    with pytest.raises(psf.ModelError, match=r"random variable .*as a parameter"):
+        make(transition=lambda x, q: [unnamed + q[0], x[1]])
     with pm.Model():
         gain = pm.Normal("gain")
         with pytest.raises(psf.ModelError, match=r"random variable gain.*as a parameter"):

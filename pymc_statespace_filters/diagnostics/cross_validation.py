@@ -66,7 +66,8 @@ def leave_future_out(
     model : pymc.Model, optional
         The model of the draws; by default that of the ``with`` block.
     min_observations : int
-        Number of observations before the first that is scored, not counting those entirely missing.
+        Number of observations before the first that is scored, not counting those entirely missing
+        or before the variable's ``score_from``.
         At least 1 with `refit`, else 0. It must be the same for models to be compared.
     var_name : str, optional
         Name of the StateSpace variable, if the model has several. Other observed variables count as
@@ -127,6 +128,7 @@ def leave_future_out(
     variable = _one_variable(model, var_name)
     time, name = variable.dims[0], variable.name
     observed = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))
+    observed = observed[observed >= variable.score_from]
     _check_min_observations(min_observations, 0 if refit is None else 1, observed.size, name)
     terms = _stored_terms(idata, name)
     if terms is None:

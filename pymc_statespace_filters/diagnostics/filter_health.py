@@ -71,7 +71,7 @@ def filter_diagnostics(
     The parameters are drawn from their posterior given all observations, as in posterior predictive
     checks. The predictions therefore use a little of the data they predict, and correct models
     appear slightly too good, the more so with fewer observations. `leave_future_out` scores models
-    without this effect.
+    without this effect. Observations before the variable's ``score_from`` count as missing.
 
     Parameters
     ----------
@@ -170,6 +170,7 @@ def filter_diagnostics(
             at_draws, before.drawn, at_draws.steps, at_draws.inputs(), rng
         )
         observed = observed_values(model, variable.name)
+        observed[: variable.score_from] = np.nan
         laws = laws_of(at_draws, observed, before)
         if laws is None:
             calibration = calibration_by_rank(predicted, observed, rng)

@@ -53,8 +53,8 @@ def compute_log_likelihood(
     -------
     xarray.DataTree
         With the group ``log_likelihood``: for a variable "d" its terms ``d`` (chain, draw, d_time),
-        0 for an observation that is entirely missing, -inf from a failure of the filter on. The
-        attribute ``terms`` says that they are sequential.
+        0 for an observation that is entirely missing or before ``score_from``, -inf from a failure
+        of the filter on. The attribute ``terms`` says that they are sequential.
 
     Raises
     ------

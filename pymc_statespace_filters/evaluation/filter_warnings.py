@@ -1,4 +1,4 @@
-"""The warning that a filter failed, or that too few particles decided its terms."""
+"""Warnings of failed filters, of terms decided by too few particles, and of equations that jump."""
 
 import warnings
 from collections import Counter
@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.filters.grid import GridFilter
-from pymc_statespace_filters.filters.guided_pf import GuidedPF
+from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
 from pymc_statespace_filters.filters.protocol import HealthFilter
+from pymc_statespace_filters.filters.recommendation import (
+    collapse_remedy,
+    exact_filter,
+    jump_problem,
+    short_form,
+)
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.diagnostics import TermHealth
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
@@ -21,6 +25,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 type Arguments = tuple[Any, ...]
 
 _MOST_LISTED = 8  # observations
+_N_SEEDS = 5  # at which a collapsed estimate is repeated, to say how noisy it is
 
 
 def warn_about(
@@ -41,7 +46,8 @@ def warn_about(
         reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
         listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
         warnings.warn(
-            f"{filter} gave -inf in {failed.sum()} of {len(health)} evaluations: {listed}",
+            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations: "
+            f"{listed}",
             FilterWarning,
             stacklevel=stacklevel,
         )
@@ -50,57 +56,56 @@ def warn_about(
     if collapsed.any():
         worst = int(np.argmin(smallest))
         warnings.warn(
-            f"{filter}: fewer than {COLLAPSED:g} particles decided some terms of the "
+            f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
             f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
-            f"number {smallest[worst]:.3g}). {_extent(system, filter, arguments_of(worst))}, by a "
-            f"different amount for every seed; more particles lessen this only slowly. "
-            f"{_remedy(system, filter)}",
+            f"number {smallest[worst]:.3g}). {_extent(system, filter, arguments_of(worst))}. "
+            f"{collapse_remedy(compile_system(system), filter)}",
             FilterWarning,
             stacklevel=stacklevel,
         )
 
 
-def _remedy(system: StateSpaceModel, filter: Any) -> str:
-    """Say which filter gives the likelihood of a system without collapse."""
-    if _exact_filter(system) is not None:
-        return "Use GridFilter(), which computes this likelihood without particles."
-    if isinstance(filter, GuidedPF):
-        return "Use more particles; if they collapse again, BootstrapPF(n) with many."
-    return (
-        "Use GuidedPF(n), which is unbiased and moves its particles to where the record leads; if "
-        "they collapse there, too, BootstrapPF(n) with many."
-    )
+def warn_of_jumps(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:
+    """Warn if the filter linearises an equation that jumps as the state moves."""
+    problem = jump_problem(compile_system(system), filter)
+    if problem is not None:
+        warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:
-    """Say which terms few particles decided, and by how much they fall short if that is known."""
-    unknown = "The log-likelihood may be tens of nats too low"
+    """Say which terms few particles decided, and how far off or how noisy their sum is."""
     if not isinstance(filter, HealthFilter):
-        return unknown
+        return "The log-likelihood may be far too low, by a different amount for every seed"
     terms, n_effective, _ = evaluator(TermHealth(system, filter))(*arguments)
     few = np.flatnonzero(n_effective < COLLAPSED)
     listed = ", ".join(map(str, few[:_MOST_LISTED])) + ", .." * (few.size > _MOST_LISTED)
     where = f"In the worst of them these are {few.size} of {terms.size} terms, j = {listed}"
-    exact = _exact_filter(system)
-    if exact is None:
-        return f"{where}. {unknown}"
-    missing = evaluator(LogLikelihood(system, exact))(*arguments)[0] - terms
-    if not np.isfinite(missing).all():
-        return f"{where}. {unknown}"
+    exact = exact_filter(compile_system(system), without=filter)
+    if exact is not None:
+        missing = evaluator(LogLikelihood(system, exact))(*arguments)[0] - terms
+        if np.isfinite(missing).all():
+            return (
+                f"{where}, together {_below(missing[few].sum())} those of {short_form(exact)}; the "
+                f"log-likelihood is {_below(missing.sum())}, by a different amount for every seed"
+            )
+    estimates = _at_other_seeds(system, filter, arguments, terms.sum())
+    n_failed = _N_SEEDS - estimates.size
+    failed = f" and was -inf at {n_failed} of them" if n_failed else ""
     return (
-        f"{where}, together {_below(missing[few].sum())} those of {exact}; the log-likelihood is "
-        f"{_below(missing.sum())}"
+        f"{where}; at {_N_SEEDS} seeds the log-likelihood ranged over {np.ptp(estimates):.1f} nats"
+        f"{failed}, and it is too low more often than not"
     )
+
+
+def _at_other_seeds(
+    system: StateSpaceModel, filter: Any, arguments: Arguments, first: float
+) -> np.ndarray:
+    """The finite estimates of the log-likelihood at a seed, ``first``, and at some others."""
+    *record, seed = arguments
+    evaluate = evaluator(LogLikelihood(system, filter))
+    others = [evaluate(*record, int(seed) ^ other)[0].sum() for other in range(1, _N_SEEDS)]
+    return np.array([value for value in (first, *others) if np.isfinite(value)])
 
 
 def _below(missing: float) -> str:
     return f"{abs(missing):.1f} nats {'below' if missing > 0 else 'above'}"
-
-
-def _exact_filter(system: StateSpaceModel) -> GridFilter | None:
-    exact = GridFilter()
-    try:
-        exact.check(compile_system(system))
-    except ModelError:
-        return None
-    return exact if exact.is_exact_for(compile_system(system)) else None

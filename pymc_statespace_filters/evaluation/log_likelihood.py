@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_jumps
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
@@ -73,7 +73,8 @@ def log_likelihood(
     Warns
     -----
     FilterWarning
-        Once, on the first rank, if a filter failed or its particles collapsed.
+        Once, on the first rank, if a filter failed or its particles collapsed; and if it
+        linearises an equation that jumps as the state moves.
 
     Examples
     --------
@@ -91,6 +92,7 @@ def log_likelihood(
     (2,)
     """
     check_system_and_filter(system, filter)
+    warn_of_jumps(system, filter)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)

@@ -117,27 +117,26 @@ class GridFilter:
     def check(self, system: System) -> None:
         """Raise if the system is not one that this filter can treat."""
         if system.n != 1:
-            gaussian = "EKF" if system.gaussian_observation else "IPLF"
             raise ModelError(
                 f"GridFilter treats systems of one state, got {system.n} states "
-                f"{list(system.states)}; use GuidedPF, or {gaussian} where the state stays Gaussian"
+                f"{list(system.states)}"
             )
         if system.carried:
             raise ModelError(
                 f"GridFilter cannot treat the carried states {list(system.carried)}: a memory has "
-                f"no density; use BootstrapPF"
+                f"no density"
             )
         if system.m == 0:
             raise ModelError(
-                "GridFilter needs process noise, which makes the density smooth; this system has "
-                "none: use BootstrapPF or EKF"
+                "GridFilter needs process noise, which makes the density smooth, and this system "
+                "has none"
             )
         if not system.has_additive_process_noise:
             raise ModelError(
                 "GridFilter needs a transition with additive noise, g(x, q) = g(x, 0) + G(x) q, so "
                 "that a step is Gaussian given the state, and here dg/dq depends on q (or cannot "
                 "be seen not to). Substeps of an integrator do that where the drift is not linear: "
-                "use a smaller dt instead. Otherwise use BootstrapPF"
+                "a smaller dt does without them"
             )
 
     def is_exact_for(self, system: System) -> bool:

@@ -163,7 +163,9 @@ class GuidedPF(ParticleFilter):
     In intervals over which the linear system may be wrong one particle in ten moves unguided, so
     that no weight of such an interval is above ten. Where two states explain the record equally
     well, as with a sensor of ``abs(x)``, particles follow one of them: most estimates are then too
-    low, a few far too high. Use `BootstrapPF`.
+    low, a few far too high. So they are where the transition jumps as the state moves
+    (``pt.switch``): with 100 particles 7 to 104 nats too low over 60 observations. Use
+    `BootstrapPF`.
 
     Terms of single observations are noisier than their sum, because particles are where the whole
     record wants them.

@@ -94,8 +94,7 @@ class IPLF(GaussianFilterBase):
         if system.model.equations.observation_draw is None:
             raise ModelError(
                 "IPLF needs the mean and variance of an observation, which observation_logp does "
-                "not give; use observation_dist, or BootstrapPF, PFEnKF or, for one state, "
-                "GridFilter"
+                "not give and observation_dist does"
             )
         unknown = unknown_moments(system.model)
         if unknown:

@@ -115,6 +115,10 @@ class System(Protocol):
         """Whether the transition is known to have no kink and no jump."""
 
     @property
+    def jumping_equations(self) -> tuple[str, ...]:
+        """Those of "transition" and "observation" that are known to jump in the state."""
+
+    @property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` is known to depend on neither inputs nor time."""
 
@@ -336,8 +340,8 @@ def check_states_filter(filter: Filter) -> StatesFilter:
     """Return the filter, or raise if it gives no states."""
     if not isinstance(filter, StatesFilter):
         raise ModelError(
-            f"{filter!r} gives no states: it has no compile_states; name a filter that does, such "
-            f"as filter=psf.EKF()"
+            f"{filter!r} gives no states: it has no compile_states; name a filter of the package "
+            f"instead (filter=...)"
         )
     return filter
 

@@ -27,6 +27,7 @@ from pymc_statespace_filters.compiler.native.code_library import with_internal_l
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
+from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.record import check_system
 
@@ -46,7 +47,11 @@ def check_system_and_filter(system: Any, filter: Any) -> None:
     """Raise unless these are a system and a filter that can treat it."""
     check_system(system)
     check_filter(filter)
-    filter.check(compile_system(system))
+    compiled = compile_system(system)
+    try:
+        filter.check(compiled)
+    except ModelError as refusal:
+        raise ModelError(f"{refusal}; {alternatives(compiled, filter)}") from None
 
 
 class FilterOp(Op):
@@ -146,7 +151,11 @@ def check_observed(p: int) -> Any:
     @jit
     def check(steps, observed):
         if observed.shape[0] != steps.size or observed.shape[1] != p:
-            raise ModelError("observed must have a row for each step, a column for each observable")
+            raise ModelError(
+                "observed must have a row for each step and a column for each observable; for a "
+                "record of another length give the variable steps=pm.Data(...) and "
+                "observed=pm.Data(...), and replace both in one pm.set_data"
+            )
 
     return check
 

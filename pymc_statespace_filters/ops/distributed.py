@@ -19,6 +19,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
+from pymc_statespace_filters.filters.recommendation import short_form
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS, evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.parallel.communicator import Communicator
@@ -72,13 +73,13 @@ def check_ranks(filter: Filter, n_ranks: int) -> None:
         return
     if not isinstance(filter, EnsembleFilter):
         raise ModelError(
-            f"{filter} has no members to distribute over {n_ranks} ranks; take one rank for each "
-            f"evaluation, or a filter with members: EnKF, GuidedPF, BootstrapPF or PFEnKF"
+            f"{short_form(filter)} has no members to distribute over {n_ranks} ranks; take one "
+            f"rank for each evaluation, or a filter with particles or members"
         )
     if n_ranks > (most := filter.max_ranks()):
         raise ModelError(
-            f"{filter} has members for {most} of {n_ranks} ranks only: a rank takes whole blocks "
-            f"of 64 members"
+            f"{short_form(filter)} has members for {most} of {n_ranks} ranks only: a rank takes "
+            f"whole blocks of 64 members"
         )
 
 

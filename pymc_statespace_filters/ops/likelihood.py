@@ -16,9 +16,13 @@ from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.rewriting.basic import register_specialize
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.compiler.lowering.compiled_system import (
+    CompiledSystem,
+    compile_system,
+)
 from pymc_statespace_filters.errors import GradientUnavailableError
 from pymc_statespace_filters.filters.protocol import DifferentiableFilter
+from pymc_statespace_filters.filters.recommendation import filters_for, listed, short_form
 from pymc_statespace_filters.ops.base import (
     HEALTH_SIZE,
     RECORD_INPUTS,
@@ -57,10 +61,13 @@ class LogLikelihood(FilterOp):
         """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
         if not self.filter.has_gradient:
             what = "is a random estimate without a" if self.filter.noisy else "does not come with a"
+            filters = filters_for(compile_system(self.system))
+            with_gradient = listed(f for f in filters if f.has_gradient)
+            remedy = f", or take a filter with a gradient: {with_gradient}" if with_gradient else ""
             raise GradientUnavailableError(
-                f"The likelihood by {self.filter} {what} gradient, so NUTS, HMC, nutpie and "
-                f"find_MAP cannot use it. Sample with psf.sample_dram() or "
-                f"pm.sample(step=psf.DRAM()), or take psf.EKF() for a likelihood with a gradient."
+                f"The likelihood by {short_form(self.filter)} {what} gradient, so NUTS, HMC, "
+                f"nutpie and find_MAP cannot use it. Sample with psf.sample_dram() or "
+                f"pm.sample(step=psf.DRAM()){remedy}."
             )
         terms_bar = cotangents[0]
         if isinstance(terms_bar.type, DisconnectedType):

@@ -4,17 +4,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytensor.tensor as pt
 from pymc.logprob.abstract import _logprob
 from pytensor.graph.basic import Variable
 from pytensor.link.numba.dispatch.basic import numba_njit
 from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
+from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import simulator
 from pymc_statespace_filters.ops.base import cache_key, check_record
 from pymc_statespace_filters.ops.batch import vectorized
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV, draw_in_python
+
+_TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
 
 
 @draw_in_python.register
@@ -59,8 +64,14 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
 def _log_density(
     op: StateSpaceRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """log p(d_j | d_1 .. d_{j-1}), one term per observation."""
+    """log p(d_j | d_1 .. d_{j-1}), one term per observation, 0 for those that are not scored."""
     (value,) = values
     theta, steps, inputs, t0, seed = params
     likelihood = LogLikelihood(op.system, op.filter)
-    return vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
+    terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
+    if op.score_from == 0:
+        return terms
+    # The length comes from the steps, which do not depend on the parameters as the terms do.
+    n_rows = steps.shape[-1]
+    rows = CheckAndRaise(ModelError, _TOO_SHORT)(pt.arange(n_rows), pt.gt(n_rows, op.score_from))
+    return pt.switch(pt.ge(rows, op.score_from), terms, 0.0)

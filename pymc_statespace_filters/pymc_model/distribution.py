@@ -13,10 +13,12 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.filter_warnings import warn_of_jumps
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
+from pymc_statespace_filters.system.checks import is_integer
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import check_names, symbolic_parameters
 from pymc_statespace_filters.system.record import check_seed, symbolic_record
@@ -54,6 +56,11 @@ class StateSpace(Continuous):
     seed : int
         Seed of the noise inside the filter. The model stores it as shared data ``{name}_seed``,
         which sampling does not change.
+    score_from : int
+        The first row of the data whose term counts, 0 for all. The filter passes through the rows
+        before it, which settle a state whose start is not known; their terms are 0 in the
+        log-density and in `compute_log_likelihood`, and they do not count as observations in the
+        evidence. Models are comparable only with the same number.
     dims : (str, str), optional
         Names of the dimensions, default ``({name}_time, observable)``.
 
@@ -61,6 +68,11 @@ class StateSpace(Continuous):
     ------
     ModelError
         If data, steps or inputs do not fit the system, or a parameter has no value.
+
+    Warns
+    -----
+    FilterWarning
+        If the filter linearises an equation that jumps as the state moves.
 
     Examples
     --------
@@ -95,11 +107,13 @@ class StateSpace(Continuous):
         inputs: Any = None,
         t0: float = 0.0,
         seed: int = 0,
+        score_from: int = 0,
         dims: Sequence[str] | None = None,
     ) -> TensorVariable:
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
         check_system_and_filter(system, filter)
+        warn_of_jumps(system, filter)
         given = {} if params is None else params
         check_names(system, given)
         values = dict(system.defaults) | _model_variables(system, model) | dict(given)
@@ -109,6 +123,7 @@ class StateSpace(Continuous):
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
         full_name = model.name_for(name)
+        _check_name(model, full_name, name, system)
         time_dim, component_dim = _dims(full_name, dims)
         _add_coord(model, time_dim, record.t0 + record.current_steps * system.dt, name)
         _add_coord(model, component_dim, list(system.observables), name)
@@ -123,27 +138,42 @@ class StateSpace(Continuous):
             noise_seed,
             system=system,
             filter=filter,
+            score_from=_check_score_from(score_from, record.current_steps.size),
             observed=record.observed,
             dims=(time_dim, component_dim),
         )
 
     @classmethod
-    def dist(cls, *params: Any, system: StateSpaceModel, filter: Filter, **kwargs: Any) -> Any:
+    def dist(
+        cls,
+        *params: Any,
+        system: StateSpaceModel,
+        filter: Filter,
+        score_from: int = 0,
+        **kwargs: Any,
+    ) -> Any:
         """Make the variable without a model; parameters are theta, steps, inputs, t0 and seed."""
         dtypes = ("float64", "int64", "float64", "float64", "int64")
         symbols = [
             pt.cast(p, dtype) if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype))
             for p, dtype in zip(params, dtypes, strict=True)
         ]
-        return super().dist(symbols, system=system, filter=filter, **kwargs)
+        settings = {"system": system, "filter": filter, "score_from": score_from}
+        return super().dist(symbols, **settings, **kwargs)
 
     @classmethod
     def rv_op(
-        cls, *params: Any, system: StateSpaceModel, filter: Filter, rng: Any = None, **kwargs: Any
+        cls,
+        *params: Any,
+        system: StateSpaceModel,
+        filter: Filter,
+        score_from: int,
+        rng: Any = None,
+        **kwargs: Any,
     ) -> TensorVariable:
         """Apply the operation; called by PyMC."""
         rng = pt.random.shared_rng(seed=None) if rng is None else rng
-        operation = StateSpaceRV(system=system, filter=filter)
+        operation = StateSpaceRV(system=system, filter=filter, score_from=score_from)
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 
@@ -159,6 +189,25 @@ def _model_variables(system: StateSpaceModel, model: pm.Model) -> dict[str, Vari
     return enclosing | {
         name: model.named_vars[full] for name, full in names.items() if full in model.named_vars
     }
+
+
+def _check_name(model: pm.Model, full_name: str, name: str, system: StateSpaceModel) -> None:
+    """Raise if the variable of a parameter has this name; PyMC says so of any other variable."""
+    if name in system.parameters and full_name in model.named_vars:
+        raise ModelError(
+            f"name must differ from the model's variables, got {name!r}, which is the variable of "
+            f"the parameter {name!r} of the system: give the data another name, such as "
+            f"'{name}_data'"
+        )
+
+
+def _check_score_from(score_from: Any, n_observations: int) -> int:
+    if not is_integer(score_from) or not 0 <= score_from < n_observations:
+        raise ModelError(
+            f"score_from must be an integer from 0 to {n_observations - 1}, as there are "
+            f"{n_observations} observations, got {score_from!r}"
+        )
+    return int(score_from)
 
 
 def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:

@@ -1,5 +1,6 @@
 """Queries about the StateSpace variables of a PyMC model: filters, seeds, likelihood terms."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -13,6 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.filters.recommendation import collapse_remedy, short_form
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
 
@@ -58,6 +60,27 @@ def noisy_filters(model: pm.Model) -> dict[str, Filter]:
     """The filter of every variable whose likelihood is a random estimate."""
     filters = {name: node.op.filter for name, node in state_space_nodes(model).items()}
     return {name: filter for name, filter in filters.items() if filter.noisy}
+
+
+def filters_used(model: pm.Model) -> dict[str, str]:
+    """The attribute ``filter`` of results: a JSON text of the filter of every variable.
+
+    Files of netCDF and Zarr store no mappings as attributes. Empty without such a variable.
+    """
+    nodes = state_space_nodes(model)
+    used = {name: short_form(node.op.filter) for name, node in nodes.items()}
+    return {"filter": json.dumps(used)} if used else {}
+
+
+def collapse_remedies(model: pm.Model) -> str:
+    """What to do where particles collapse, for every noisy filter of the model."""
+    nodes = {name: state_space_nodes(model)[name].op for name in noisy_filters(model)}
+    remedies = {
+        name: collapse_remedy(compile_system(op.system), op.filter) for name, op in nodes.items()
+    }
+    if len(set(remedies.values())) <= 1:
+        return "".join(set(remedies.values()))
+    return " ".join(f"For {name!r}: {remedy}" for name, remedy in remedies.items())
 
 
 def is_filter(value: object) -> bool:

@@ -16,17 +16,23 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 class StateSpaceRV(RandomVariable):
-    """Draws data (J, p) from theta, steps, inputs and t0; its last input, the seed, is unused."""
+    """Draws data (J, p) from theta, steps, inputs and t0; its last input, the seed, is unused.
+
+    The log-density leaves out the terms of the first ``score_from`` rows.
+    """
 
     name = "StateSpace"
     signature = "(k),(j),(s,u),(),()->(j,p)"
     dtype = "float64"
-    __props__ = (*RandomVariable.__props__, "system", "filter")
+    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from")
     _print_name = ("StateSpace", "\\operatorname{StateSpace}")
 
-    def __init__(self, *, system: StateSpaceModel, filter: Filter, **settings: Any) -> None:
+    def __init__(
+        self, *, system: StateSpaceModel, filter: Filter, score_from: int = 0, **settings: Any
+    ) -> None:
         self.system = system
         self.filter = filter
+        self.score_from = score_from
         super().__init__(**settings)
 
     def __str__(self) -> str:

@@ -19,7 +19,8 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 class StateSpaceVariable(NamedTuple):
     """One variable of a model: its system, its filter, and the symbols of its record.
 
-    ``dims`` names time and observables; theta and inputs may depend on the free variables.
+    ``dims`` names time and observables; theta and inputs may depend on the free variables. Terms of
+    the rows before ``score_from`` do not count.
     """
 
     name: str
@@ -32,6 +33,7 @@ class StateSpaceVariable(NamedTuple):
     t0: TensorVariable
     seed: TensorVariable
     observed: TensorVariable
+    score_from: int
 
 
 def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
@@ -43,7 +45,10 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
             theta, steps, inputs, t0, seed = node.inputs[-5:]
             dims = model.named_vars_to_dims[name]
             record = (theta, steps, inputs, t0, seed, model.rvs_to_values[rv])
-            found.append(StateSpaceVariable(name, node.op.system, node.op.filter, dims, *record))
+            op = node.op
+            found.append(
+                StateSpaceVariable(name, op.system, op.filter, dims, *record, op.score_from)
+            )
     return found
 
 

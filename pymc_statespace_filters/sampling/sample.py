@@ -128,8 +128,10 @@ def sample_dram(
     -------
     xarray.DataTree
         As returned by ``pm.sample``; None on ranks that do not get it. After Ctrl-C, the draws made
-        until then. The attributes ``exact`` (whether the chains target the posterior itself,
-        without the bias of a filter), ``refresh_noise`` and ``correlation`` describe the target.
+        until then. The attributes ``exact`` (1 if the chains target the posterior itself, 0 if one
+        with the bias of a filter), ``refresh_noise`` (0 or 1) and ``correlation`` describe the
+        target, and ``filter``, a JSON text, names the filter of every StateSpace variable:
+        ``'{"d": "BootstrapPF(200)"}'``.
         ``log_likelihood_variance``, for runs of at least 600 iterations with a noisy likelihood, is
         the variance of the estimated log-likelihood over 12 noise seeds at the draw of highest
         density.

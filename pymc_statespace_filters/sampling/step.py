@@ -245,7 +245,7 @@ class DRAM(BlockedStep):
     def _closing_warning(self) -> SamplerWarning | None:
         # Without the number of the chain, which PyMC does not pass to a step method.
         growth = self._target.growth(self._prepared_chain.state.proposal_cov)
-        return closing_warning(self._statistics, growth)
+        return closing_warning(self._statistics, growth, self._target.collapse_remedy)
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0

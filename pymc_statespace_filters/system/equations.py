@@ -95,7 +95,16 @@ def _default(role: str, name: str, value: Any) -> Any:
     except (TypeError, ValueError):
         array = np.asarray(np.nan)
     if value is None or not np.isfinite(array).all():
-        raise ModelError(f"{role}: the default of {name!r} must be a finite number, got {value!r}")
+        # The usual wish behind an infinite default is the model without a term.
+        remedy = (
+            f"; write the equations with the reciprocal, inverse_{name} = 1 / {name}, and the "
+            f"default 0"
+            if np.isinf(array).any()
+            else ""
+        )
+        raise ModelError(
+            f"{role}: the default of {name!r} must be a finite number, got {value!r}{remedy}"
+        )
     # Nested tuples, because a system is hashable.
     return float(array) if array.ndim == 0 else _nested_tuple(array.tolist())
 
@@ -133,8 +142,13 @@ def as_symbol(role: str, value: Any) -> TensorVariable:
 
 
 def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariable:
-    """What a function returned as a vector, of the given length unless it is None."""
+    """What a function returned as a vector, of the given length unless it is None.
+
+    One component may be a scalar.
+    """
     symbol = as_symbol(role, value)
+    if symbol.type.ndim == 0 and length in (None, 1):
+        symbol = as_symbol(role, [value])
     if symbol.type.ndim != 1:
         raise ModelError(
             f"{role} must return one expression per component (a list or a vector), "
@@ -146,8 +160,13 @@ def as_vector(role: str, value: Any, length: int | None = None) -> TensorVariabl
 def as_matrix(
     role: str, value: Any, rows: int | None = None, columns: int | None = None
 ) -> TensorVariable:
-    """What a function returned as a matrix, of the given numbers of rows and columns."""
+    """What a function returned as a matrix, of the given numbers of rows and columns.
+
+    A matrix of one row and column may be a scalar.
+    """
     symbol = as_symbol(role, value)
+    if symbol.type.ndim == 0 and rows in (None, 1) and columns in (None, 1):
+        symbol = as_symbol(role, [[value]])
     if symbol.type.ndim != 2:
         raise ModelError(
             f"{role} must be a matrix (nested lists or pt.stack of rows), "
@@ -202,6 +221,8 @@ def _constant_covariance(role: str, value: Any, size: int | None, *, definite: b
         matrix = np.array(value, dtype="float64")
     except (TypeError, ValueError):
         raise ModelError(f"{role} must be a matrix of numbers, got {value!r}") from None
+    if matrix.ndim == 0 and size in (None, 1):
+        matrix = matrix.reshape(1, 1)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ModelError(f"{role} must be a square matrix, got shape {matrix.shape}")
     if size is not None and matrix.shape[0] != size:

@@ -25,28 +25,64 @@ from pytensor.tensor.subtensor import Subtensor, unflatten_index_variables
 
 from pymc_statespace_filters.errors import ModelError
 
+# Where the noise of a function belongs, by the function's name in messages.
+_NOISE_OF = {
+    "transition": "the noise of a step is the argument q of the transition, with the covariance "
+    "process_noise, or the diffusion of an integrator",
+    "observation": "noise of the observation is given by observation_noise, or by "
+    "observation_dist as a distribution for each observable",
+    "observation_dist": "a distribution with random parameters must be given by its own density, "
+    "such as pm.NegativeBinomial for a Poisson with a Gamma rate, or these become states",
+    "initial_mean": "the spread of the initial state is initial_cov",
+}
 
-def freeze(inputs: Sequence[Variable], outputs: Sequence[Variable]) -> FrozenFunctionGraph:
-    """The graph from ``inputs`` to ``outputs``, immutable and hashable."""
+
+def freeze(
+    inputs: Sequence[Variable], outputs: Sequence[Variable], role: str = "a function of the system"
+) -> FrozenFunctionGraph:
+    """The graph from ``inputs`` to ``outputs``, immutable and hashable; messages name ``role``."""
     for variable in graph_inputs(outputs):
-        if variable not in inputs and not isinstance(variable, Constant):
-            raise ModelError(
-                f"a function of the system must use its arguments and constants only, got the "
-                f"{_kind(variable, outputs)}; pass it as a parameter, or as a number or array if "
-                f"it is constant"
-            )
+        if variable in inputs or isinstance(variable, Constant):
+            continue
+        if (drawn := _drawn_from(variable, outputs)) is not None:
+            _check_made_before(drawn, inputs, role)
+        raise ModelError(
+            f"{role} must use its arguments and constants only, got the "
+            f"{_kind(variable, drawn)}; pass it as a parameter, or as a number or array if "
+            f"it is constant"
+        )
     _check_indices(outputs)
     return FrozenFunctionGraph.from_io(inputs, outputs)
 
 
-def _kind(variable: Variable, outputs: Sequence[Variable]) -> str:
+def _drawn_from(generator: Variable, outputs: Sequence[Variable]) -> Variable | None:
+    """The random variable that is drawn from a generator; None for any other variable."""
+    if not isinstance(generator.type, RandomType):
+        return None
+    return next(v for v in ancestors(outputs) if v.owner and generator in v.owner.inputs)
+
+
+def _check_made_before(drawn: Variable, inputs: Sequence[Variable], role: str) -> None:
+    """Raise if a random variable was made inside the function that was called with ``inputs``."""
+    if _serial_number(drawn) > min(map(_serial_number, inputs)):
+        remedy = f": {_NOISE_OF[role]}" if role in _NOISE_OF else ""
+        name = getattr(drawn.owner.op, "name", None) or drawn
+        raise ModelError(
+            f"{role} must be a deterministic function of its arguments, got the random variable "
+            f"{name}, made inside it{remedy}"
+        )
+
+
+def _serial_number(variable: Variable) -> int:
+    """A number that grows with every variable that PyTensor makes."""
+    return int(variable.auto_name.removeprefix("auto_"))
+
+
+def _kind(variable: Variable, drawn: Variable | None) -> str:
     """How to call an outside variable in a message; a generator is named by what it draws."""
-    if not isinstance(variable, SharedVariable):
-        return f"symbol {variable}"
-    if not isinstance(variable.type, RandomType):
-        return f"shared variable {variable}"
-    drawn = [v for v in ancestors(outputs) if v.owner is not None and variable in v.owner.inputs]
-    return f"random variable {drawn[0].name or drawn[0]}"
+    if drawn is not None:
+        return f"random variable {drawn.name or drawn}"
+    return f"{'shared variable' if isinstance(variable, SharedVariable) else 'symbol'} {variable}"
 
 
 def _check_indices(outputs: Sequence[Variable]) -> None:

@@ -80,11 +80,12 @@ class EulerMaruyama:
     Parameters
     ----------
     drift : callable
-        ``f(x, u, t, ...)``, one expression per state. ``x`` (state), ``u`` (inputs) and ``t``
-        (time) are passed by name if they are arguments; every other argument is a parameter.
+        ``f(x, u, t, ...)``, one expression per state, for one state a scalar. ``x`` (state), ``u``
+        (inputs) and ``t`` (time) are passed by name if they are arguments; every other argument is
+        a parameter.
     diffusion : callable or array_like, shape (n, m)
         ``G(x, u, t, ...)``, one row per state and one column per independent Wiener process, per
-        square root of time. Correlated noises share columns.
+        square root of time. Correlated noises share columns. One state and one noise: a scalar.
     dt : float
         Length of one step, in the time unit of the drift.
     substeps : int
@@ -164,6 +165,8 @@ def _constant_diffusion(value: Any) -> tuple[tuple[float, ...], ...]:
         raise ModelError(
             f"diffusion must be a function or a matrix of numbers, got {value!r}"
         ) from None
+    if matrix.ndim == 0:  # one state, one noise
+        matrix = matrix.reshape(1, 1)
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ModelError(f"diffusion must be a finite matrix (states x noises), got {value!r}")
     return tuple(map(tuple, matrix.tolist()))

@@ -26,7 +26,8 @@ class StateSpaceModel:
         d_j &= h(x_{d(j)}, e_j), \quad e_j \sim N(0, \Gamma), \qquad x_0 \sim N(m_0, P_0)
 
     (thesis, Eqs. 3.10-3.11). Functions are ordinary Python functions of PyTensor symbols and are
-    called once. Five argument names are reserved: ``x`` (state), ``q`` (process noise), ``e``
+    called once. A vector of one component and a matrix of one element may be given or returned as
+    a scalar. Five argument names are reserved: ``x`` (state), ``q`` (process noise), ``e``
     (measurement noise), ``u`` (inputs at this step) and ``t`` (time). They are passed by name, in
     any order, to the functions that have them as arguments. Every other argument is a parameter; a
     default makes it optional.

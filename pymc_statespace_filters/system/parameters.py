@@ -75,9 +75,13 @@ def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
 def _check_complete(system: StateSpaceModel, found: Mapping[str, Any]) -> None:
     """Raise unless every parameter has a value."""
     if missing := [name for name in system.parameters if name not in found]:
+        optional = [name for name, _ in system.defaults]
+        needed = [name for name in system.parameters if name not in optional]
+        also = f" (optional, with a default: {optional})" if optional else ""
         raise ModelError(
-            f"params must give every parameter without a default, {list(system.parameters)}, got "
-            f"no value for the parameters {missing}, only for {sorted(found)}"
+            f"params must give every parameter without a default, {needed}{also}, got "
+            f"no value for the parameters {missing}, only for "
+            f"{sorted(name for name in found if name not in optional)}"
         )
 
 

@@ -144,18 +144,19 @@ def trace(
     transition = as_vector("transition", functions.transition.step(values), n)
     inputs = [symbols.theta, *(values[name] for name in "xqut"), seen.noise, seen.datum]
 
-    def frozen(output: TensorVariable | None) -> FrozenFunctionGraph | None:
-        return None if output is None else freeze(inputs, [output])
+    def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
+        return None if output is None else freeze(inputs, [output], role)
 
+    density = "observation_logp" if seen.draw is None else "observation_dist"
     equations = Equations(
-        transition=freeze(inputs, [transition]),
-        process_noise=frozen(process_noise),
-        observation=frozen(seen.observation),
-        observation_noise=frozen(seen.covariance),
-        observation_logp=frozen(seen.logp),
+        transition=freeze(inputs, [transition], "transition"),
+        process_noise=frozen("process_noise", process_noise),
+        observation=frozen("observation", seen.observation),
+        observation_noise=frozen("observation_noise", seen.covariance),
+        observation_logp=frozen(density, seen.logp),
         observation_draw=seen.freeze_draw(inputs),
-        initial_mean=freeze(inputs, [symbols.initial_mean]),
-        initial_cov=freeze(inputs, [initial_cov]),
+        initial_mean=freeze(inputs, [symbols.initial_mean], "initial_mean"),
+        initial_cov=freeze(inputs, [initial_cov], "initial_cov"),
     )
     return equations, seen
 
@@ -182,7 +183,7 @@ class FunctionTransition:
 
     def step(self, values: Values) -> TensorVariable:
         """The next state."""
-        return as_vector("transition", self.equation(values))
+        return as_vector("transition", self.equation(values), values["x"].type.shape[0])
 
 
 def _read_transition(
@@ -221,11 +222,11 @@ def _read_initial_mean(value: Any) -> Any:
         mean = np.array(value, dtype="float64")
     except (TypeError, ValueError):
         raise ModelError(f"initial_mean must be numbers or a function, got {value!r}") from None
-    if mean.ndim != 1 or not np.isfinite(mean).all():
+    if mean.ndim > 1 or not np.isfinite(mean).all():
         raise ModelError(
             f"initial_mean must be a finite vector, one entry per state, got {value!r}"
         )
-    return mean
+    return np.atleast_1d(mean)
 
 
 def _noise_size(functions: Functions, values: Values) -> int:

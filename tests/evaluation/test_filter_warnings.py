@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
@@ -21,11 +22,21 @@ SYSTEM = psf.StateSpaceModel(
 )
 
 
-def warned(rows, filter="a filter"):
+BENT = psf.StateSpaceModel(
+    transition=lambda x, q: [pt.sin(x[0]) + q[0], x[0]],
+    process_noise=1.0,
+    observation=lambda x: x[0],
+    observation_noise=1e-4,
+    initial_mean=[0.0, 0.0],
+    initial_cov=np.eye(2),
+)
+
+
+def warned(rows, filter="a filter", system=SYSTEM):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about(SYSTEM, filter, np.array(rows), lambda i: asked.append(i) or ())
+        warn_about(system, filter, np.array(rows), lambda i: asked.append(i) or ())
     return [str(w.message) for w in caught], asked
 
 
@@ -40,10 +51,27 @@ def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
 
 def test_a_filter_is_not_its_own_remedy(monkeypatch):
     monkeypatch.setattr(filter_warnings, "_extent", lambda *_: "Some terms")
-    (of_guided,), _ = warned([[1.5, 0.0, -1.0]], psf.GuidedPF(100))
-    (of_bootstrap,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100))
+    (of_guided,), _ = warned([[1.5, 0.0, -1.0]], psf.GuidedPF(100), BENT)
+    (of_bootstrap,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100), BENT)
+    (of_linear,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100))
     assert "Use more particles" in of_guided
-    assert "Use GuidedPF(n)" in of_bootstrap
+    assert "GuidedPF(100)" not in of_guided.removeprefix("GuidedPF(100)")
+    assert "Use GuidedPF(100)" in of_bootstrap
+    assert "Use EKF()" in of_linear
+    assert "slowly" not in of_guided + of_bootstrap + of_linear
+
+
+def test_the_spread_over_seeds_is_that_of_the_system_at_hand():
+    record = np.array([0.1, 0.3, -0.5, 2.0])
+    arguments = (BENT, psf.BootstrapPF(64), {}, record)
+    with pytest.warns(psf.FilterWarning) as caught:
+        psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=8)
+    seeds = [8 ^ i for i in range(5)]
+    with pytest.warns(psf.FilterWarning):
+        at_seeds = psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=seeds)
+    spread = np.ptp(at_seeds.sum(axis=1))
+    assert f"at 5 seeds the log-likelihood ranged over {spread:.1f} nats" in str(caught[0].message)
+    assert str(caught[0].message).startswith("BootstrapPF(64): fewer than 3")
 
 
 @pytest.mark.parametrize("smallest", [COLLAPSED, np.inf])

@@ -299,7 +299,7 @@ def refused(**changes):
     }
     system = psf.StateSpaceModel(**settings | changes)
     with pytest.raises(psf.ModelError) as error:
-        psf.GridFilter().check(compile_system(system))
+        psf.log_likelihood(system, psf.GridFilter(), {}, [0.0], steps=[1])
     return str(error.value)
 
 

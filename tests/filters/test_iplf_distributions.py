@@ -190,9 +190,7 @@ def test_nuts_samples_the_posterior_of_counts(counts):
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()])
 def test_filters_of_gaussian_noise_name_the_one_for_distributions(filter):
-    with pytest.raises(
-        psf.ModelError, match="observation_dist works with IPLF, and observation_dist"
-    ):
+    with pytest.raises(psf.ModelError, match=r"GuidedPF\(100\).*\(exact\) and by IPLF\(\)"):
         psf.log_likelihood(COUNTER, filter, {"a": 1.0, "c": 1.0}, [3], steps=[0])
 
 

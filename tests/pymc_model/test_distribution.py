@@ -110,7 +110,10 @@ def test_declared_shapes():
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        (None, r"params must .*\['a', 'b'\], got no value for the parameters \['a'\]"),
+        (
+            None,
+            r"params must .*\['a'\] \(optional, with a default: \['b'\]\), got no .* \['a'\]",
+        ),
         ({"a": 1.0, "c": 2.0}, r"params must name parameters .*\['a', 'b'\], got \['c'\]"),
         ({"a": [0.1, 0.2]}, r"'a' must have shape \(\), got \(2,\)"),
         ({"a": pt.dvector("v")}, r"'a' must have shape \(\)"),
@@ -122,6 +125,13 @@ def test_declared_shapes():
 def test_wrong_parameters(params, message):
     with pm.Model(), pytest.raises(ModelError, match=message):
         pair_variable(params=params)
+
+
+def test_data_with_the_name_of_a_parameter():
+    with pm.Model():
+        pm.Normal("a")
+        with pytest.raises(ModelError, match=r"name .*'a', .*the parameter 'a' .*such as 'a_data'"):
+            psf.StateSpace("a", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
 
 
 def test_a_vector_in_the_model_for_a_scalar_parameter():

@@ -1,5 +1,6 @@
 """What chains say of their health, by ``sample_dram`` and by the step method."""
 
+import json
 import logging
 
 import numpy as np
@@ -23,6 +24,22 @@ def runaway():
     with pm.Model() as model:
         pm.Normal("y", shape=2)
         pm.Flat("free")
+    return model
+
+
+def collapsing():
+    """Three observations far from where the particles are, and a parameter of no consequence."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: 0.5 * x[0] + q[0],
+        process_noise=1.0,
+        observation=lambda x: x[0],
+        observation_noise=1e-4,
+        initial_mean=lambda m: 1e-9 * m,
+        initial_cov=1.0,
+    )
+    with pm.Model() as model:
+        pm.Normal("m")
+        psf.StateSpace("d", system, psf.BootstrapPF(20), steps=[1, 2, 3], observed=[3.0, -3, 3])
     return model
 
 
@@ -56,6 +73,12 @@ def both_ways(model, caplog, **settings):
         ),
         (runaway(), {"draws": 500, "tune": 1000}, "proposals of free have become", "proper prior"),
         (nan_beyond(0.0), {"draws": 500}, "the log-density is NaN", "truncated"),
+        (
+            collapsing(),
+            {"draws": 300, "tune": 100, "refresh_noise": False},
+            "In 300 of 300 draws the particles collapsed",
+            "Use EKF(), which computes this likelihood without particles.",
+        ),
     ],
 )
 def test_chains_name_themselves_and_the_cure(model, settings, found, cure, caplog):
@@ -134,6 +157,7 @@ def test_the_spread_at_the_highest_draw(caplog):
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         tree = sample_dram(model, draws=700, chains=2)
     assert "variance" not in caplog.text
+    assert json.loads(tree.attrs["filter"]) == {"d0": "BootstrapPF(20)"}
     found = tree.attrs["log_likelihood_variance"]
     logp = model.compile_logp()
     (seed,) = [v for v in logp.f.get_shared() if v.name == "d0_seed"]

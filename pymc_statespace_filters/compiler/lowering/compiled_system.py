@@ -27,6 +27,7 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
     smoothed_cov,
     step_back,
 )
+from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -238,6 +239,11 @@ class CompiledSystem:
     def has_smooth_transition(self) -> bool:
         """Whether no part of the transition has a kink or a jump; False if unknown."""
         return structure.has_smooth_transition(self.model)
+
+    @cached_property
+    def jumping_equations(self) -> tuple[str, ...]:
+        """Those of "transition" and "observation" that are known to jump in the state."""
+        return jumping_equations(self.model)
 
     @cached_property
     def is_time_invariant(self) -> bool:

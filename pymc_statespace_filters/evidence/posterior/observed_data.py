@@ -1,38 +1,56 @@
 """The observed data of a model: number of observations and fingerprint."""
 
 import hashlib
+from typing import NamedTuple
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
 
-def _observed(model: pm.Model) -> list[tuple[NDArray[np.float64], bool]]:
-    """Observed values of each variable, and whether an observation is a vector (the last axis)."""
+class _Observed(NamedTuple):
+    """Observed values of a variable, and whether an observation is a vector (the last axis).
+
+    Rows before ``score_from`` have no term in the log-density.
+    """
+
+    values: NDArray[np.float64]
+    is_vector: bool
+    score_from: int
+
+    @property
+    def scored(self) -> NDArray[np.float64]:
+        """The values that have a term."""
+        return self.values[self.score_from :] if self.score_from else self.values
+
+
+def _observed(model: pm.Model) -> list[_Observed]:
+    """What every observed variable has for data."""
     return [
-        (
+        _Observed(
             np.asarray(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"), dtype=np.float64),
             getattr(rv.owner.op, "ndim_supp", 0) > 0,
+            getattr(rv.owner.op, "score_from", 0),
         )
         for rv in model.observed_RVs
     ]
 
 
 def observation_count(model: pm.Model) -> int:
-    """Count the observations J of a model that are not entirely missing.
+    """Count the observations J of a model that are scored and not entirely missing.
 
     A vector-valued observation (a row of a state-space or multivariate variable) counts once, like
     a scalar one; the counts of several observed variables are added.
     """
     return sum(
-        int((~np.isnan(values).all(axis=-1)).sum() if is_vector else (~np.isnan(values)).sum())
-        for values, is_vector in _observed(model)
+        int((~np.isnan(one.scored).all(axis=-1) if one.is_vector else ~np.isnan(one.scored)).sum())
+        for one in _observed(model)
     )
 
 
 def scalar_count(model: pm.Model) -> int:
-    """Count the observed scalars of a model that are not missing."""
-    return sum(int((~np.isnan(values)).sum()) for values, _ in _observed(model))
+    """Count the observed scalars of a model that are scored and not missing."""
+    return sum(int((~np.isnan(one.scored)).sum()) for one in _observed(model))
 
 
 def data_fingerprint(model: pm.Model) -> str:
@@ -41,14 +59,16 @@ def data_fingerprint(model: pm.Model) -> str:
     Returns
     -------
     str
-        Hexadecimal SHA-256 of shapes, values and positions of missing values: reproducible across
-        processes, and independent of the structure of the model and the names of its variables.
+        Hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows that
+        are not scored: reproducible across processes, and independent of the structure of the model
+        and the names of its variables.
         Axes of length one are ignored, so that a vector of J values equals a table of one column.
     """
     hashes = []
-    for values, _ in _observed(model):
-        values = np.squeeze(values)
+    for one in _observed(model):
+        values = np.squeeze(one.values)
         canonical = np.where(np.isnan(values), np.nan, values + 0.0)  # one kind of NaN and of zero
         content = repr(values.shape).encode() + canonical.astype("<f8").tobytes()
-        hashes.append(hashlib.sha256(content).digest())
+        unscored = f" scored from {one.score_from}" if one.score_from else ""
+        hashes.append(hashlib.sha256(content + unscored.encode()).digest())
     return hashlib.sha256(b"".join(sorted(hashes))).hexdigest()

@@ -164,6 +164,5 @@ def check_simulated_observations(name: str, system: System) -> None:
     if not system.gaussian_observation:
         raise ModelError(
             f"{name} updates members by a Kalman gain and so needs an observation function with "
-            f"Gaussian noise; with observation_dist or observation_logp use the particle filters "
-            f"GuidedPF, BootstrapPF or PFEnKF"
+            f"Gaussian noise, got observation_dist or observation_logp"
         )

@@ -96,9 +96,8 @@ class GaussianFilterBase:
         """Raise if the observation is not a function with Gaussian noise."""
         if not system.gaussian_observation:
             raise ModelError(
-                f"{type(self).__name__} needs an observation function with Gaussian noise; "
-                f"observation_dist works with IPLF, and observation_dist and observation_logp work "
-                f"with the particle filters GuidedPF and BootstrapPF and, for one state, GridFilter"
+                f"{type(self).__name__} needs an observation function with Gaussian noise, got "
+                f"observation_dist or observation_logp"
             )
 
     def _check_not_carried(self, system: System) -> None:
@@ -106,7 +105,7 @@ class GaussianFilterBase:
         if system.carried:
             raise ModelError(
                 f"{type(self).__name__} cannot treat the carried states {list(system.carried)}, "
-                f"which no Kalman update may move; use EnKF, GuidedPF or BootstrapPF"
+                f"which no Kalman update may move"
             )
 
 

@@ -107,15 +107,17 @@ class PhaseStatistics(NamedTuple):
 
 
 def closing_warning(
-    statistics: PhaseStatistics, growth: Growth | None = None
+    statistics: PhaseStatistics, growth: Growth | None = None, remedy: str = ""
 ) -> SamplerWarning | None:
     """Warn of what went wrong after warm-up, if anything did.
 
-    ``growth`` is that of the adapted proposals. PyMC logs the warning in the main process, in
-    whichever process the chain ran.
+    ``growth`` is that of the adapted proposals, ``remedy`` what the model's filters can do about
+    collapse. PyMC logs the warning in the main process, in whichever process the chain ran.
     """
     message = (
-        _mobility_problem(statistics) or _growth_problem(growth) or _failure_problem(statistics)
+        _mobility_problem(statistics)
+        or _growth_problem(growth)
+        or _failure_problem(statistics, remedy)
     )
     return None if message is None else sampler_warning(message)
 
@@ -200,15 +202,13 @@ def _growth_problem(growth: Growth | None) -> str | None:
     )
 
 
-def _failure_problem(statistics: PhaseStatistics) -> str | None:
+def _failure_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
     if statistics.collapsed > TOLERATED_COLLAPSES * statistics.iterations:
         return (
             f"In {statistics.collapsed} of {statistics.iterations} draws the particles collapsed: "
-            "hardly more than one of them determined the estimated likelihood at some observation "
-            "(sample_stats n_effective; filter_diagnostics shows at which). Such estimates vary by "
-            "many nats, and a chain is slow to leave an overestimate. More particles reduce this "
-            "only slowly; use GridFilter() for one state with additive process noise, GuidedPF(n) "
-            "otherwise."
+            f"fewer than {COLLAPSED:g} of them determined the estimated likelihood at some "
+            "observation (sample_stats n_effective; filter_diagnostics shows at which). A chain is "
+            f"slow to leave an overestimate. {remedy}".rstrip()
         )
     n_failed = sum(count for _, count in statistics.failures)
     if n_failed > TOLERATED_FAILURES * statistics.evaluations:

@@ -18,6 +18,7 @@ from xarray import DataTree
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.pymc_model.inspection import filters_used
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
@@ -284,6 +285,7 @@ class ModelTask:
             sampling_time=self._ended - self._began,
         )
         tree.attrs |= {
+            **filters_used(self.model),
             "exact": int(target.exact),
             "refresh_noise": int(request.settings.refresh_noise),
             "correlation": request.settings.correlation or 0.0,
@@ -355,7 +357,8 @@ def _chain_warnings(
     for i, (draws, state) in enumerate(results):
         statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
         if statistics.iterations:
-            warning = closing_warning(statistics, target.growth(state.proposal_cov))
+            growth = target.growth(state.proposal_cov)
+            warning = closing_warning(statistics, growth, target.collapse_remedy)
             if warning is not None:
                 warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
             elif i in below:

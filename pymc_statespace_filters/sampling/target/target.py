@@ -6,6 +6,7 @@ the compiled graph; its ``bind`` gives a `BoundLogDensity`, callable from one th
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,12 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.graph_rewrites import pilot_filters
-from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds, state_space_nodes
+from pymc_statespace_filters.pymc_model.inspection import (
+    collapse_remedies,
+    exactness,
+    noise_seeds,
+    state_space_nodes,
+)
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import RandomBlock
 from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
@@ -130,6 +136,11 @@ class Target:
             return None
         graph = tempered_density(self._model, filters, PILOT_POWER)
         return LogDensity(*self._shared, fixed_noise=True, graph=graph)
+
+    @cached_property
+    def collapse_remedy(self) -> str:
+        """What to do where particles collapse, for every filter of the model that has some."""
+        return collapse_remedies(self._model)
 
     @property
     def carries_noise(self) -> bool:
