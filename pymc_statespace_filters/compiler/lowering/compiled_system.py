@@ -231,6 +231,11 @@ class CompiledSystem:
         return structure.has_smooth_transition(self.model)
 
     @cached_property
+    def has_smooth_sensor(self) -> bool:
+        """Whether no observable has a kink as a function of the state."""
+        return structure.has_smooth_sensor(self.model)
+
+    @cached_property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` depends on neither inputs nor time; False if unknown."""
         symbols = {name: symbols_of(self.model)[name] for name in ("theta", *"xut")}
