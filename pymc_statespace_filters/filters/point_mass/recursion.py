@@ -60,7 +60,7 @@ _GROWTH = 4
 class Table(NamedTuple):
     """Mean, sd and relative errors of a step from the points ``first`` on, and its kernel."""
 
-    first: int
+    first: np.int64
     mean: np.ndarray
     sd: np.ndarray
     errors: np.ndarray
@@ -162,8 +162,9 @@ def transition_at(system, k, t, spacing, reach, grid, table):
         old = block_of(table.first), block_of(table.first + table.mean.size)
         first, last = _range_with(block_of(low), block_of(end - 1) + 1, *old)
         X = grid_points(LANES * first, LANES * (last - first), spacing)
-        moments = _moments(system, k, t, X, spacing, spacing)
-        table = Table(LANES * first, *moments, no_tiles(table.tiles.low, table.tiles.high))
+        mean, sd, errors = _moments(system, k, t, X, spacing, spacing)
+        tiles = no_tiles(table.tiles.low, table.tiles.high)
+        table = Table(LANES * first, mean, sd, errors, tiles)
     points = slice(low - table.first, end - table.first)
     return tabled, table.mean[points], table.sd[points], table.errors[points], table
 

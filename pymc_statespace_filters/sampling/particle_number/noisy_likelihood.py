@@ -109,7 +109,7 @@ class NoisyLikelihood:
         seconds = (time.process_time() - began) / n_seeds
         return Estimates(np.where(totals < np.inf, totals, -np.inf), terms, seconds)
 
-    def prepare(self, filter: Filter) -> ParallelMap:
+    def prepare(self, filter: Any) -> ParallelMap:
         """Compile what `estimates` evaluates, unless it is there."""
         if filter not in self._densities:
             name = type(filter).__name__
