@@ -175,10 +175,10 @@ class ChainProgress(ProgressBarManager):
 
 
 class _RowProgress:
-    """A bar that appears once its task has taken two seconds, and disappears with the next task."""
+    """A bar that appears when its task has taken some seconds; the next task begins a new one."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        self._stack = stack
+    def __init__(self, stack: ExitStack, patience: float) -> None:
+        self._stack, self._patience = stack, patience
         self._total = self._done = 0
         self._shown: tuple | None = None
         self.begin("", 0)
@@ -192,16 +192,21 @@ class _RowProgress:
         self._task, self._total = task, total
         self._done, self._start = 0, perf_counter()
         self._shown = None
+        if task and self._patience == 0.0:
+            self._show()
 
     def advance(self, count: int) -> None:
         self._done += count
-        if self._shown is None and perf_counter() - self._start > PATIENCE:
-            bar = self._stack.enter_context(create_simple_progress())
-            self._shown = bar, bar.add_task(self._task, completed=0, total=self._total)
-            count = self._done
         if self._shown is not None:
             bar, row = self._shown
             bar.advance(row, advance=count)
+        elif perf_counter() - self._start > self._patience:
+            self._show()
+
+    def _show(self) -> None:
+        bar = self._stack.enter_context(create_simple_progress())
+        self._stack.enter_context(_quiet_compilation())
+        self._shown = bar, bar.add_task(self._task, completed=self._done, total=self._total)
 
 
 class ReportsRows(Protocol):
@@ -211,16 +216,31 @@ class ReportsRows(Protocol):
 
 
 @contextmanager
-def row_progress(work: ReportsRows, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
-    """Show the progress of work that takes long.
+def row_progress(
+    work: ReportsRows, *, enabled: bool, patience: float = PATIENCE
+) -> Iterator[Callable[[str, int], None]]:
+    """Show the progress of work that takes longer than ``patience`` seconds.
 
     Yields the function that begins a task, with its name and about how many rows it has.
     """
     with ExitStack() as stack:
-        bar = _RowProgress(stack)
+        bar = _RowProgress(stack, patience)
         if enabled:
             work.on_progress = bar.advance
-        yield bar.begin
+        yield bar.begin if enabled else lambda task, total: None
+
+
+_shown: list[object] = []  # bars, and lines that may be
+
+
+@contextmanager
+def _quiet_compilation() -> Iterator[None]:
+    """Show no line about compilation, which would be drawn over what is shown now."""
+    _shown.append(object())
+    try:
+        yield
+    finally:
+        _shown.pop()
 
 
 @contextmanager
@@ -230,7 +250,7 @@ def slow_compilation(name: str) -> Iterator[None]:
     The line disappears when the compilation ends.
     """
     console = Console(stderr=True)
-    if not console.is_terminal:
+    if not console.is_terminal or _shown:
         yield
         return
     status = console.status(f"Compiling {name}, once per installation ...")
@@ -238,7 +258,8 @@ def slow_compilation(name: str) -> Iterator[None]:
     timer.daemon = True
     timer.start()
     try:
-        yield
+        with _quiet_compilation():  # of parts
+            yield
     finally:
         timer.cancel()
         timer.join()

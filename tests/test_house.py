@@ -73,6 +73,7 @@ TOUCH_INSIDES = {
     "parallel/environment.py": "numba.core",
     # vector instructions that numba does not have
     "filters/kernel_density/simd_windows.py": ("llvmlite", "numba.core", "numba.extending"),
+    "filters/point_mass/tiles.py": ("llvmlite", "numba.core", "numba.extending"),
     # functions that run in Python too
     "sampling/kernel/adaptation_state.py": "numba.extending",
     "sampling/kernel/independence.py": "numba.extending",

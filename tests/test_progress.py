@@ -42,3 +42,24 @@ def test_without_a_terminal_nothing_is_written(capsys, monkeypatch):
     with progress.slow_compilation("pf_enkf"):
         pass
     assert capsys.readouterr() == ("", "")
+
+
+def test_parts_of_a_compilation_and_what_a_bar_shows_have_no_line_of_their_own(terminal):
+    with progress.slow_compilation("the model"), progress.slow_compilation("a part"):
+        sleep(0.3)
+    assert "Compiling the model" in terminal.getvalue()
+    assert "a part" not in terminal.getvalue()
+    terminal.truncate(0)
+
+    class Work:
+        on_progress = None
+
+    with progress.row_progress(Work(), enabled=True, patience=0.0) as begin:
+        begin("Pilot", 10)
+        with progress.slow_compilation("a filter"):
+            sleep(0.3)
+        begin("", 0)
+    assert "a filter" not in terminal.getvalue()
+    with progress.slow_compilation("the model"):
+        sleep(0.3)
+    assert "Compiling the model" in terminal.getvalue()

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numba import typeof
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
@@ -17,6 +18,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -124,7 +126,13 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
         return states, observations
 
     keys = (part.key for part in parts)
-    return _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {m} {p}", *keys))
+    cached = _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {m} {p}", *keys))
+    # At once and not by the first call, which PyMC makes when its bar is on the screen already.
+    vector, matrix, steps = np.zeros(1), np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
+    arguments = np.random.default_rng(0), vector, steps, matrix, 0.0
+    with slow_compilation("the simulation of this system"):
+        cached.function.compile(tuple(map(typeof, arguments)))
+    return cached
 
 
 def simulate(

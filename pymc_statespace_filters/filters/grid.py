@@ -60,6 +60,9 @@ POINT_MASS_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "terms": F64_PTR, "health": F64_PTR,
 }  # fmt: skip
 
+# Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
+_WITH_KINKS = 1e-5
+
 PointMassArguments = arguments_class("PointMassArguments", POINT_MASS_ARGUMENTS, __name__)
 
 
@@ -76,7 +79,8 @@ class GridFilter:
     ----------
     tolerance : float
         Largest error allowed in a term log p(d_j | d_1 .. d_{j-1}), by the filter's own error
-        estimate; between 1e-12 and 1e-2.
+        estimate; between 1e-12 and 1e-2. A larger one saves time: 1e-3 takes between a sixth and
+        four fifths of the time of 1e-8. A sensor with a kink, such as |x|, gets at least 1e-5.
 
     Raises
     ------
@@ -88,10 +92,16 @@ class GridFilter:
     The process noise must be additive given the state, ``g(x, q) = g(x, 0) + G(x) q``, and nowhere
     zero. A transition with kinks (`freeplay`, an absolute value) is integrated with an error of
     second order in the spacing, which the error estimate does not include: `is_exact_for` is then
-    False. Parameters that would need more than 8192 points get the log-likelihood minus infinity,
-    with that reason. Masses below the rounding error of the largest are dropped, until an
-    observation falls so far out that they matter. A grid point that diverges is left out, as a
-    particle that is not finite would be.
+    False. Beside the kink of a sensor the error is of second order, too, and is estimated: 1e-8
+    would need some 10^5 points there. Parameters that would need more than 8192 points get the
+    log-likelihood minus infinity, with that reason. Masses below the rounding error of the largest
+    are dropped, until an observation falls so far out that they matter. A grid point that diverges
+    is left out, as a particle that is not finite would be.
+
+    Time grows in proportion to the record: 1 to 3 microseconds for a step without an observation
+    where some hundred points suffice, 3 to 50 for an observation, the more the finer the sensor is.
+    Per step it grows with the spread of the state in standard deviations of a step's noise.
+    Smoothed states take two to four times as long as the likelihood.
 
     R. S. Bucy and K. D. Senne, "Digital synthesis of non-linear filters", Automatica 7 (1971).
 
@@ -139,6 +149,9 @@ class GridFilter:
                 "a smaller dt does without them"
             )
 
+    def _tolerance_for(self, system: System) -> float:
+        return self.tolerance if system.has_smooth_sensor else max(self.tolerance, _WITH_KINKS)
+
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood is that of the system, to the tolerance."""
         return system.has_exact_observation_density and system.has_smooth_transition
@@ -148,7 +161,7 @@ class GridFilter:
         POINT_MASS.compile()
         table = system_table(system, ("step_moments", "log_density"))
         evaluate, make_table, dt = POINT_MASS.external, table.make, system.dt
-        tolerance = self.tolerance
+        tolerance = self._tolerance_for(system)
 
         @njit_callable
         def run(theta, steps, observed, inputs, t0, noise):
@@ -172,15 +185,15 @@ class GridFilter:
 
         The draws of one ``draw_seed`` are independent; if smoothed, they are a path.
         """
-        return states_function(system, self.tolerance, moment)
+        return states_function(system, self._tolerance_for(system), moment)
 
     def compile_predictions(self, system: System) -> CompiledFunction[PredictionsFunction]:
         """Compile the law of every observation given those before it."""
-        return predictions_function(system, self.tolerance)
+        return predictions_function(system, self._tolerance_for(system))
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
-        return run_function(system, self.tolerance)
+        return run_function(system, self._tolerance_for(system))
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""

@@ -127,6 +127,10 @@ class System(Protocol):
         """Whether one step is known to have a Gaussian density given the state before."""
 
     @property
+    def has_smooth_sensor(self) -> bool:
+        """Whether no observable has a kink as a function of the state."""
+
+    @property
     def has_exact_observation_density(self) -> bool:
         """Whether `log_density` is exact, not a linearization."""
 

@@ -28,6 +28,7 @@ from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.record import check_system
 
@@ -117,7 +118,11 @@ def evaluator(op: FilterOp) -> Any:
     def evaluate(*values: Any) -> tuple:
         # Other types of arrays (in another order, or read-only) would be compiled again.
         arrays = [np.require(v, kind, ("C", "W")) for v, kind in zip(values, kinds, strict=True)]
-        results = machine_code(*arrays)
+        if not machine_code.overloads:
+            with slow_compilation(f"{type(op.filter).__name__} for this system"):
+                results = machine_code(*arrays)
+        else:
+            results = machine_code(*arrays)
         return results if isinstance(results, tuple) else (results,)
 
     return evaluate

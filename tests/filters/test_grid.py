@@ -375,3 +375,37 @@ def test_tails_that_a_surprise_asks_for_were_not_cut_off_before():
         data = np.array([0.4 + deviations * sd])
         expected = kalman_terms(system, data, steps)
         np.testing.assert_allclose(grid_terms(system, data, steps), expected, rtol=1e-9)
+
+
+def test_a_sensor_with_a_kink_has_a_tolerance_that_the_largest_grid_allows():
+    """Beside the kink of |x| the trapezoidal rule is of second order: 1e-8 would need 10^5 points.
+
+    The exact terms are by folding: a start at zero and a symmetric step make |x| of a walk the
+    state, with a smooth sensor.
+    """
+    walk = {
+        "process_noise": [[0.25]],
+        "observation_noise": [[0.04]],
+        "initial_mean": [0.0],
+        "initial_cov": [[1.0]],
+    }
+    kinked = psf.StateSpaceModel(lambda x, q: [0.9 * x[0] + q[0]], lambda x: [abs(x[0])], **walk)
+    observed, steps = np.array([0.8, 0.1, np.nan, 1.4, 0.05, 0.6]), np.arange(1, 7)
+    x = np.linspace(0.0, 6.0, 3001)  # the half line, with weights of the trapezoidal rule
+    weights = np.full(x.size, x[1])
+    weights[[0, -1]] *= 0.5
+    density, terms = 2.0 * norm.pdf(x), []
+    kernel = norm.pdf(x[:, None], 0.9 * x, 0.5) + norm.pdf(x[:, None], -0.9 * x, 0.5)
+    for d in observed:
+        density = kernel @ (weights * density)
+        seen = 1.0 if np.isnan(d) else norm.pdf(d, x, 0.2)
+        terms.append(np.log(weights @ (density * seen)))
+        density = density * seen / np.exp(terms[-1])
+    for tolerance in (1e-8, 1e-5):
+        found = psf.log_likelihood(
+            kinked, psf.GridFilter(tolerance=tolerance), {}, observed, steps=steps
+        )
+        np.testing.assert_allclose(found, terms, rtol=0.0, atol=1e-5)
+    assert not compile_system(kinked).has_smooth_sensor
+    assert compile_system(COUNTED).has_smooth_sensor
+    assert compile_system(DOUBLE_WELL_SYSTEM).has_smooth_sensor

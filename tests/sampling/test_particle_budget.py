@@ -12,6 +12,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread
 from pymc_statespace_filters.sampling.particle_number import suggest as particle_budget
+from pymc_statespace_filters.sampling.particle_number.effort import Effort, OutOfTimeError
+from pymc_statespace_filters.sampling.particle_number.noisy_likelihood import NoisyLikelihood
 from pymc_statespace_filters.sampling.particle_number.search import Row
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from tests.filters.truth_systems import log_likelihoods
@@ -83,7 +85,7 @@ def test_one_of_two_noisy_variables_is_tuned_on_its_own_noise():
     """The spread is to the rounding what it is where the other variable has no noise."""
     few, at = psf.BootstrapPF(4), np.array([0.6, -0.2])
     spreads = [
-        particle_budget._NoisyLikelihood(model, "a", np.random.default_rng(1)).spread(30, at, 40)
+        NoisyLikelihood(model, "a", np.random.default_rng(1), Effort(60.0)).spread(30, at, 40)
         for model in (two_records(few, few), two_records(few, psf.EKF()))
     ]
     np.testing.assert_allclose(spreads[0].variance, spreads[1].variance, rtol=1e-9)
@@ -142,13 +144,160 @@ def test_other_bad_arguments():
 def test_a_reading_is_a_warning_and_the_table_is_there(monkeypatch):
     noisy = SeedSpread(100, -1.0, 40.0, 30.0, 50.0, 0)
     rows = [Row(20, noisy, np.nan, 3, 1e-3), Row(200, noisy, np.nan, 1, 1e-2)]
-    monkeypatch.setattr(particle_budget._NoisyLikelihood, "points", lambda self: (None, []))
+    monkeypatch.setattr(NoisyLikelihood, "points", lambda self: (None, []))
     monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: rows)
     with pytest.warns(FilterWarning, match=r"d: the variance .* does not decrease to 3.3"):
         table = psf.suggest_particles(linear_model(psf.BootstrapPF(20)))
-    assert table.attrs == {"n_particles": 200}
+    assert table.attrs == {"n_particles": 200, "extrapolated": False, "noisiest": {}}
     assert list(table["suggested"]) == [False, True]
     assert list(table["n_failed"]) == [3, 1]
+
+
+SURPRISES = {20: 7.0, 41: -8.0}  # additions to two rows
+
+
+def surprising_model(filter=None):
+    """Two rows far from the prediction, where few of the particles are."""
+    data = DATA.copy()
+    for row, shift in SURPRISES.items():
+        data[row] += shift
+    with pm.Model() as model:
+        pm.Normal("phi", 0.8, 0.05)
+        psf.StateSpace(
+            "d",
+            LINEAR,
+            filter or psf.BootstrapPF(20),
+            params={"phi": model["phi"], "spread": 0.7},
+            steps=STEPS,
+            observed=data,
+        )
+    return model
+
+
+def with_points(monkeypatch, *points):
+    """No pilot: these points (1,) are the centre and the tail."""
+    first, *tail = (np.array([x]) for x in points)
+    monkeypatch.setattr(NoisyLikelihood, "points", lambda self: (first, tail))
+
+
+def after_evaluations(monkeypatch, n, reason):
+    """Raise when a result is there and n more evaluations have been made."""
+    made = []
+
+    def advance(self, count):
+        made.extend([None] * (count if self.is_limited else 0))
+        if len(made) > n:
+            raise reason
+
+    monkeypatch.setattr(Effort, "advance", advance)
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [(OutOfTimeError(), "stopped after max_seconds=180"), (KeyboardInterrupt(), "interrupted")],
+)
+def test_a_search_that_is_stopped_gives_what_it_knows(monkeypatch, reason, words):
+    with_points(monkeypatch, 0.8)
+    after_evaluations(monkeypatch, 10, reason)
+    model = surprising_model()
+    with pytest.warns(FilterWarning, match=f"d: {words}, with one number .* to 1/N") as caught:
+        table = psf.suggest_particles(model, random_seed=1, progressbar=False)
+    assert list(table.index) == [20]
+    assert not table["suggested"].any()
+    ratio = table.attrs["n_particles"] / 20
+    assert ratio == pytest.approx(table["variance_centre"].iloc[0] / (3.3 / 1.2**2), rel=0.2)
+    assert table.attrs["extrapolated"]
+    assert "the largest shares of the variance are" in str(caught[0].message)
+    assert set(table.attrs["noisiest"]) <= set(SURPRISES)
+    assert sum(table.attrs["noisiest"].values()) > 0.5
+
+
+def test_an_interrupt_before_the_first_result_is_one(monkeypatch):
+    def points(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(NoisyLikelihood, "points", points)
+    with pytest.raises(KeyboardInterrupt):
+        psf.suggest_particles(surprising_model(), random_seed=1)
+
+
+def test_a_filter_is_named_if_it_has_been_seen_to_cope(monkeypatch):
+    """The search ends at the largest number, 16 000; GridFilter has no noise at all."""
+    with_points(monkeypatch, 0.8)
+    noisy = SeedSpread(100, -1.0, 40.0, 30.0, 50.0, 0)
+
+    def search(measure, first, target):
+        return [measure(first)._replace(centre=noisy)]
+
+    monkeypatch.setattr(particle_budget, "search", search)
+    with pytest.warns(FilterWarning, match=r"41 \(.* %\).*GridFilter.* without noise"):
+        psf.suggest_particles(surprising_model(), random_seed=1, progressbar=False)
+
+
+def test_a_noisy_pilot_is_repeated_by_a_filter_of_the_same_posterior(monkeypatch):
+    model, used = surprising_model(), []
+    pilot = NoisyLikelihood._pilot
+
+    def watched(self, filter, start, share):
+        used.append(filter)
+        return pilot(self, filter, start, share)
+
+    monkeypatch.setattr(NoisyLikelihood, "_pilot", watched)
+    likelihood = NoisyLikelihood(model, None, np.random.default_rng(1), Effort(600.0))
+    centre, _ = likelihood.points()
+    assert used == [psf.BootstrapPF(200), psf.GridFilter()]
+    exact = surprising_model(psf.EKF()).compile_logp()
+    grid = np.linspace(0.6, 1.0, 401)
+    best = grid[np.argmax([exact({"phi": x}) for x in grid])]
+    assert centre[0] == pytest.approx(best, abs=0.01)
+
+
+def test_the_pilot_keeps_to_its_share_of_the_limit():
+    """With no time at all: 25 iterations or a few more, of 500."""
+    effort = Effort(1e-9)
+    likelihood = NoisyLikelihood(surprising_model(), None, np.random.default_rng(1), effort)
+    pilot = likelihood._pilot(psf.BootstrapPF(2000), np.array([0.8]), 0.25)
+    assert 25 <= pilot.n_iterations < 500
+    assert not pilot.is_complete
+    assert len(pilot.positions) > 0
+
+
+def test_the_bar_begins_with_the_call_and_names_the_work(monkeypatch):
+    shown = []
+
+    class Bar:
+        __enter__ = __exit__ = lambda self, *_: self
+
+        def add_task(self, task, completed, total):
+            shown.append([task, completed, total])
+            return 0
+
+        def advance(self, row, advance):
+            shown[-1][1] += advance
+
+    monkeypatch.setattr("pymc_statespace_filters.progress.create_simple_progress", Bar)
+    with_points(monkeypatch, 0.8, 0.7)
+    monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: [measure(3000)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FilterWarning)
+        psf.suggest_particles(linear_model_of_phi(), random_seed=1)
+    compiled, measured = shown[:2]
+    assert compiled == ["Compiling BootstrapPF, 3000 particles", 1, 1]
+    assert measured == ["3000 particles", 25, 25]
+
+
+def linear_model_of_phi():
+    with pm.Model() as model:
+        phi = pm.Normal("phi", 0.5, 0.5)
+        params = {"phi": phi, "spread": 0.7}
+        psf.StateSpace("d", LINEAR, psf.BootstrapPF(20), params=params, steps=STEPS, observed=DATA)
+    return model
+
+
+def test_bad_limits():
+    for value in (0.0, -1, "a minute", np.nan):
+        with pytest.raises(ModelError, match=r"max_seconds must be a positive number, got "):
+            psf.suggest_particles(linear_model(psf.BootstrapPF(20)), max_seconds=value)
 
 
 @pytest.mark.slow

@@ -246,6 +246,11 @@ class CompiledSystem:
         return jumping_equations(self.model)
 
     @cached_property
+    def has_smooth_sensor(self) -> bool:
+        """Whether no observable has a kink as a function of the state."""
+        return structure.has_smooth_sensor(self.model)
+
+    @cached_property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` depends on neither inputs nor time; False if unknown."""
         symbols = {name: symbols_of(self.model)[name] for name in ("theta", *"xut")}

@@ -70,9 +70,23 @@ def has_additive_process_noise(system: StateSpaceModel) -> bool:
 def has_smooth_transition(system: StateSpaceModel) -> bool:
     """Whether no part of the transition has a kink or a jump; False where undecided."""
     symbols = symbols_of(system)
-    transition = call(system.equations.transition, system, symbols)
+    return _is_smooth(call(system.equations.transition, system, symbols), symbols)
+
+
+def has_smooth_sensor(system: StateSpaceModel) -> bool:
+    """Whether an observation with noise has no kink or jump as a function of the state.
+
+    False where undecided. Distributions of observations count as smooth.
+    """
+    if system.equations.observation is None:
+        return True
+    symbols = symbols_of(system)
+    return _is_smooth(call(system.equations.observation, system, symbols), symbols)
+
+
+def _is_smooth(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
     try:
-        (values,) = unrolled(Graph(symbols, [transition]))
+        (values,) = unrolled(Graph(symbols, [vector]))
     except NotUnrollableError:
         return False
     return not any(isinstance(e.op, _KINKED) for e in depends_on(values, frozenset({"x.0"})))

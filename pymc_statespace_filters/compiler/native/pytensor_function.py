@@ -27,6 +27,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     call_address,
 )
+from pymc_statespace_filters.progress import slow_compilation
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 
@@ -72,7 +73,8 @@ class NativeFunction:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
         self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
-        self.shapes = [np.shape(result) for result in self(*example)]
+        with slow_compilation("the functions of the model"):
+            self.shapes = [np.shape(result) for result in self(*example)]
 
     @property
     def size(self) -> int:

@@ -55,7 +55,7 @@ def extent_of(mean, sd, mass, spacing, reach):
 
 
 @njit_internal
-def _add_gaussian(first, spacing, mean, sd, mass, out):
+def add_gaussian(first, spacing, mean, sd, mass, out):
     """Add the masses of mass * N(mean, sd^2) to ``out``, whose first point is number ``first``."""
     scale = spacing / sd
     height = mass * scale * _ONE_OVER_ROOT_TWO_PI
@@ -84,44 +84,13 @@ def scatter(low, n, spacing, mean, sd, mass, reach):
         first, last = max(first, float(low)), min(last, float(low + n))
         if mass[i] > 0.0 and first < last:
             target = out[np.int64(first) - low : np.int64(last) - low]
-            _add_gaussian(first, spacing, mean[i], sd[i], mass[i], target)
-    return out
-
-
-@njit_internal
-def transition_kernel(spacing, mean, sd, reach):
-    """The transition kernel by rows, one per source: (first targets, ends of rows, masses)."""
-    n = mean.size
-    first, end = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
-    for i in range(n):
-        start, stop = _target(mean[i], sd[i], spacing, reach)
-        if max(-start, stop) < _LARGEST_INDEX and stop - start <= MAX_POINTS:
-            first[i] = np.int64(start)
-            end[i + 1] = np.int64(stop - start)
-        end[i + 1] += end[i]
-    masses = np.zeros(end[n])
-    for i in range(n):
-        _add_gaussian(float(first[i]), spacing, mean[i], sd[i], 1.0, masses[end[i] : end[i + 1]])
-    return first, end, masses
-
-
-@njit_internal
-def scatter_rows(first, end, masses, mass, low, n):
-    """As `scatter`, with the rows of a `transition_kernel`."""
-    out = np.zeros(n)
-    for i in range(mass.size):
-        if mass[i] > 0.0 and end[i] < end[i + 1]:
-            row = masses[end[i] : end[i + 1]]
-            target = out[first[i] - low : first[i] - low + row.size]
-            source_mass = mass[i]
-            for b in range(row.size):
-                target[b] += source_mass * row[b]
+            add_gaussian(first, spacing, mean[i], sd[i], mass[i], target)
     return out
 
 
 @njit_reassoc
 def _mean_over_gaussian(first, spacing, mean, sd, values):
-    """Sum of ``values`` times the masses that `_add_gaussian` gives a unit mass."""
+    """Sum of ``values`` times the masses that `add_gaussian` gives a unit mass."""
     scale = spacing / sd
     start = (first * spacing - mean) / sd
     result = 0.0
@@ -141,21 +110,6 @@ def gather(low, spacing, values, mean, sd, reach):
         if first < last:
             target = values[np.int64(first) - low : np.int64(last) - low]
             out[i] = _mean_over_gaussian(first, spacing, mean[i], sd[i], target)
-    return out
-
-
-@njit_reassoc
-def gather_rows(first, end, masses, low, values, n):
-    """As `gather`, with the first ``n`` rows of a `transition_kernel`."""
-    out = np.empty(n)
-    for i in range(n):
-        start = max(first[i], low)
-        size = min(first[i] + end[i + 1] - end[i], low + values.size) - start
-        at, target = end[i] + start - first[i], start - low
-        result = 0.0
-        for b in range(size):
-            result += masses[at + b] * values[target + b]
-        out[i] = result
     return out
 
 

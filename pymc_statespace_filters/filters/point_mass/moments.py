@@ -5,6 +5,7 @@ import math
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
 
 _HALVINGS = 40  # of the bisection for a draw within a cell
+_STRIDE = 16  # points, in the search for that cell
 
 
 @njit_internal
@@ -51,8 +52,9 @@ def draw(low, spacing, mass, u):
     # The integral over a cell is its mass plus 1/24 of the second difference, which telescopes.
     total = total_mass(mass) - (mass[0] + mass[-1]) / 24.0
     wanted = u * total
-    i, before, masses = 0, 0.0, mass[0]
-    end = masses + (mass[1] - mass[0] - mass[0]) / 24.0
+    i, masses = _start_of_search(mass, wanted)
+    before = masses - mass[i] + (mass[i] - mass[i - 1] - mass[0]) / 24.0 if i > 0 else 0.0
+    end = masses + (mass[i + 1] - mass[i] - mass[0]) / 24.0
     while i + 2 < n and end < wanted:
         i += 1
         masses += mass[i]
@@ -60,6 +62,20 @@ def draw(low, spacing, mass, u):
     if end < wanted:
         i, before = n - 1, end
     return (low + i + _position_in_cell(mass, i, wanted - before)) * spacing
+
+
+@njit_reassoc
+def _start_of_search(mass, wanted):
+    """A point whose cell ends below ``wanted``, or the first one, and the sum of masses to it."""
+    i, before = 0, mass[0]
+    while i + 2 * _STRIDE < mass.size:
+        masses, j = before, i + _STRIDE
+        for b in range(_STRIDE):
+            masses += mass[i + 1 + b]
+        if masses + (mass[j + 1] - mass[j] - mass[0]) / 24.0 >= wanted:
+            break
+        i, before = j, masses
+    return i, before
 
 
 @inline_always

@@ -3,11 +3,12 @@
 A *grid* is (low, spacing, masses), see the module `grid`. Its *source* is the mixture of Gaussians
 (means, standard deviations, masses) that was evaluated on it; the source has a density at any
 point, so a finer grid, where an observation requires one, is evaluated from it. A state known
-exactly, x_0, is the grid of the single point 1 with spacing x_0. A *table* stores the transition
-kernel of a step that is the same at every time: (first point, mean, sd, errors, rows).
+exactly, x_0, is the grid of the single point 1 with spacing x_0. A `Table` stores the
+transition kernel of a step that is the same at every time.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,11 +29,18 @@ from pymc_statespace_filters.filters.point_mass.grid import (
     highest,
     normalise,
     scatter,
-    scatter_rows,
     significant,
     total,
-    transition_kernel,
     weigh,
+)
+from pymc_statespace_filters.filters.point_mass.tiles import (
+    LANES,
+    Tiles,
+    block_of,
+    multiply,
+    no_tiles,
+    tiles_to_sources,
+    tiles_to_targets,
 )
 from pymc_statespace_filters.filters.system_table import log_density, step_moments
 
@@ -45,11 +53,37 @@ REFINEMENT = 0.7
 _KNOWN = 1e-15  # a smaller standard deviation, relative to the mean, is lost in rounding
 
 
+# A table grows to what it held before and holds now, up to this multiple of what is needed now.
+_GROWTH = 4
+
+
+class Table(NamedTuple):
+    """Mean, sd and relative errors of a step from the points ``first`` on, and its kernel."""
+
+    first: np.int64
+    mean: np.ndarray
+    sd: np.ndarray
+    errors: np.ndarray
+    tiles: Tiles
+
+
 @njit_internal
 def empty_table():
     """A table without points."""
-    values, indices = np.empty(0), np.empty(0, np.int64)
-    return np.int64(0), values, values, values, (indices, indices, values)
+    values, zero = np.empty(0), np.int64(0)
+    return Table(zero, values, values, values, no_tiles(zero, zero))
+
+
+@njit_internal
+def _range_with(first, end, old_first, old_end):
+    """A range of blocks with a margin, and with the one before unless that is too large."""
+    margin = (end - first) // 4 + 1
+    low, high = first - margin, end + margin
+    if old_first < old_end:
+        both_low, both_high = min(low, old_first), max(high, old_end)
+        if both_high - both_low <= _GROWTH * (high - low):
+            low, high = both_low, both_high
+    return low, high
 
 
 @njit_internal
@@ -105,8 +139,10 @@ def predict(system, k, t, spacing, reach, grid, table):
         code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
         return code, grid, source, table, lost
     if tabled:
-        starts, ends, masses = rows_from(low, table)
-        out = scatter_rows(starts, ends, masses, mass, target, n)
+        first, end = block_of(target), block_of(target + n - 1) + 1
+        table = with_targets(table, spacing, reach, first, end)
+        out = multiply(table.tiles, low, mass, first, end - first)
+        target = LANES * first
     else:
         out = scatter(target, n, spacing, *source, reach)
     i, j = significant(out, truncation_of(reach))
@@ -118,26 +154,49 @@ def transition_at(system, k, t, spacing, reach, grid, table):
     """The transition from every point: (whether it is tabled, mean, sd, errors, table)."""
     low, grid_spacing, mass = grid
     tabled = system.is_time_invariant and grid_spacing == spacing and mass.size > 1
-    first, mean, sd, errors, rows = table
-    if not tabled or low < first or low + mass.size > first + mean.size:
-        first, n = low, mass.size
-        if tabled:  # a margin for the density to move within
-            first, n = low - n // 4, n + n // 2
-        mean, sd, errors = _moments(
-            system, k, t, grid_points(first, n, grid_spacing), grid_spacing, spacing
-        )
-        if tabled:
-            rows = transition_kernel(spacing, mean, sd, reach)
-            table = first, mean, sd, errors, rows
-    points = slice(low - first, low - first + mass.size)
-    return tabled, mean[points], sd[points], errors[points], table
+    if not tabled:
+        X = grid_points(low, mass.size, grid_spacing)
+        return tabled, *_moments(system, k, t, X, grid_spacing, spacing), table
+    end = low + mass.size
+    if low < table.first or end > table.first + table.mean.size:
+        old = block_of(table.first), block_of(table.first + table.mean.size)
+        first, last = _range_with(block_of(low), block_of(end - 1) + 1, *old)
+        X = grid_points(LANES * first, LANES * (last - first), spacing)
+        mean, sd, errors = _moments(system, k, t, X, spacing, spacing)
+        tiles = no_tiles(table.tiles.low, table.tiles.high)
+        table = Table(LANES * first, mean, sd, errors, tiles)
+    points = slice(low - table.first, end - table.first)
+    return tabled, table.mean[points], table.sd[points], table.errors[points], table
 
 
 @njit_internal
-def rows_from(low, table):
-    """The rows of a table's kernel from point ``low`` on."""
-    first, _, _, _, (starts, ends, masses) = table
-    return starts[low - first :], ends[low - first :], masses
+def _is_within(first, end, tiles):
+    """Whether tiles reach the targets in blocks [first, end)."""
+    return tiles.block.size > 0 and tiles.low <= first and end <= tiles.high
+
+
+@njit_internal
+def with_targets(table, spacing, reach, first, end):
+    """The table with tiles for a prediction of blocks [first, end)."""
+    start, mean, sd, errors, tiles = table
+    if _is_within(first, end, tiles):
+        return table
+    low, high = _range_with(first, end, tiles.low, tiles.high)
+    return Table(
+        start, mean, sd, errors, tiles_to_targets(start, spacing, mean, sd, reach, low, high)
+    )
+
+
+@njit_internal
+def with_sources(table, spacing, reach, first, end):
+    """The table with tiles for the adjoint of a prediction of blocks [first, end)."""
+    start, mean, sd, errors, tiles = table
+    if _is_within(first, end, tiles):
+        return table
+    low, high = _range_with(first, end, tiles.low, tiles.high)
+    return Table(
+        start, mean, sd, errors, tiles_to_sources(start, spacing, mean, sd, reach, low, high)
+    )
 
 
 @njit_internal

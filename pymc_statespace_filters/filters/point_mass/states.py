@@ -48,15 +48,16 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     first_grid,
     next_grid,
 )
-from pymc_statespace_filters.filters.point_mass.grid import gather, gather_rows, grid_points
+from pymc_statespace_filters.filters.point_mass.grid import gather, grid_points
 from pymc_statespace_filters.filters.point_mass.moments import draw, mean_and_sd, total_mass
 from pymc_statespace_filters.filters.point_mass.recursion import (
     TOO_SHORT,
     empty_table,
     has_valid_covariances,
-    rows_from,
     transition_at,
+    with_sources,
 )
+from pymc_statespace_filters.filters.point_mass.tiles import LANES, block_of, multiply
 from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
 from pymc_statespace_filters.filters.system_table import (
     SYSTEM_ARGUMENTS,
@@ -203,8 +204,11 @@ def _predict_adjoint(system, k, t, spacing, reach, grid, table, later, ratio):
     low, _, mass = grid
     tabled, mean, sd, _, table = transition_at(system, k, t, spacing, reach, grid, table)
     if tabled and later[1] == spacing:
-        starts, ends, masses = rows_from(low, table)
-        ratio = gather_rows(starts, ends, masses, later[0], ratio, mass.size)
+        end = block_of(later[0] + ratio.size - 1) + 1
+        table = with_sources(table, spacing, reach, block_of(later[0]), end)
+        first, end = block_of(low), block_of(low + mass.size - 1) + 1
+        rows = multiply(table.tiles, later[0], ratio, first, end - first)
+        ratio = rows[low - LANES * first : low - LANES * first + mass.size]
     else:
         ratio = gather(later[0], later[1], ratio, mean, sd, reach)
     return mean, sd, ratio, table
@@ -215,8 +219,9 @@ def _backward_weights(mass, mean, sd, x):
     """Masses times the densities of the state x one step later."""
     out = np.empty(mass.size)
     for i in range(mass.size):
-        z = (x - mean[i]) / sd[i]
-        weight = mass[i] / sd[i] * exp(-0.5 * z * z)
+        precision = 1.0 / sd[i]
+        z = (x - mean[i]) * precision
+        weight = mass[i] * precision * exp(-0.5 * z * z)
         out[i] = weight if weight > 0.0 else 0.0  # a diverged point gives NaN
     return out
 

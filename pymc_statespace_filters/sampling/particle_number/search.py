@@ -74,9 +74,30 @@ def choose(rows: Sequence[Row], target: tuple[float, float]) -> tuple[Row, str |
         f"the variance of the estimated log-likelihood at the centre does not decrease to "
         f"{high:g}: it is {first.centre.variance:.3g} with {first.n_particles} particles and "
         f"{last.centre.variance:.3g} with {last.n_particles}, the most tried. If it decreases "
-        "slower than 1/N, particles collapse at some observation: find it as the one whose terms "
-        "of psf.log_likelihood vary most over seeds, and compare filters there"
+        "slower than 1/N, particles collapse at some observation"
     )
+
+
+def best_guess(rows: Sequence[Row], target: tuple[float, float]) -> tuple[int, Row | None]:
+    """The number to suggest after an unfinished search, and its row if it was measured.
+
+    If no number has a variance in the target, one is extrapolated: variance proportional to 1/N.
+    """
+    low, high = target
+    aim = high / _margin(target) ** 2
+    inside = [row for row in rows if low <= row.centre.variance <= high]
+    if inside:
+        row = min(inside, key=lambda row: abs(_log_ratio(row.centre.variance, aim)))
+        return row.n_particles, row
+    row = nearest_row(rows, aim)
+    if not 0.0 < row.centre.variance < math.inf:
+        return row.n_particles, row
+    return round_up(row.n_particles * row.centre.variance / aim), None
+
+
+def nearest_row(rows: Sequence[Row], aim: float) -> Row:
+    """The row whose variance is nearest to the aim, of several the one with most particles."""
+    return min(rows, key=lambda row: (abs(_log_ratio(row.centre.variance, aim)), -row.n_particles))
 
 
 def _margin(target: tuple[float, float]) -> float:
@@ -89,9 +110,7 @@ def _next_number(rows: Sequence[Row], first: int, target: tuple[float, float]) -
     margin, most = _margin(target), _GROWTH * max(first, _FIRST)
     aim = high / margin**2
     numbers = [row.n_particles for row in rows]
-    nearest = min(
-        rows, key=lambda row: (abs(_log_ratio(row.centre.variance, aim)), -row.n_particles)
-    )
+    nearest = nearest_row(rows, aim)
     if abs(_log_ratio(nearest.centre.variance, aim)) > math.log(margin):
         factor = min(_JUMP, max(1.0 / _JUMP, nearest.centre.variance / aim))
         proposed = min(most, round_up(nearest.n_particles * factor))

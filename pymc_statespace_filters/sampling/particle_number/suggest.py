@@ -1,46 +1,36 @@
 """``suggest_particles``: the number of particles for a noisy likelihood, measured on the model."""
 
-import time
 import warnings
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from pymc.model import Model
-from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.pymc_model.graph_rewrites import with_filter
-from pymc_statespace_filters.pymc_model.inspection import noise_seeds, noisy_filters, resized
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.output.likelihood_variance import (
-    TARGET,
-    TOO_NOISY,
-    SeedSpread,
-    acceptance_share,
-    seed_spread,
+from pymc_statespace_filters.progress import row_progress
+from pymc_statespace_filters.sampling.output.likelihood_variance import TARGET, acceptance_share
+from pymc_statespace_filters.sampling.particle_number.effort import Effort, OutOfTimeError
+from pymc_statespace_filters.sampling.particle_number.measurement import Measurement
+from pymc_statespace_filters.sampling.particle_number.noisy_likelihood import NoisyLikelihood
+from pymc_statespace_filters.sampling.particle_number.search import (
+    Row,
+    best_guess,
+    choose,
+    nearest_row,
+    search,
 )
-from pymc_statespace_filters.sampling.particle_number.pilot_chain import SETTINGS as PILOT_SETTINGS
-from pymc_statespace_filters.sampling.particle_number.pilot_chain import Pilot, run_pilot
-from pymc_statespace_filters.sampling.particle_number.search import Row, choose, search
-from pymc_statespace_filters.sampling.target.log_density import BoundLogDensity, LogDensity
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.sampling.target.variables import (
-    RaveledVariables,
-    continuous_value_vars,
-)
-from pymc_statespace_filters.system.checks import check_random_seed
+from pymc_statespace_filters.system.checks import check_positive, check_random_seed
 
-# Evaluations at a point: in a first estimate, at the centre, and at each point of the tail.
-_FIRST, _CENTRE, _TAIL = 25, 100, 30
-# Beyond this factor from the target the first estimate suffices.
-_NEAR = 4.0
-# The tail points among the pilot's draws: fractions of the draws of lower density.
-_TAIL_FRACTIONS = (0.01, 0.02, 0.03, 0.04, 0.05)
-# The best of the pilot's draws, compared by the mean of their estimates.
-_N_BEST, _PER_BEST = 5, 12
-# Particles of the pilot: least, most, and the most by which they are multiplied.
-_PILOT_LEAST, _PILOT_MOST, _PILOT_GROWTH = 200, 1000, 16
+
+class _Suggestion(NamedTuple):
+    """The number, its row unless it was not measured, the row it follows from, and the problem."""
+
+    n_particles: int
+    row: Row | None
+    basis: Row
+    problem: str | None
 
 
 def suggest_particles(
@@ -49,6 +39,8 @@ def suggest_particles(
     var_name: str | None = None,
     target: tuple[float, float] = TARGET,
     random_seed: int | np.random.Generator | None = None,
+    max_seconds: float = 180.0,
+    progressbar: bool = True,
 ) -> pd.DataFrame:
     """Find the number of particles at which a chain gains most per unit of time.
 
@@ -68,13 +60,21 @@ def suggest_particles(
         Range for the variance of the estimated log-likelihood. Per unit of time chains gain most
         between 1 and 3.3 [1]_, [2]_.
     random_seed : None, int or numpy.random.Generator
-        It determines the table except the column ``seconds``.
+        It determines the table except the column ``seconds``, unless ``max_seconds`` is reached.
+    max_seconds : float, default 180
+        Time after which the search ends with what it has measured. Compilation does not count, and
+        the first 25 estimates are always made.
+    progressbar : bool
+        Whether to show what is being measured, and how far it is.
 
     Returns
     -------
     pandas.DataFrame
         A row for each number measured, indexed by ``n_particles``; the suggested number is in
-        ``attrs["n_particles"]``. Its columns are
+        ``attrs["n_particles"]``, and ``attrs["extrapolated"]`` says whether it was not measured but
+        computed from another, because time was up. ``attrs["noisiest"]`` are the rows of the
+        record, from 0, that carry most of the variance, with their shares: the fewest that carry
+        half of it, at most five. The columns are
 
         ``variance_centre``, ``variance_low``, ``variance_high``
             variance of the estimated log-likelihood at the centre, and a 95 % interval for it
@@ -101,7 +101,9 @@ def suggest_particles(
     -----
     FilterWarning
         If no number tried brings the variance into the target range, or if it is above 10 in the
-        tail.
+        tail; if time is up, or the user interrupts (Ctrl-C) when a number has been measured; if
+        1000 particles or more are needed for a fiftieth of the observations. It names the
+        observations that carry the variance, and a filter with less noise if the system allows one.
 
     Notes
     -----
@@ -111,9 +113,13 @@ def suggest_particles(
     margin for the error of measurement, and below 10 at the tail points; it is 10 if the variance
     is below the target even with 10 particles.
 
-    The cost is 1000 to 1300 evaluations for the pilot, with 200 to 1000 particles, twice that if
-    its own variance turns out to be above 10, and 250 for each of at most seven numbers. Numbers
-    above 64 times the model's own, and above 16 000, are not tried.
+    The cost is 1000 to 1300 evaluations for the pilot, with 200 to 1000 particles, in two threads,
+    and 250 for each of at most seven numbers, in as many threads as there are cores. If the pilot's
+    own variance turns out to be above 10 it is repeated: with `GridFilter` or `GuidedPF` if the
+    model's filter is unbiased and the system allows one of them, which has the same posterior, else
+    with up to sixteen times as many particles. A pilot is cut when a quarter of ``max_seconds`` has
+    passed, a repeated one after half. Numbers above 64 times the model's own, and above 16 000, are
+    not tried.
 
     The number of particles changes the variance, and for EnKF and PFEnKF also the bias, which a
     small variance does not exclude.
@@ -149,90 +155,49 @@ def suggest_particles(
     >>> bool(1.0 < table.loc[table.attrs["n_particles"], "variance_centre"] < 3.3)
     True
     """
-    low, high = _checked_target(target)
-    likelihood = _NoisyLikelihood(model, var_name, check_random_seed(random_seed))
-    centre, tail = likelihood.points()
-
-    def measure(n_particles: int) -> Row:
-        spread, seconds = likelihood.timed_spread(n_particles, centre, _FIRST)
-        if not low / _NEAR <= spread.variance <= high * _NEAR:
-            return Row(n_particles, spread, np.nan, spread.n_failed, seconds)
-        spread, seconds = likelihood.timed_spread(n_particles, centre, _CENTRE)
-        spreads = [likelihood.spread(n_particles, point, _TAIL) for point in tail]
-        n_failed = spread.n_failed + sum(s.n_failed for s in spreads)
-        return Row(n_particles, spread, max(s.variance for s in spreads), n_failed, seconds)
-
-    rows = search(measure, likelihood.filter.size(), (low, high))
-    suggested, problem = choose(rows, (low, high))
-    if problem is not None:
-        warnings.warn(f"{likelihood.name}: {problem}", FilterWarning, stacklevel=2)
-    return _table(rows, suggested)
-
-
-class _NoisyLikelihood:
-    """The log-density of a model for any number of particles of one noisy variable."""
-
-    def __init__(self, model: Model, var_name: str | None, rng: np.random.Generator):
-        self.name, self.filter = _noisy_variable(model, var_name)
-        self._model, self._rng = model, rng
-        self._seeds = noise_seeds(model)
-        self._point = model.initial_point(random_seed=0)
-        self._raveled = RaveledVariables(continuous_value_vars(None, model), self._point)
-        if not self._raveled.dim:
-            raise ModelError("model must have at least one free variable, it has none")
-        self._densities: dict[int, BoundLogDensity] = {}
-
-    def points(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Run the pilot; the centre of the posterior and its tail points, shape (d,) each."""
-        n = min(max(self.filter.size(), _PILOT_LEAST), _PILOT_MOST)
-        pilot = self._pilot(n, self._raveled.ravel(self._point))
-        centre, variance = self._best(n, pilot)
-        if variance > TOO_NOISY:  # the pilot's target was mostly noise
-            n = round(n * min(variance, _PILOT_GROWTH))
-            pilot = self._pilot(n, centre)
-            centre, _ = self._best(n, pilot)
-        tail = [int(np.argmin(np.abs(pilot.fractions - f))) for f in _TAIL_FRACTIONS]
-        return centre, [pilot.positions[i] for i in dict.fromkeys(tail)]
-
-    def spread(self, n_particles: int, position: np.ndarray, n_seeds: int) -> SeedSpread:
-        """Seed spread at a point, with fixed noise of the other variables."""
-        seeds = np.tile([int(s.get_value()) for s in self._seeds.values()], (n_seeds, 1))
-        seeds[:, list(self._seeds).index(self.name)] = draw_seeds(self._rng, (n_seeds,))
-        return seed_spread(self._density(n_particles), position, (), seeds)
-
-    def timed_spread(
-        self, n_particles: int, position: np.ndarray, n_seeds: int
-    ) -> tuple[SeedSpread, float]:
-        """Seed spread, and the CPU time of an evaluation in seconds."""
-        self._density(n_particles)
-        began = time.process_time()
-        spread = self.spread(n_particles, position, n_seeds)
-        return spread, (time.process_time() - began) / n_seeds
-
-    def _density(self, n_particles: int) -> BoundLogDensity:
-        if n_particles not in self._densities:
-            variables, graph = self._raveled.variables, self._graph(n_particles)
-            density = LogDensity(self._model, variables, self._point, self._seeds, graph=graph)
-            self._densities[n_particles] = density.bind()
-            self.spread(n_particles, self._raveled.ravel(self._point), 1)  # the first call compiles
-        return self._densities[n_particles]
-
-    def _graph(self, n_particles: int) -> TensorVariable:
-        filters = {self.name: resized(self.filter, n_particles)}
-        return with_filter([self._model.logp()], self._model, filters)[0]
-
-    def _pilot(self, n_particles: int, start: np.ndarray) -> Pilot:
-        target = Target(self._model, None, PILOT_SETTINGS, graph=self._graph(n_particles))
-        return run_pilot(target, start, self._rng)
-
-    def _best(self, n_particles: int, pilot: Pilot) -> tuple[np.ndarray, float]:
-        """Compare the highest draws by new estimates, as those with fixed noise are too high."""
-        spreads = [self.spread(n_particles, x, _PER_BEST) for x in pilot.positions[:_N_BEST]]
-        best = int(np.argmax([spread.mean for spread in spreads]))
-        return pilot.positions[best], spreads[best].variance
+    target = _checked_target(target)
+    effort = Effort(check_positive("max_seconds", max_seconds))
+    likelihood = NoisyLikelihood(model, var_name, check_random_seed(random_seed), effort)
+    measurement = Measurement(likelihood, effort, target)
+    with row_progress(effort, enabled=progressbar, patience=0.0) as announce:
+        effort.announce = announce
+        try:
+            measurement.find_points()
+            rows = search(measurement.measure, likelihood.filter.size(), target)
+            row, problem = choose(rows, target)
+            found = _Suggestion(row.n_particles, row, row, problem)
+        except (OutOfTimeError, KeyboardInterrupt) as reason:
+            rows = sorted(measurement.rows.values())
+            if not rows:
+                raise
+            is_late = isinstance(reason, OutOfTimeError)
+            stopped = f"stopped after max_seconds={max_seconds:g}" if is_late else "interrupted"
+            found = _unfinished(rows, target, stopped)
+        if found.problem is None and not likelihood.pilot_is_complete:
+            cut = "the pilot was cut to keep max_seconds, so that the centre may be off"
+            found = found._replace(problem=cut)
+        advice = measurement.advice(found.basis, found.n_particles, found.problem)
+    if text := ". ".join([found.problem, *advice] if found.problem else advice):
+        warnings.warn(f"{likelihood.name}: {text}", FilterWarning, stacklevel=2)
+    return _table(rows, found, measurement.noisiest_at(found.basis))
 
 
-def _table(rows: list[Row], suggested: Row) -> pd.DataFrame:
+def _unfinished(rows: Sequence[Row], target: tuple[float, float], stopped: str) -> _Suggestion:
+    """What is known after an unfinished search."""
+    n, row = best_guess(rows, target)
+    basis = nearest_row(rows, target[1]) if row is None else row
+    measured = "one number" if len(rows) == 1 else f"{len(rows)} numbers"
+    if row is None:
+        how = (
+            f"{n} particles are extrapolated from the variance of {basis.centre.variance:.3g} "
+            f"with {basis.n_particles}, as about proportional to 1/N"
+        )
+    else:
+        how = f"{n} particles are the best of them, with a variance of {row.centre.variance:.3g}"
+    return _Suggestion(n, row, basis, f"{stopped}, with {measured} of particles measured: {how}")
+
+
+def _table(rows: Sequence[Row], found: _Suggestion, noisiest: Mapping[int, float]) -> pd.DataFrame:
     table = pd.DataFrame(
         {
             "n_particles": [row.n_particles for row in rows],
@@ -243,32 +208,15 @@ def _table(rows: list[Row], suggested: Row) -> pd.DataFrame:
             "n_failed": [row.n_failed for row in rows],
             "acceptance": [acceptance_share(row.centre.variance) for row in rows],
             "seconds": [row.seconds for row in rows],
-            "suggested": [row is suggested for row in rows],
+            "suggested": [row is found.row for row in rows],
         }
     ).set_index("n_particles")
-    table.attrs["n_particles"] = suggested.n_particles
+    table.attrs |= {
+        "n_particles": found.n_particles,
+        "extrapolated": found.row is None,
+        "noisiest": dict(noisiest),
+    }
     return table
-
-
-def _noisy_variable(model: Any, var_name: Any) -> tuple[str, Any]:
-    """Give the variable to tune, and its filter."""
-    if not isinstance(model, Model):
-        raise ModelError(f"model must be a pymc.Model, got {model!r}")
-    filters = noisy_filters(model)
-    if not filters:
-        raise ModelError(
-            "model must have a StateSpace variable with a noisy likelihood (EnKF, BootstrapPF, "
-            "PFEnKF), got a model without one"
-        )
-    listed = ", ".join(map(repr, filters))
-    if var_name is None and len(filters) > 1:
-        raise ModelError(
-            f"var_name must be one of {listed}, as several variables are noisy, got None"
-        )
-    name = next(iter(filters)) if var_name is None else var_name
-    if name not in filters:
-        raise ModelError(f"var_name must be a variable with a noisy filter, {listed}, got {name!r}")
-    return name, filters[name]
 
 
 def _checked_target(target: Any) -> tuple[float, float]:

@@ -65,6 +65,8 @@ class LogDensity:
     group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together. The first, this one, evaluates the
         log-density; the others call `leader_follower.follow`.
+    extra : sequence of TensorVariable
+        Further results for `at_rows`.
     """
 
     def __init__(
@@ -79,12 +81,14 @@ class LogDensity:
         correlation: float | None = None,
         graph: TensorVariable | None = None,
         group: Communicator | None = None,
+        extra: Sequence[TensorVariable] = (),
     ):
         others = [v for v in model.value_vars if v not in variables]
         self.others = tuple(v.name for v in others)
         density = model.logp() if graph is None else graph
         outputs = [density, model.logp(vars=model.free_RVs), *health_outputs([density])]
         self._n_healths = len(outputs) - 2
+        outputs += extra
         seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
         noise_inputs: list[Variable] = []
         noise: list[Variable] = []
@@ -140,8 +144,8 @@ class LogDensity:
     def at_rows(self) -> "ParallelMap | RowsOnAllRanks":
         """A function of positions (m, d) and m seeds of each noisy variable.
 
-        The first columns of its results are the log-density and that of the prior. It works in
-        threads, unless all ranks evaluate together.
+        The first columns of its results are the log-density and that of the prior, the last ones
+        are ``extra``. It works in threads, unless all ranks evaluate together.
         """
         if self._leader is not None:
             return RowsOnAllRanks(self.bind())

@@ -1,0 +1,167 @@
+"""The estimated likelihood of a model, at points of its posterior, for any number of particles."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymc.model import Model
+
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.pymc_model.graph_rewrites import (
+    likelihood_terms,
+    quiet_filter,
+    with_filter,
+)
+from pymc_statespace_filters.pymc_model.inspection import noise_seeds, noisy_filters, resized
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
+from pymc_statespace_filters.sampling.output.likelihood_variance import (
+    TOO_NOISY,
+    SeedSpread,
+    spread_of,
+)
+from pymc_statespace_filters.sampling.particle_number.effort import Effort
+from pymc_statespace_filters.sampling.particle_number.pilot_chain import (
+    SETTINGS,
+    Pilot,
+    pilot_chains,
+    run_pilot,
+)
+from pymc_statespace_filters.sampling.target.log_density import LogDensity
+from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.sampling.target.variables import (
+    RaveledVariables,
+    continuous_value_vars,
+)
+
+# The tail points among the pilot's draws: fractions of the draws of lower density.
+_TAIL_FRACTIONS = (0.01, 0.02, 0.03, 0.04, 0.05)
+# The best of the pilot's draws, compared by the mean of their estimates.
+_N_BEST, _PER_BEST = 5, 12
+# Particles of the pilot: least, most, and the most by which they are multiplied.
+_PILOT_LEAST, _PILOT_MOST, _PILOT_GROWTH = 200, 1000, 16
+# Parts of the limit in seconds after which the first and the second pilot are cut.
+_FIRST_SHARE, _SECOND_SHARE = 0.25, 0.5
+
+
+class Estimates(NamedTuple):
+    """Estimates at one point, of which some may be minus infinity, and what they cost."""
+
+    totals: np.ndarray  # (R,)
+    terms: np.ndarray  # (R, J), of the likelihood
+    seconds: float  # CPU time of one
+
+    @property
+    def spread(self) -> SeedSpread:
+        """Moments of the totals."""
+        return spread_of(self.totals)
+
+
+class NoisyLikelihood:
+    """The log-density of a model for any number of particles of one noisy variable."""
+
+    def __init__(
+        self, model: Model, var_name: str | None, rng: np.random.Generator, effort: Effort
+    ):
+        self.name, self.filter = noisy_variable(model, var_name)
+        self.pilot_is_complete = True
+        self._model, self._rng, self._effort = model, rng, effort
+        self._seeds = noise_seeds(model)
+        self._point = model.initial_point(random_seed=0)
+        self._raveled = RaveledVariables(continuous_value_vars(None, model), self._point)
+        if not self._raveled.dim:
+            raise ModelError("model must have at least one free variable, it has none")
+        self._densities: dict[Filter, ParallelMap] = {}
+
+    def points(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Run the pilot; the centre of the posterior and its tail points, shape (d,) each."""
+        n = min(max(self.filter.size(), _PILOT_LEAST), _PILOT_MOST)
+        filter = resized(self.filter, n)
+        pilot = self._pilot(filter, self._raveled.ravel(self._point), _FIRST_SHARE)
+        centre, variance = self._best(filter, pilot)
+        quiet = self.quiet_filter() if self.filter.unbiased else None
+        if variance > TOO_NOISY and (pilot.is_complete or quiet is not None):
+            # The pilot's target was mostly noise.
+            filter = quiet or resized(filter, round(n * min(variance, _PILOT_GROWTH)))
+            pilot = self._pilot(filter, centre, _SECOND_SHARE)
+            centre, _ = self._best(filter, pilot)
+        self.pilot_is_complete = pilot.is_complete
+        tail = [int(np.argmin(np.abs(pilot.fractions - f))) for f in _TAIL_FRACTIONS]
+        return centre, [pilot.positions[i] for i in dict.fromkeys(tail)]
+
+    def quiet_filter(self) -> Filter | None:
+        """A filter with little noise that has the same posterior, if the system allows one."""
+        return quiet_filter(self._model, self.name)
+
+    def spread(self, n_particles: int, position: np.ndarray, n_seeds: int) -> SeedSpread:
+        """Seed spread at a point, with fixed noise of the other variables."""
+        return self.estimates(resized(self.filter, n_particles), position, n_seeds).spread
+
+    def estimates(self, filter: Filter, position: np.ndarray, n_seeds: int) -> Estimates:
+        """Estimates by a filter, with fixed noise of the other variables."""
+        density = self.prepare(filter)
+        began = time.process_time()
+        seeds = np.tile([int(s.get_value()) for s in self._seeds.values()], (n_seeds, 1))
+        seeds[:, list(self._seeds).index(self.name)] = draw_seeds(self._rng, (n_seeds,))
+        results = density(np.tile(position, (n_seeds, 1)), *seeds.T)
+        totals, terms = results[:, 0], results[:, -density.shapes[-1][0] :]
+        seconds = (time.process_time() - began) / n_seeds
+        return Estimates(np.where(totals < np.inf, totals, -np.inf), terms, seconds)
+
+    def prepare(self, filter: Any) -> ParallelMap:
+        """Compile what `estimates` evaluates, unless it is there."""
+        if filter not in self._densities:
+            name = type(filter).__name__
+            what = f"{name}, {filter.size()} particles" if filter.noisy else name
+            with self._effort.compilation(what):
+                self._densities[filter] = self._compiled(filter)
+        return self._densities[filter]
+
+    def _compiled(self, filter: Filter) -> ParallelMap:
+        logp = self._model.logp()
+        terms = likelihood_terms(logp, self._model, self.name)
+        graph, terms = with_filter([logp, terms], self._model, {self.name: filter})
+        variables = self._raveled.variables
+        density = LogDensity(
+            self._model, variables, self._point, self._seeds, graph=graph, extra=[terms]
+        ).at_rows()
+        assert isinstance(density, ParallelMap)  # no ranks share the evaluations
+        density.on_progress = self._effort.advance
+        return density
+
+    def _pilot(self, filter: Filter, start: np.ndarray, share: float) -> Pilot:
+        self._effort.begin_compilation(f"a chain with {type(filter).__name__}")
+        graph = with_filter([self._model.logp()], self._model, {self.name: filter})[0]
+        target = Target(self._model, None, SETTINGS, graph=graph)
+        return run_pilot(pilot_chains(target, start, self._rng), self._effort, share)
+
+    def _best(self, filter: Filter, pilot: Pilot) -> tuple[np.ndarray, float]:
+        """Compare the highest draws by new estimates, as those with fixed noise are too high."""
+        self.prepare(filter)
+        self._effort.announce("Centre of the posterior", _N_BEST * _PER_BEST)
+        points = pilot.positions[:_N_BEST]
+        spreads = [self.estimates(filter, x, _PER_BEST).spread for x in points]
+        best = int(np.argmax([spread.mean for spread in spreads]))
+        return pilot.positions[best], spreads[best].variance
+
+
+def noisy_variable(model: Any, var_name: Any) -> tuple[str, Any]:
+    """Give the variable to tune, and its filter."""
+    if not isinstance(model, Model):
+        raise ModelError(f"model must be a pymc.Model, got {model!r}")
+    filters = noisy_filters(model)
+    if not filters:
+        raise ModelError(
+            "model must have a StateSpace variable with a noisy likelihood (EnKF, BootstrapPF, "
+            "PFEnKF), got a model without one"
+        )
+    listed = ", ".join(map(repr, filters))
+    if var_name is None and len(filters) > 1:
+        raise ModelError(
+            f"var_name must be one of {listed}, as several variables are noisy, got None"
+        )
+    name = next(iter(filters)) if var_name is None else var_name
+    if name not in filters:
+        raise ModelError(f"var_name must be a variable with a noisy filter, {listed}, got {name!r}")
+    return name, filters[name]
