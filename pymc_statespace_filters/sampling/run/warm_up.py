@@ -13,8 +13,15 @@ from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
 from pymc_statespace_filters.sampling.kernel.state import Draws
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
+from pymc_statespace_filters.sampling.starts.population import N_POINTS
+from pymc_statespace_filters.student_mixture import standardised
 
 _NO_CHAIN = 2**32 - 1
+# Iterations of the warm-up of all chains. The search for starts makes 24 to 60 evaluations for each
+# point, and 200: with as many draws, a shorter run spends a third to two thirds on it.
+_LONG_WARMUP = 4000
+_PER_POINT = 40
+_FEWEST_POINTS = 20
 
 
 def stops_of(request: SamplingRequest) -> list[int]:
@@ -22,10 +29,39 @@ def stops_of(request: SamplingRequest) -> list[int]:
     return [*warmup_parts(request.tune), request.n_iterations]
 
 
+def n_search_points(request: SamplingRequest) -> int:
+    """Points of the search for starts: fewer with a short warm-up, 0 if there is no search.
+
+    The number of draws does not count, so that a long run contains every shorter one. A pilot that
+    lacks variables needs a search, however short.
+    """
+    iterations = request.chains * request.tune
+    if iterations >= _LONG_WARMUP:
+        return N_POINTS
+    n_points = iterations // _PER_POINT
+    if iterations > 0 and request.pilot is not None:
+        return max(n_points, _FEWEST_POINTS)
+    return n_points if n_points >= _FEWEST_POINTS else 0
+
+
 def generator_of(request: SamplingRequest, *key: int) -> np.random.Generator:
     """A generator of a model's own random numbers, which are not those of a chain."""
     seed = np.random.SeedSequence(request.entropy, spawn_key=(_NO_CHAIN, *key))
     return np.random.default_rng(seed)
+
+
+def searched_cov(request: SamplingRequest, population: np.ndarray | None) -> np.ndarray | None:
+    """The first proposal covariance after a short search; None if it is the user's or the prior's.
+
+    A mixture fitted to few points may suit none, and the prior may be a thousand times too wide.
+    """
+    n_points = n_search_points(request)
+    if population is None or request.proposal_cov is not None or n_points == N_POINTS:
+        return None
+    points = standardised(population)
+    if points is None:
+        return None
+    return np.asarray(points.chol @ points.chol.T * 2.38**2 / population.shape[1])
 
 
 class WarmUp:
