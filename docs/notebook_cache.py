@@ -6,6 +6,7 @@ versions of the dependencies.
 """
 
 import hashlib
+import os
 import shutil
 from pathlib import Path
 
@@ -36,6 +37,15 @@ def prepare(cache: Path) -> None:
         if other != cache:
             shutil.rmtree(other)
     get_cache(cache).db  # noqa: B018 - reading it makes its tables
+    _quiet_kernels(cache.parent.with_name("ipython"))
+
+
+def _quiet_kernels(profiles: Path) -> None:
+    """Have kernels write errors only: each warns that it is reached by TCP, the default."""
+    config = profiles / "profile_default" / "ipython_kernel_config.py"
+    config.parent.mkdir(parents=True, exist_ok=True)
+    config.write_text('get_config().IPKernelApp.log_level = "ERROR"\n')
+    os.environ["IPYTHONDIR"] = str(profiles)
 
 
 def report_failures(app: Sphinx, exception: Exception | None) -> None:

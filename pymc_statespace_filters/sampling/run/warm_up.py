@@ -17,11 +17,12 @@ from pymc_statespace_filters.sampling.starts.population import N_POINTS
 from pymc_statespace_filters.student_mixture import standardised
 
 _NO_CHAIN = 2**32 - 1
-# Iterations of the warm-up of all chains. The search for starts makes 24 to 60 evaluations for each
-# point, and 200: with as many draws, a shorter run spends a third to two thirds on it.
-_LONG_WARMUP = 4000
-_PER_POINT = 40
-_FEWEST_POINTS = 20
+# Iterations of the warm-up of all chains: from the first on, the search for starts is complete, and
+# below the second there is none. A search makes 200 evaluations, and 24 to 60 for each point: with
+# as many draws as warm-up, a third of what the chains evaluate, or as much for narrow posteriors.
+_LONG_WARMUP, _SHORT_WARMUP = 4000, 800
+_PER_POINT = 40  # of these iterations
+_FEWEST_POINTS = 32
 
 
 def stops_of(request: SamplingRequest) -> list[int]:
@@ -38,10 +39,9 @@ def n_search_points(request: SamplingRequest) -> int:
     iterations = request.chains * request.tune
     if iterations >= _LONG_WARMUP:
         return N_POINTS
-    n_points = iterations // _PER_POINT
-    if iterations > 0 and request.pilot is not None:
-        return max(n_points, _FEWEST_POINTS)
-    return n_points if n_points >= _FEWEST_POINTS else 0
+    if iterations == 0 or (iterations < _SHORT_WARMUP and request.pilot is None):
+        return 0
+    return max(iterations // _PER_POINT, _FEWEST_POINTS)
 
 
 def generator_of(request: SamplingRequest, *key: int) -> np.random.Generator:
