@@ -19,6 +19,9 @@ endef
 IN = $(VENV)/bin
 PYTEST = -m pytest -n 2 --dist loadfile
 
+# Whether `make docs` runs notebooks always (force), or as the cache in .cache/notebooks needs it.
+EXECUTE = cache
+
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
@@ -60,8 +63,8 @@ lint: $(VENV)/.installed  ## check style, format, types and import layers
 	$(IN)/mypy
 	$(IN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed  ## build the guide in docs/_build/html and run its notebooks, two at a time
-	$(IN)/python -m sphinx -E -j 2 -W --keep-going --quiet -b html docs docs/_build/html
+docs: $(VENV)/.installed  ## build the guide in docs/_build/html; notebooks run again if the package has changed, or EXECUTE=force
+	$(IN)/python -m sphinx -E -j 2 -D nb_execution_mode=$(EXECUTE) -W --keep-going --quiet -b html docs docs/_build/html
 
 linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck

@@ -13,6 +13,7 @@ sys.path.insert(0, str(HERE))
 
 from pymc_statespace_filters import DRAM  # noqa: E402
 
+import notebook_cache  # noqa: E402
 import reference_pages  # noqa: E402
 
 project = "pymc-statespace-filters"
@@ -34,10 +35,12 @@ nitpicky = True  # every reference within the guide must be found
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
-# Notebooks are stored without outputs and run once in every build. A notebook that raises, or
-# writes a warning to its stderr, fails the build.
-nb_execution_mode = "force"
-nb_execution_raise_on_error = True
+# Notebooks are stored without outputs. A notebook runs once for each version of the package, and in
+# every build of .ci/run. One that raises, takes too long, or writes a warning to its stderr fails the
+# build at its end, when the other pages are written.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(notebook_cache.folder(HERE.parent))
+nb_execution_raise_on_error = False
 nb_execution_timeout = 240
 nb_merge_streams = True
 nb_output_stderr = (
@@ -80,3 +83,5 @@ linkcheck_anchors = False
 
 def setup(app: Sphinx) -> None:
     reference_pages.write(HERE / "reference" / "api")
+    notebook_cache.prepare(Path(nb_execution_cache_path))
+    app.connect("build-finished", notebook_cache.report_failures)

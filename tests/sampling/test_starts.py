@@ -1,5 +1,6 @@
 """`find_starts`: points of the posterior, in all its modes, whatever the prior."""
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -7,6 +8,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from tests.sampling.autoregression import autoregression, simulated
 
@@ -126,3 +128,62 @@ def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():
         pm.Poisson("n", 3)
     with pytest.raises(ModelError, match="discrete"):
         psf.find_starts(discrete)
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """A posterior a thousand times narrower than its prior, in three dimensions."""
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 100.0, shape=3)
+        pm.Normal("y", mu, 0.1, observed=[2.0, -5.0, 30.0])
+    return model
+
+
+@pytest.fixture
+def evaluated(monkeypatch):
+    """Numbers of points that searches evaluate from now on."""
+    found, call = [], ParallelMap.__call__
+
+    def counting(mapped, *columns):
+        found.append(len(columns[0]))
+        return call(mapped, *columns)
+
+    monkeypatch.setattr(ParallelMap, "__call__", counting)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("tune", "least", "most"), [(0, 0, 0), (199, 0, 0), (200, 400, 2000), (500, 800, 3600)]
+)
+def test_a_search_costs_no_more_than_the_chains_of_a_short_run(
+    narrow, evaluated, tune, least, most
+):
+    """Four chains with as many draws as warm-up make some 9.5 ``tune`` evaluations."""
+    psf.sample_dram(10, tune, model=narrow, random_seed=1, progressbar=False)
+    assert least <= sum(evaluated) <= most <= 10 * tune
+
+
+def test_a_long_warmup_has_the_complete_search(narrow, evaluated):
+    psf.find_starts(narrow, random_seed=1, progressbar=False)
+    complete = sum(evaluated)
+    evaluated.clear()
+    psf.sample_dram(10, 1000, model=narrow, random_seed=1, progressbar=False)
+    assert sum(evaluated) == pytest.approx(complete, rel=0.2)  # other random numbers
+    assert complete > 5000
+
+
+def test_chains_of_a_short_run_find_a_narrow_posterior(narrow):
+    """From draws of the prior R-hat is above 1.5; the bound is that of four chains that agree."""
+    tree = psf.sample_dram(200, 200, model=narrow, random_seed=1, progressbar=False)
+    assert float(az.rhat(tree["posterior"].to_dataset())["mu"].max()) < 1.1
+    mean, sd = tree["posterior"]["mu"].mean(("chain", "draw")), 0.1
+    np.testing.assert_allclose(mean, [2.0, -5.0, 30.0], atol=5 * sd / np.sqrt(50))
+
+
+def test_the_starts_of_a_seed_do_not_depend_on_the_number_of_draws(narrow):
+    short, long = (
+        psf.sample_dram(draws, 200, model=narrow, random_seed=1, progressbar=False)
+        for draws in (10, 30)
+    )
+    drawn = long["posterior"]["mu"].isel(draw=slice(10))
+    np.testing.assert_array_equal(short["posterior"]["mu"], drawn)

@@ -56,15 +56,25 @@ class Chain:
         Key of the chain's random numbers.
     n_rows, n_covs : int
         Iterations whose draws are kept, and those, the first ones, whose proposal covariance is.
+    proposal_cov : ndarray, shape (d, d), optional
+        Of the first proposals. Default: the target's.
     """
 
-    def __init__(self, target: Target, key: np.ndarray, n_rows: int, n_covs: int):
+    def __init__(
+        self,
+        target: Target,
+        key: np.ndarray,
+        n_rows: int,
+        n_covs: int,
+        proposal_cov: np.ndarray | None = None,
+    ):
         self._target = target
         self._density = target.density.bind()
         self._screen = None if target.screen is None else target.screen.bind()
         dim, n_noisy = target.raveled.dim, len(target.seed_names)
         adaptation = np.empty(packed_size(dim))
-        pack(start_adaptation(target.first_cov), adaptation)
+        first_cov = target.first_cov if proposal_cov is None else proposal_cov
+        pack(start_adaptation(first_cov), adaptation)
         self.state = ChainState(
             np.empty(dim),
             np.zeros(n_noisy, dtype=np.int64),

@@ -55,6 +55,8 @@ class ChainTask:
         Packed, of the first proposals.
     population : ndarray, shape (m, d), optional
         Points of which the chain starts at one, instead of a candidate.
+    proposal_cov : ndarray, optional
+        Of the first proposals. Default: the target's.
     index : int
         Number of the chain.
     name : str, optional
@@ -76,6 +78,7 @@ class ChainTask:
         n_rows: int,
         mixture: np.ndarray,
         population: np.ndarray | None = None,
+        proposal_cov: np.ndarray | None = None,
         index: int = 0,
         name: str | None = None,
         checkpoint: Checkpoint | None = None,
@@ -90,7 +93,7 @@ class ChainTask:
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0
         # Pages of these arrays that are never written to take no memory.
-        self.chain = Chain(target, draw_key(self._rng), n_rows, n_covs)
+        self.chain = Chain(target, draw_key(self._rng), n_rows, n_covs, proposal_cov)
         self.chain.state.mixture[:] = mixture
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:

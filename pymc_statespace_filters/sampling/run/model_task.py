@@ -42,7 +42,13 @@ from pymc_statespace_filters.sampling.output.warnings import (
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.run.warm_up import WarmUp, generator_of, stops_of
+from pymc_statespace_filters.sampling.run.warm_up import (
+    WarmUp,
+    generator_of,
+    n_search_points,
+    searched_cov,
+    stops_of,
+)
 from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import find_population
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
@@ -128,6 +134,7 @@ class ModelTask:
     def chain_task(self, index: int) -> ChainTask:
         """Make the task of a chain, from its start or from its checkpoint."""
         target, request = self.prepare(), self.request
+        population = self.population if request.initvals is None else None
         return ChainTask(
             target,
             request.tune,
@@ -140,15 +147,16 @@ class ModelTask:
             checkpoint=self.checkpoint,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
-            population=self.population if request.initvals is None else None,
+            population=population,
+            proposal_cov=searched_cov(request, population),
             mixture=self.mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        None without warm-up, too, and if the noise is carried. A pilot that lacks no variable has
-        the points itself.
+        None with a short warm-up, too, and if the noise is carried. A pilot that lacks no variable
+        has the points itself.
 
         Raises
         ------
@@ -159,8 +167,9 @@ class ModelTask:
         pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
         if pilot is not None and np.isfinite(pilot).all():
             return pilot
+        n_points = n_search_points(request)
         if (
-            request.tune == 0
+            n_points == 0
             or request.initvals is not None
             or not target.prior_draws.may_start
             or target.carries_noise
@@ -173,7 +182,11 @@ class ModelTask:
             return stored.draws["population"]
         try:
             found = find_population(
-                target, generator_of(request), progressbar=progressbar, pilot=pilot
+                target,
+                generator_of(request),
+                progressbar=progressbar,
+                n_points=n_points,
+                pilot=pilot,
             )
         except Exception as error:
             of_model = f" of model {self.name!r}" if self.name else ""

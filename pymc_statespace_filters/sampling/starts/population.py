@@ -5,6 +5,9 @@ Kalman filter exists, it leads the way: the population is first annealed to the 
 square root of its likelihood, and from there to the posterior, which takes fewer evaluations. The
 square root, because the two likelihoods may differ by many nats. Draws of some variables from a
 pilot, if there are any, lead the way instead (`nested`).
+
+The cost is proportional to the number of points. If they are few, the `EKF` still leads many, which
+cost little, and an expensive filter evaluates some of them.
 """
 
 from collections.abc import Callable
@@ -28,7 +31,8 @@ from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 from pymc_statespace_filters.student_mixture import StudentMixture
 
 N_POINTS = 256
-_TYPICAL_EVALUATIONS = 9000  # for the progress bar
+_TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
+_DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what the EKF has found
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
 _MOST_BATCHES = 10  # of draws of the prior
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
@@ -63,9 +67,14 @@ def population_of(
 
 
 def find_population(
-    target: Target, rng: np.random.Generator, *, progressbar: bool, pilot: Array | None = None
+    target: Target,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool,
+    n_points: int = N_POINTS,
+    pilot: Array | None = None,
 ) -> Points:
-    """Points distributed nearly as the posterior.
+    """Points distributed nearly as the posterior, ``n_points`` in each of the last sweeps.
 
     ``pilot`` are draws (n, d) of a posterior close by, with columns of NaN for what it lacks.
 
@@ -74,27 +83,23 @@ def find_population(
     ModelError
         If no draw of the prior has a positive likelihood.
     """
-    found = None
-    by_ekf = target.pilot_density() if pilot is None else None
-    if by_ekf is not None:
-        rows = by_ekf.at_rows()
-        with row_progress(rows, enabled=progressbar) as announce:
-            announce("Finding starts by an EKF", _TYPICAL_EVALUATIONS)
-            cheap = _densities(rows, target, rng)
-            found = _annealed(_prior_population(target, _from_prior(cheap)), rng)
+    led = _led_by_ekf(target, rng, progressbar=progressbar) if pilot is None else None
     rows = target.density.at_rows()
     with row_progress(rows, enabled=progressbar) as announce:
-        announce("Finding starts", _TYPICAL_EVALUATIONS)
+        announce("Finding starts", _TYPICAL_EVALUATIONS * n_points)
         full = _densities(rows, target, rng)
+        found = None
         if pilot is not None:
             reference = nested_reference(pilot, target.prior_draws.draws, rng)
-            drawn = _population(reference.sample(N_POINTS, rng), _from_reference(reference, full))
-            found = _annealed(drawn, rng)
-        elif found is not None:
-            found = _annealed(_population(found.x, _from_ekf(cheap, full)), rng)
+            x = reference.sample(min(_DRAWN * n_points, N_POINTS), rng)
+            found = _annealed(_population(x, _from_reference(reference, full)), n_points, rng)
+        elif led is not None:
+            x, cheap = led
+            x = x[:: -(-len(x) // (_DRAWN * n_points))]
+            found = _annealed(_population(x, _from_ekf(cheap, full)), n_points, rng)
         if found is None:
-            drawn = _prior_population(target, _from_prior(full))
-            found = _annealed(drawn, rng, fewest=1)
+            drawn = _prior_population(target, _from_prior(full), n_points)
+            found = _annealed(drawn, n_points, rng, fewest=1)
         if found is None:
             raise ModelError(
                 f"the likelihood is zero at all of {len(drawn[0].x)} draws of the prior: narrow "
@@ -105,15 +110,36 @@ def find_population(
     return Points(found.x, log_density, modes)
 
 
+def _led_by_ekf(
+    target: Target, rng: np.random.Generator, *, progressbar: bool
+) -> tuple[Array, Densities] | None:
+    """Points of the prior times the square root of an EKF's likelihood, and its densities.
+
+    None if there is none, if the filters are cheap, or if it is positive at too few points.
+    """
+    density = target.pilot_density()
+    if density is None:
+        return None
+    rows = density.at_rows()
+    with row_progress(rows, enabled=progressbar) as announce:
+        announce("Finding starts by an EKF", _TYPICAL_EVALUATIONS * N_POINTS)
+        cheap = _densities(rows, target, rng)
+        drawn = _prior_population(target, _from_prior(cheap), N_POINTS)
+        found = _annealed(drawn, N_POINTS, rng)
+    return None if found is None else (found.x, cheap)
+
+
 def _population(x: Array, log_densities: Densities) -> tuple[Population, Densities]:
     return Population(x, *log_densities(x)), log_densities
 
 
-def _prior_population(target: Target, log_densities: Densities) -> tuple[Population, Densities]:
+def _prior_population(
+    target: Target, log_densities: Densities, n_points: int
+) -> tuple[Population, Densities]:
     """Draws of the prior, more of them if few have a positive likelihood."""
     population, _ = _population(target.prior_draws.draws, log_densities)
     for batch in range(1, _MOST_BATCHES):
-        if np.isfinite(population.log_ratio).sum() >= N_POINTS // 4:
+        if np.isfinite(population.log_ratio).sum() >= n_points // 4:
             break
         more, _ = _population(target.prior_draws.batch(batch), log_densities)
         pairs = zip(population, more, strict=True)
@@ -122,13 +148,16 @@ def _prior_population(target: Target, log_densities: Densities) -> tuple[Populat
 
 
 def _annealed(
-    drawn: tuple[Population, Densities], rng: np.random.Generator, fewest: int = _FEWEST
+    drawn: tuple[Population, Densities],
+    n_points: int,
+    rng: np.random.Generator,
+    fewest: int = _FEWEST,
 ) -> Population | None:
     """The points led to the second distribution; None if it is positive at too few of them."""
     population, log_densities = drawn
     if np.isfinite(population.log_ratio).sum() < fewest:
         return None
-    return _without_stragglers(anneal(population, log_densities, N_POINTS, rng))
+    return _without_stragglers(anneal(population, log_densities, n_points, rng))
 
 
 def _without_stragglers(population: Population) -> Population:

@@ -1,0 +1,86 @@
+"""The build of the guide: which notebooks run, and what becomes of one that fails."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("myst_nb")  # the newest releases are tested without those of the guide
+
+ROOT = Path(__file__).parents[1]
+CONF = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {docs!r})
+import notebook_cache
+HERE = Path(__file__).parent
+extensions = ["myst_nb"]
+exclude_patterns = [".cache"]
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = False
+nb_execution_cache_path = str(notebook_cache.folder(HERE))
+def setup(app):
+    notebook_cache.prepare(Path(nb_execution_cache_path))
+    app.connect("build-finished", notebook_cache.report_failures)
+"""
+
+
+def write_notebook(path, source):
+    cells = [
+        {"cell_type": "markdown", "metadata": {}, "source": f"# {path.stem}"},
+        {"cell_type": "code", "metadata": {}, "source": source, "outputs": []},
+    ]
+    cells[1]["execution_count"] = None
+    spec = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    book = {"cells": cells, "metadata": {"kernelspec": spec}, "nbformat": 4, "nbformat_minor": 4}
+    path.write_text(json.dumps(book))
+
+
+@pytest.fixture(scope="module")
+def guide(tmp_path_factory):
+    """A guide with a package of one file, a notebook that counts its runs and one that fails."""
+    guide = tmp_path_factory.mktemp("build") / "guide"
+    package = guide / "pymc_statespace_filters"
+    package.mkdir(parents=True)
+    (package / "sources.py").write_text("number = 1\n")
+    (guide / "conf.py").write_text(CONF.format(docs=str(ROOT / "docs")))
+    (guide / "index.md").write_text("# Guide\n\n```{toctree}\ngood\nbad\n```\n")
+    write_notebook(guide / "good.ipynb", f"print('ran', file=open({str(guide / 'runs')!r}, 'a'))")
+    write_notebook(guide / "bad.ipynb", "1 / 0")
+    return guide
+
+
+def build(guide):
+    command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "--quiet", "-b", "html"]
+    return subprocess.run(
+        [*command, str(guide), str(guide.parent / "html")], capture_output=True, text=True
+    )
+
+
+@pytest.fixture(scope="module")
+def first(guide):
+    return build(guide)
+
+
+def test_a_notebook_that_fails_is_named_at_the_end_and_the_other_pages_are_written(guide, first):
+    assert first.returncode == 1
+    lines = first.stderr.strip().splitlines()
+    assert lines[-1] == (
+        "WARNING: the notebooks of these pages failed: bad (CellExecutionError). All other pages "
+        "are complete."
+    )
+    for page in ("index", "good", "bad"):
+        assert (guide.parent / "html" / f"{page}.html").exists()
+    assert "IPKernelApp" not in first.stderr
+
+
+def test_notebooks_run_again_if_the_package_has_changed(guide, first):
+    write_notebook(guide / "bad.ipynb", "1 / 1")
+    assert build(guide).returncode == 0
+    assert (guide / "runs").read_text() == "ran\n"
+    (guide / "pymc_statespace_filters" / "sources.py").write_text("number = 2\n")
+    assert build(guide).returncode == 0
+    assert (guide / "runs").read_text() == "ran\nran\n"
+    assert len(list((guide / ".cache" / "notebooks").iterdir())) == 1
