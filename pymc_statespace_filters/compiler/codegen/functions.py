@@ -6,6 +6,7 @@ does it for every column of an ensemble. Both are written out in scalars where t
 small enough, and call PyTensor's array code otherwise; both forms have the same interface.
 """
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -32,10 +33,18 @@ from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.errors import LoweringError
 
-# Up to this size array code takes as long to compile and is up to eighty times slower: rings of 8
-# states with a gradient and of 16 without, dense systems of 10. Beyond, compilation is too slow.
-MAX_EXPRESSIONS = 6000
-MAX_OUTPUT_ELEMENTS = 200
+_LOG = logging.getLogger("pymc_statespace_filters")
+
+# Of one function, written out. An operation takes about 1 ms to compile, so a function of this size
+# takes half a minute (20 states with a full matrix of parameters and EKF: 27000 operations, 29 s).
+# Array code takes 40 s for the EKF of 12 states and little more for 40, and runs up to seventeen
+# times slower (20 states: 0.07 and 1.2 ms). CPU seconds of a first call.
+MAX_EXPRESSIONS = 30_000
+MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
+
+# Above this number of statements a function is optimised and made machine code in its callers only:
+# 18 s instead of 28 s for the gradient of 20 states.
+LARGE = 1000
 
 # LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
 # 8 rows that are written and as many that are only read need 92.
@@ -83,9 +92,18 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
     """
     try:
         written = {name: unrolled(f.graph) for name, f in functions.items()}
-    except NotUnrollableError:
+    except NotUnrollableError as reason:
+        _log_choice(", ".join(functions), reason)
         return {name: array_vector_function(name, f) for name, f in functions.items()}
+    _log_choice(", ".join(functions))
     return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
+
+
+def _log_choice(names: str, reason: Exception | None = None) -> None:
+    if reason is None:
+        _LOG.debug("%s: written out in scalars", names)
+    else:
+        _LOG.debug("%s: array code, because of %s", names, reason)
 
 
 def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
@@ -109,8 +127,10 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     """
     try:
         (values,) = unrolled(graph)
-    except NotUnrollableError:
+    except NotUnrollableError as reason:
+        _log_choice(name, reason)
         return array_member_function(name, arguments, graph, target)
+    _log_choice(name)
     writer = Writer(_element_code(graph), VECTOR_NAMESPACE)
     members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
     dependent = depends_on(values, members)
@@ -188,10 +208,11 @@ def build(
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     namespace = {**writer.namespace, **others}
     code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
-    function, source = function_of(name, arguments, body, {**namespace, **code})
+    large = sum(len(lines) for _, lines in blocks.values()) > LARGE
+    function, source = function_of(name, arguments, body, {**namespace, **code}, large)
     texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
     operations = [repr(op) for op, _ in writer.fallbacks.values()]
-    return CompiledFunction(function, digest(source, *texts, *operations))
+    return CompiledFunction(function, digest(source, *texts, *operations), large)
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

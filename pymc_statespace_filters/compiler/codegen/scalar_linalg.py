@@ -130,9 +130,7 @@ def _by_cofactors(arena: Arena, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarra
     return out, det
 
 
-def _eliminate(
-    arena: Arena, a: np.ndarray, b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Value]:
+def _eliminate(arena: Arena, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, Value]:
     """Upper triangular equations with the same solutions, and the determinant."""
     n, rows = a.shape[0], np.concatenate([a, b], axis=1)
     signs: list[Value] = []

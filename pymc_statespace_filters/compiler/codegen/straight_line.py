@@ -23,7 +23,8 @@ _OPERATORS: dict[type, Callable] = {
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow,
     ast.BitAnd: operator.and_, ast.BitOr: operator.or_, ast.BitXor: operator.xor,
     ast.Lt: operator.lt, ast.Gt: operator.gt, ast.LtE: operator.le, ast.GtE: operator.ge,
-    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.USub: operator.neg, ast.Invert: operator.invert,
+    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.USub: operator.neg,
+    ast.Invert: operator.invert,
 }  # fmt: skip
 
 # On two double-precision numbers; numba would emit the same instruction.
@@ -57,7 +58,8 @@ def straight_line(arguments: str, lines: Sequence[str], namespace: Mapping[str, 
                 result = step(frame)
             return context.get_dummy_value() if reader.returned is None else result
 
-        return signature(reader.returned or types.void, *kinds), generate
+        returned = types.void if reader.returned is None else reader.returned
+        return signature(returned, *kinds), generate
 
     scope = {"typed": typed}
     exec(f"def code(typing, {arguments}): return typed(typing, ({arguments},))", scope)
@@ -66,7 +68,7 @@ def straight_line(arguments: str, lines: Sequence[str], namespace: Mapping[str, 
 
 @dataclass
 class _Frame:
-    """One translation: the values of names so far, and what is made once of arrays and functions."""
+    """One translation: the values of the names so far, arrays and functions that it made."""
 
     context: Any
     builder: Any
@@ -170,13 +172,11 @@ class _Reader:
         return self._called(_OPERATORS[type(node.op)], term)
 
     def _binop(self, node: ast.BinOp) -> _Term:
-        function, right = _OPERATORS[type(node.op)], node.right
-        if function is operator.pow and isinstance(right, ast.Constant):
-            # Numba writes a whole power as products if it knows the exponent.
-            exponent = right.value
-            literal = _Term(types.literal(exponent), lambda frame: exponent)
-            return self._called(function, self._term(node.left), literal)
-        return self._called(function, self._term(node.left), self._term(right))
+        function, left = _OPERATORS[type(node.op)], self._term(node.left)
+        exponent = getattr(node.right, "value", None)
+        if function is operator.pow and isinstance(exponent, int) and left.type == types.float64:
+            return _Term(types.float64, lambda frame: _power(frame, left.emit(frame), exponent))
+        return self._called(function, left, self._term(node.right))
 
     def _compare(self, node: ast.Compare) -> _Term:
         (op,), (right,) = node.ops, node.comparators
@@ -252,11 +252,20 @@ class _Reader:
         return self._signatures[key]
 
     def _cast(self, term: _Term, kind: Any) -> _Term:
-        if term.type == kind or isinstance(term.type, types.Literal):
+        if term.type == kind:
             return term
-        return _Term(
-            kind, lambda f: f.context.cast(f.builder, term.emit(f), term.type, kind)
-        )
+        return _Term(kind, lambda f: f.context.cast(f.builder, term.emit(f), term.type, kind))
+
+
+def _power(frame: _Frame, base: Any, exponent: int) -> Any:
+    """A whole power from 1 on, as products."""
+    result = None
+    while exponent:
+        if exponent % 2:
+            result = base if result is None else frame.builder.fmul(result, base)
+        exponent //= 2
+        base = frame.builder.fmul(base, base)
+    return result
 
 
 def _instruction(function: Any) -> Callable[[Any, Any, Any], ir.Value] | None:
