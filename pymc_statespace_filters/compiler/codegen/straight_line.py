@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba import types
+from numba.core import cgutils
 from numba.core.typing import signature
 from numba.extending import intrinsic
 from numba.np.arrayobj import load_item, make_array, store_item
@@ -147,7 +148,7 @@ class _Reader:
     def _constant(self, node: ast.Constant) -> _Term:
         return self._number(node.value)
 
-    def _number(self, value: float | int | bool) -> _Term:
+    def _number(self, value: Any) -> _Term:
         kinds = {bool: types.boolean, int: types.int64, float: types.float64}
         kind = kinds[type(value)]
         return _Term(kind, lambda frame: frame.context.get_constant(kind, value))
@@ -165,7 +166,8 @@ class _Reader:
 
     def _unaryop(self, node: ast.UnaryOp) -> _Term:
         if isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant):
-            return self._number(-node.operand.value)  # type: ignore[operator]
+            value: Any = node.operand.value
+            return self._number(-value)
         term = self._term(node.operand)
         if isinstance(node.op, ast.Not):
             return _Term(types.boolean, lambda frame: frame.builder.not_(term.emit(frame)))
