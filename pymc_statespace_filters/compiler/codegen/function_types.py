@@ -61,5 +61,10 @@ def function_of(
 
 def jit(function: Any, large: bool = False) -> Any:
     """Compile with the flags of all generated code."""
-    decorator = linked if large else partial(numba.njit, nogil=True, error_model="numpy")
+    # A large function has one caller, into which it is inlined; alone, it would be optimised twice.
+    decorator = (
+        partial(linked, forceinline=True)
+        if large
+        else partial(numba.njit, nogil=True, error_model="numpy")
+    )
     return decorator(fastmath=FAST_MATH)(function)

@@ -43,7 +43,7 @@ MAX_EXPRESSIONS = 30_000
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
 # Above this number of statements a function is optimised and made machine code in its callers only:
-# 18 s instead of 28 s for the gradient of 20 states.
+# 17 s instead of 28 s for the gradient of 20 states.
 LARGE = 1000
 
 # LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
