@@ -36,7 +36,7 @@ from pymc_statespace_filters.errors import LoweringError
 _LOG = logging.getLogger("pymc_statespace_filters")
 
 # Of one function, written out. An operation takes about 1 ms to compile, so a function of this size
-# takes half a minute (20 states with a full matrix of parameters and EKF: 27000 operations, 29 s).
+# takes up to half a minute (20 states with a full matrix of parameters and EKF: 27000 operations, 22 s).
 # Array code takes 40 s for the EKF of 12 states and little more for 40, and runs up to seventeen
 # times slower (20 states: 0.07 and 1.2 ms). CPU seconds of a first call.
 MAX_EXPRESSIONS = 30_000
