@@ -35,10 +35,9 @@ from pymc_statespace_filters.errors import LoweringError
 
 _LOG = logging.getLogger("pymc_statespace_filters")
 
-# Of one function, written out. An operation takes about 1 ms to compile, so a function of this size
-# takes up to half a minute (20 states with a full matrix of parameters and EKF: 27000 operations, 22 s).
-# Array code takes 40 s for the EKF of 12 states and little more for 40, and runs up to seventeen
-# times slower (20 states: 0.07 and 1.2 ms). CPU seconds of a first call.
+# Of one function, written out. An operation takes about 1 ms to compile: the EKF of 20 states with
+# a full matrix of parameters has 27000 operations and takes 22 s. Array code takes 40 s for the EKF
+# of 12 states and 50 s for 20, and runs seventeen times slower there. CPU seconds of a first call.
 MAX_EXPRESSIONS = 30_000
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
