@@ -13,6 +13,11 @@ def _positive(x):
     return root @ root.T
 
 
+def _lopsided(x):
+    """A matrix whose largest pivots are not on the diagonal."""
+    return pt.stack([[0.1 * x[0], 2.0, x[1]], [3.0 + x[2], 0.2, 1.0], [x[0], x[1], 4.0]])
+
+
 def _unpacked(x):
     a, b, c = x
     return [a * b, c, a]
@@ -107,13 +112,40 @@ NESTED = {
     "gradient of products": _gradient(lambda x: (pt.exp(x) * x[::-1]).sum()),
 }
 
+SOLVED = {
+    "solve": lambda x: pt.linalg.solve(_positive(x), x),
+    "solve two": lambda x: pt.linalg.solve(_positive(x)[:2, :2], _positive(x)[:2]).ravel(),
+    "solve one": lambda x: pt.linalg.solve(x[2:, None], x[:1]),
+    "solve positive": lambda x: pt.linalg.solve(_positive(x), x, assume_a="pos"),
+    "solve symmetric": lambda x: pt.linalg.solve(_lopsided(x), x, assume_a="sym"),
+    "solve lower symmetric": lambda x: pt.linalg.solve(
+        _lopsided(x), _positive(x), assume_a="sym", lower=True
+    ).ravel(),
+    "solve tridiagonal": lambda x: pt.linalg.solve(
+        _positive(x) * np.tri(3, k=1) * np.tri(3, k=1).T, x, assume_a="tridiagonal"
+    ),
+    "solve diagonal": lambda x: pt.linalg.solve(_positive(x), x, assume_a="diagonal"),
+    "solve transposed general": lambda x: pt.linalg.solve(_lopsided(x), x, transposed=True),
+    "no first pivot": lambda x: pt.linalg.solve(
+        pt.stack([[0.0, x[0], 2.0], [1.0, 0.0, 0.0], [x[2], 0.0, 5.0]]), x
+    ),
+    "inverse": lambda x: pt.linalg.inv(_positive(x)).ravel(),
+    "inverse of lopsided": lambda x: pt.linalg.inv(_lopsided(x)).ravel(),
+    "determinant": lambda x: pt.stack(
+        [pt.linalg.det(_positive(x)), pt.linalg.det(_lopsided(x)), pt.linalg.det(A[:2, :2] * x[0])]
+    ),
+    "cho_solve": lambda x: pt.linalg.cho_solve((pt.linalg.cholesky(_positive(x)), True), x),
+    "upper cho_solve": lambda x: pt.linalg.cho_solve(
+        (pt.linalg.cholesky(_positive(x), lower=False), False), x
+    ),
+    "gradient of solve": _gradient(lambda x: pt.linalg.solve(_lopsided(x), x).sum()),
+    "gradient of inverse": _gradient(lambda x: pt.linalg.inv(_lopsided(x)).sum()),
+    "gradient of determinant": _gradient(lambda x: pt.log(pt.abs(pt.linalg.det(_lopsided(x))))),
+}
+
 # What has no scalar form goes through array code.
 ARRAYS_ONLY = {
-    "solve": lambda x: pt.linalg.solve(_positive(x), x),
-    "inverse": lambda x: pt.linalg.inv(_positive(x)).ravel(),
-    "determinant": lambda x: [pt.linalg.det(_positive(x))],
-    "cho_solve": lambda x: pt.linalg.cho_solve((pt.linalg.cholesky(_positive(x)), True), x),
-    "gradient of solve": _gradient(lambda x: pt.linalg.solve(_positive(x), x).sum()),
+    "eigenvalues": lambda x: pt.linalg.eigvalsh(_positive(x)),
     "cumsum": lambda x: pt.cumsum(x),
     "sort": lambda x: pt.sort(x),
     "index by value": lambda x: x[pt.argmax(x)][None],
@@ -122,4 +154,4 @@ ARRAYS_ONLY = {
     ),
 }
 
-UNROLLED = MOVING | ARITHMETIC | LOGIC | ALGEBRA | NESTED
+UNROLLED = MOVING | ARITHMETIC | LOGIC | ALGEBRA | SOLVED | NESTED

@@ -71,16 +71,22 @@ def test_a_member_function_is_the_same_on_arrays(on_arrays):
 
 
 def test_what_no_member_enters_is_computed_before_the_loop(monkeypatch):
-    bodies = []
+    noted = []
     build = lowering.build
-    monkeypatch.setattr(
-        lowering, "build", lambda name, a, body, f: bodies.append(body) or build(name, a, body, f)
-    )
+
+    def note(name, arguments, body, writer, **blocks):
+        noted.append((body, blocks))
+        return build(name, arguments, body, writer, **blocks)
+
+    monkeypatch.setattr(lowering, "build", note)
     member_function("move", "c, Z, X", member_graph(), "X[{i}, member]")
-    (body,) = bodies
+    ((body, blocks),) = noted
     loop = next(i for i, line in enumerate(body) if line.startswith("for member"))
-    assert any("exp(" in line for line in body[:loop])
-    assert not any("exp(" in line or "c[" in line for line in body[loop:])
+    assert any("before(" in line for line in body[:loop])
+    assert not any("before(" in line for line in body[loop:])
+    (_, before), (_, inside) = blocks["before"], blocks["inside"]
+    assert any("exp(" in line for line in before)
+    assert not any("exp(" in line or "c[" in line for line in inside)
 
 
 def test_on_arrays_too_it_is_computed_before_the_loop():
@@ -125,7 +131,8 @@ def test_an_exception_before_the_members_is_nan_for_all():
     assert np.isnan(X).all()
 
 
-def test_an_exception_of_a_vector_function_is_nan():
+def test_an_exception_of_a_vector_function_is_nan(on_arrays):
+    on_arrays()
     s = vector("s", 1)
     graph = Graph({"s": s}, [pt.linalg.inv(s[None, :]).ravel(), pt.atleast_1d(s[0])])
     function = vector_functions({"f": VectorFunction("s", graph, (False, True))})["f"].function

@@ -1,4 +1,4 @@
-"""Forty states and more: too many to write out, so everything runs on arrays."""
+"""Forty states and more on arrays, the form of functions that are too large to write out."""
 
 import warnings
 
@@ -7,6 +7,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
@@ -20,6 +21,11 @@ Q, R = 0.1 * np.eye(N_STATES), 0.2 * np.eye(10)
 DECAY = 0.95
 # With forty, the product by which the start is drawn would still be written out.
 N_LORENZ = 60
+
+
+@pytest.fixture(autouse=True)
+def on_arrays(monkeypatch):
+    monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 6000)
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,11 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
 sources = []
 build = lowering.build
-def noted(name, arguments, body, fallbacks):
+def noted(name, arguments, body, writer, **blocks):
     sources.extend([name, arguments, *body])
-    return build(name, arguments, body, fallbacks)
+    for block, (given, lines) in blocks.items():
+        sources.extend([block, given, *lines])
+    return build(name, arguments, body, writer, **blocks)
 lowering.build = noted
 
 def drift(x, t, u, a, b=1.5):

@@ -41,13 +41,55 @@ def assert_same(group, x, outputs, rtol):
             np.testing.assert_allclose(value, expected, rtol=rtol, atol=1e-15, err_msg=name)
 
 
-@pytest.mark.parametrize("group", ["MOVING", "ARITHMETIC", "LOGIC", "ALGEBRA", "NESTED"])
+@pytest.mark.parametrize("group", ["MOVING", "ARITHMETIC", "LOGIC", "ALGEBRA", "SOLVED", "NESTED"])
 def test_unrolled_code_equals_pytensor(group, monkeypatch):
-    monkeypatch.setattr(lowering, "MAX_OUTPUT_ELEMENTS", 1000)
     x, outputs = traced(getattr(programs, group))
     # Whatever has no scalar form raises here, where array code would step in.
     monkeypatch.setattr(lowering, "array_vector_function", None)
     assert_same(getattr(programs, group), x, outputs, rtol=1e-13)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+def test_small_systems_of_equations_are_solved_as_by_numpy(n):
+    """Random matrices and permutations, with zeros on the diagonal."""
+    p = pt.tensor("p", shape=(n * n + n,), dtype="float64")
+    A, b = p[: n * n].reshape((n, n)), p[n * n :]
+    outputs = [pt.linalg.solve(A, b), pt.linalg.inv(A).ravel(), pt.linalg.det(A)[None]]
+    function = lowered(p, outputs)
+    rng = np.random.default_rng(n)
+    order = rng.permuted(np.tile(np.arange(n), (5, 1)), axis=1)
+    matrices = [rng.normal(size=(n, n)) + 2 * np.eye(n) for _ in range(5)]
+    for matrix in [*matrices, *np.eye(n)[order], np.eye(n)[::-1]]:
+        right = rng.normal(size=n)
+        solution, inverse, det = function(np.concatenate([matrix.ravel(), right]))
+        scale = np.linalg.cond(matrix)
+        for value, expected in (
+            (solution, np.linalg.solve(matrix, right)),
+            (inverse, np.linalg.inv(matrix).ravel()),
+            (det, [np.linalg.det(matrix)]),
+        ):
+            error = np.abs(np.array(value) - expected).max() / np.abs(expected).max()
+            assert error < 1e-14 * scale
+    # A singular matrix: no solution, no inverse, the determinant zero.
+    solution, inverse, (zero,) = function(np.concatenate([np.zeros(n * n), np.ones(n)]))
+    assert np.isnan(solution).all()
+    assert np.isnan(inverse).any()
+    assert zero == 0.0
+
+
+def test_three_equations_are_eliminated_with_the_largest_pivots():
+    """Without exchanges the small pivot would cost ten digits, with cofactors eight."""
+    p = pt.tensor("p", shape=(12,), dtype="float64")
+    function = lowered(p, [pt.linalg.solve(p[:9].reshape((3, 3)), p[9:])])
+    rng = np.random.default_rng(3)
+    u, v = (np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2))
+    for matrix in (
+        np.array([[1e-12, 1, 0], [1, 1, 0], [0, 1, 1]]),
+        u @ np.diag([1, 1e-4, 1e-8]) @ v,
+    ):
+        x = np.array([1.0, -2.0, 3.0])
+        (solution,) = function(np.concatenate([matrix.ravel(), matrix @ x]))
+        np.testing.assert_allclose(solution, x, rtol=1e-15 * np.linalg.cond(matrix) * 30)
 
 
 def test_what_does_not_unroll_runs_on_arrays():

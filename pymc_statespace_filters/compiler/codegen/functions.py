@@ -6,6 +6,7 @@ does it for every column of an ensemble. Both are written out in scalars where t
 small enough, and call PyTensor's array code otherwise; both forms have the same interface.
 """
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -28,13 +29,21 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 )
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
 from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.errors import LoweringError
 
-# Up to this size array code takes as long to compile and is up to eighty times slower: rings of 8
-# states with a gradient and of 16 without, dense systems of 10. Beyond, compilation is too slow.
-MAX_EXPRESSIONS = 6000
-MAX_OUTPUT_ELEMENTS = 200
+_LOG = logging.getLogger("pymc_statespace_filters")
+
+# Of one function, written out. An operation takes about 1 ms to compile: the EKF of 20 states with
+# a full matrix of parameters has 27000 operations and takes 22 s. Array code takes 40 s for the EKF
+# of 12 states and 50 s for 20, and runs seventeen times slower there. CPU seconds of a first call.
+MAX_EXPRESSIONS = 30_000
+MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
+
+# Above this number of statements a function is optimised and made machine code in its callers only:
+# 17 s instead of 28 s for the gradient of 20 states.
+LARGE = 1000
 
 # LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
 # 8 rows that are written and as many that are only read need 92.
@@ -82,9 +91,18 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
     """
     try:
         written = {name: unrolled(f.graph) for name, f in functions.items()}
-    except NotUnrollableError:
+    except NotUnrollableError as reason:
+        _log_choice(", ".join(functions), reason)
         return {name: array_vector_function(name, f) for name, f in functions.items()}
+    _log_choice(", ".join(functions))
     return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
+
+
+def _log_choice(names: str, reason: Exception | None = None) -> None:
+    if reason is None:
+        _LOG.debug("%s: written out in scalars", names)
+    else:
+        _LOG.debug("%s: array code, because of %s", names, reason)
 
 
 def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
@@ -96,8 +114,9 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
         else "(" + "".join(f"{writer.as_float(v)}, " for v in group) + ")"
         for group, is_scalar in zip(values, function.scalar, strict=True)
     ]
-    body = [*lines, f"return {', '.join(results)}"]
-    return build(name, function.arguments, body, writer)
+    lines.append(f"return {', '.join(results)}")
+    arguments = function.arguments
+    return build(name, arguments, [f"return all({arguments})"], writer, all=(arguments, lines))
 
 
 def member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
@@ -107,56 +126,66 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     """
     try:
         (values,) = unrolled(graph)
-    except NotUnrollableError:
+    except NotUnrollableError as reason:
+        _log_choice(name, reason)
         return array_member_function(name, arguments, graph, target)
+    _log_choice(name)
     writer = Writer(_element_code(graph), VECTOR_NAMESPACE)
     members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
     dependent = depends_on(values, members)
     common = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
-    before = writer.statements(
-        [*sorted_by_number(common), *(v for v in values if v not in dependent)]
-    )
+    kept = sorted_by_number({*common, *(v for v in values if v not in dependent)})
+    before = writer.statements(kept)
     inside, results = writer.statements(values), [writer.as_float(v) for v in values]
+    names = [writer.name(v) for v in kept]
+    inside = [*(f"{name} = common[{i}]" for i, name in enumerate(names)), *inside]
+    before.append(f"return ({''.join(f'{name}, ' for name in names)})")
     loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
-    return build(name, arguments, [*before, *loop(inside, results, target)], writer)
+    body, inputs, inside = loop(f"{arguments}, member, common", inside, results, target)
+    return build(
+        name,
+        arguments,
+        [f"common = before({arguments})", *body],
+        writer,
+        before=(arguments, before),
+        inside=(inputs, inside),
+    )
 
 
-def _loop(inside: list[str], results: list[str], target: str) -> list[str]:
-    """Lines that run ``inside`` for every member and store its results."""
+def _loop(
+    inputs: str, inside: list[str], results: list[str], target: str
+) -> tuple[list[str], str, list[str]]:
+    """A loop over all members; the arguments and lines of the code ``inside`` that it calls."""
     stores = [f"{target.format(i=i)} = {result}" for i, result in enumerate(results)]
     head = f"for member in range({target.partition('[')[0]}.shape[-1]):"
-    return [head, *_indented([*inside, *stores])]
+    return [head, f"    inside({inputs})"], inputs, [*inside, *stores]
 
 
-def _staged_loop(inside: list[str], results: list[str], target: str) -> list[str]:
+def _staged_loop(
+    inputs: str, inside: list[str], results: list[str], target: str
+) -> tuple[list[str], str, list[str]]:
     """The same loop over blocks of members, whose results are buffered and then copied.
 
     The buffer does not overlap any row that is read, so LLVM needs no check for each pair of rows.
     """
-    whole = target.partition("[")[0]
+    whole, inputs = target.partition("[")[0], f"{inputs}, buffer, j"
     stores = [f"buffer[{i}, j] = {result}" for i, result in enumerate(results)]
-    # A signed index might be negative and count from the end, which would prevent vectorisation.
-    compute = ["member = np.uint64(first + j)", *inside, *stores]
-    copy = [
+    block = [
+        f"size = min({BLOCK}, {whole}.shape[-1] - first)",
+        "for j in range(size):",
+        # A signed index might be negative and count from the end, which prevents vectorisation.
+        "    member = np.uint64(first + j)",
+        f"    inside({inputs})",
         f"for i in range({len(results)}):",
         "    for j in range(size):",
         f"        {whole}[i, np.uint64(first + j)] = buffer[i, j]",
     ]
-    block = [
-        f"size = min({BLOCK}, {whole}.shape[-1] - first)",
-        "for j in range(size):",
-        *_indented(compute),
-        *copy,
-    ]
-    return [
+    body = [
         f"buffer = np.empty(({len(results)}, {BLOCK}))",
         f"for first in range(0, {whole}.shape[-1], {BLOCK}):",
-        *_indented(block),
+        *(f"    {line}" for line in block),
     ]
-
-
-def _indented(lines: Sequence[str]) -> list[str]:
-    return ["    " + line for line in lines]
+    return body, inputs, [*inside, *stores]
 
 
 def sorted_by_number(values: Iterable[Value]) -> list[Value]:
@@ -164,13 +193,25 @@ def sorted_by_number(values: Iterable[Value]) -> list[Value]:
     return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
 
 
-def build(name: str, arguments: str, body: list[str], writer: Writer) -> CompiledFunction:
-    """Compile a function body from a writer."""
+def build(
+    name: str,
+    arguments: str,
+    body: Sequence[str],
+    writer: Writer,
+    **blocks: tuple[str, Sequence[str]],
+) -> CompiledFunction:
+    """Compile a function body that calls blocks of a writer's statements.
+
+    A block is given by its arguments and lines.
+    """
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
-    function, source = function_of(name, arguments, body, {**writer.namespace, **others})
-    return CompiledFunction(
-        function, digest(source, *(repr(op) for op, _ in writer.fallbacks.values()))
-    )
+    namespace = {**writer.namespace, **others}
+    code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
+    large = sum(len(lines) for _, lines in blocks.values()) > LARGE
+    function, source = function_of(name, arguments, body, {**namespace, **code}, large)
+    texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
+    operations = [repr(op) for op, _ in writer.fallbacks.values()]
+    return CompiledFunction(function, digest(source, *texts, *operations), large)
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

@@ -5,13 +5,14 @@ runs the operations that only move elements (indexing, joining, reshaping) on th
 elementwise operations, sums and small linear algebra are written out.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
 import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor.basic as ptb
+from pytensor.assumptions.specify import SpecifyAssumptions
 from pytensor.compile.builders import OpFromGraph
 from pytensor.compile.ops import DeepCopyOp, ViewOp
 from pytensor.graph.basic import Constant, Variable
@@ -20,7 +21,11 @@ from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import CAReduce, DimShuffle, Elemwise
 from pytensor.tensor.linalg.decomposition.cholesky import Cholesky
+from pytensor.tensor.linalg.inverse import MatrixInverse
+from pytensor.tensor.linalg.solvers.general import Solve
+from pytensor.tensor.linalg.solvers.psd import CholeskySolve
 from pytensor.tensor.linalg.solvers.triangular import SolveTriangular
+from pytensor.tensor.linalg.summary import Det
 from pytensor.tensor.math import Dot
 from pytensor.tensor.reshape import JoinDims, SplitDims
 from pytensor.tensor.shape import Reshape, Shape, Shape_i, SpecifyShape
@@ -33,6 +38,15 @@ from pytensor.tensor.subtensor import (
 )
 
 from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant, plain
+from pymc_statespace_filters.compiler.codegen.scalar_linalg import (
+    cholesky,
+    cholesky_solve,
+    determinant,
+    inner,
+    inverse,
+    solve,
+    solve_triangular,
+)
 from pymc_statespace_filters.compiler.codegen.semidefinite import (
     SemidefiniteCholesky,
     unrolled_root,
@@ -162,44 +176,8 @@ def _dot(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     is_square = a.shape == b.T.shape and all(x is y for x, y in zip(a.flat, b.T.flat, strict=True))
     for i, j in np.ndindex(out.shape):
         mirrored = is_square and j < i  # of a matrix with its own transpose
-        out[i, j] = out[j, i] if mirrored else _inner(arena, a[i, :], b[:, j])
+        out[i, j] = out[j, i] if mirrored else inner(arena, a[i, :], b[:, j])
     return [out]
-
-
-def _inner(arena: Arena, a: Iterable, b: Iterable) -> Value:
-    products = [arena.apply(ps.mul, x, y) for x, y in zip(a, b, strict=True)]
-    return arena.apply(ps.add, *products) if len(products) > 1 else products[0] if products else 0.0
-
-
-def _cholesky(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """Row by row; a negative pivot gives NaN through its square root, like LAPACK's wrapper."""
-    (a,) = arguments
-    n = a.shape[0]
-    chol = np.full((n, n), 0.0, dtype=object)
-    for i in range(n):
-        for j in range(i + 1):
-            entry = a[i, j] if node.op.lower else a[j, i]
-            rest = arena.apply(ps.sub, entry, _inner(arena, chol[i, :j], chol[j, :j]))
-            chol[i, j] = (
-                arena.apply(ps.sqrt, rest) if i == j else arena.apply(ps.true_div, rest, chol[j, j])
-            )
-    return [chol if node.op.lower else chol.T]
-
-
-def _solve_triangular(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    a, b = arguments
-    n, columns = a.shape[0], b.reshape(a.shape[0], -1)
-    order = range(n) if node.op.lower else range(n - 1, -1, -1)
-    out = np.full(columns.shape, 0.0, dtype=object)
-    for c in range(columns.shape[1]):
-        done: list[int] = []
-        for i in order:
-            rest = arena.apply(
-                ps.sub, columns[i, c], _inner(arena, [a[i, k] for k in done], out[done, c])
-            )
-            out[i, c] = rest if node.op.unit_diagonal else arena.apply(ps.true_div, rest, a[i, i])
-            done.append(i)
-    return [out.reshape(b.shape)]
 
 
 def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
@@ -295,9 +273,13 @@ _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
     ((Elemwise,), _elemwise),
     ((CAReduce,), _reduce),
     ((Dot,), _dot),
-    ((Cholesky,), _cholesky),
+    ((Cholesky,), cholesky),
     ((SemidefiniteCholesky,), unrolled_root),
-    ((SolveTriangular,), _solve_triangular),
+    ((SolveTriangular,), solve_triangular),
+    ((CholeskySolve,), cholesky_solve),
+    ((Solve,), solve),
+    ((MatrixInverse,), inverse),
+    ((Det,), determinant),
     ((Blockwise,), _blockwise),
     ((Subtensor, AdvancedSubtensor), _subtensor),
     ((IncSubtensor, AdvancedIncSubtensor), _inc_subtensor),
@@ -306,7 +288,7 @@ _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
     ((Shape, Shape_i), _shape),
     ((CheckAndRaise,), _check),
     ((OpFromGraph,), _inner_graph),
-    ((SpecifyShape, ViewOp, DeepCopyOp), _same),
+    ((SpecifyShape, SpecifyAssumptions, ViewOp, DeepCopyOp), _same),
     ((ptb.TensorFromScalar, ptb.ScalarFromTensor), _same),
     ((DimShuffle, ptb.ExtractDiag), _move),
     ((Reshape, JoinDims, SplitDims, ptb.Split), _move),

@@ -101,10 +101,17 @@ def _function(
     writer = Writer(code, VECTOR_NAMESPACE, known)
     of_lane = depends_on(values, _named(code, "theta", "s"))
     used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
-    before = writer.statements(
-        sorted_by_number({v for v in used if isinstance(v, Expression) and v not in of_lane})
-    )
-    inside = writer.statements(values)
+    shared = sorted_by_number({v for v in used if isinstance(v, Expression) and v not in of_lane})
+    before, names = writer.statements(shared), [writer.name(v) for v in shared]
+    before.append(f"return ({''.join(f'{name}, ' for name in names)})")
+    inside = [f"{name} = shared[{i}]" for i, name in enumerate(names)]
+    inside += writer.statements(values)
     inside += [f"{t} = {writer.as_float(v)}" for t, v in zip(targets, values, strict=True)]
-    loop = ["for lane in range(n_lanes):", *(f"    {line}" for line in inside or ["pass"])]
-    return build(name, _ARGUMENTS, [*before, *loop], writer)
+    inputs = f"{_ARGUMENTS}, lane, shared"
+    body = [
+        f"shared = before({_ARGUMENTS})",
+        "for lane in range(n_lanes):",
+        f"    inside({inputs})",
+    ]
+    blocks = {"before": (_ARGUMENTS, before), "inside": (inputs, inside)}
+    return build(name, _ARGUMENTS, body, writer, **blocks)

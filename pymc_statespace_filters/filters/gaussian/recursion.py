@@ -177,4 +177,6 @@ def compiled_of(
 ) -> CompiledFunction:
     """Compile a function that calls these parts; its key includes theirs."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
-    return CompiledFunction(jit(function), key_of(what, *(part.key for part in parts.values())))
+    large = any(part.large for part in parts.values())
+    key = key_of(what, *(part.key for part in parts.values()))
+    return CompiledFunction(jit(function, large), key, large)
