@@ -71,7 +71,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "header_links_before_dropdown": 6,
     "navbar_end": ["theme-switcher"],
-    "navbar_persistent": ["search-button"],  # a field would wrap the header at 1280 px
+    # A field would wrap the header at 1280 px.
+    "navbar_persistent": ["search-button"],
     "secondary_sidebar_items": ["page-toc"],
     "show_nav_level": 2,
 }
