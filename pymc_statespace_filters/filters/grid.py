@@ -80,7 +80,7 @@ class GridFilter:
     tolerance : float
         Largest error allowed in a term log p(d_j | d_1 .. d_{j-1}), by the filter's own error
         estimate; between 1e-12 and 1e-2. A larger one saves time: 1e-3 takes between a sixth and
-        four fifths of the time of 1e-8. A sensor with a kink, such as |x|, gets at least 1e-5.
+        four fifths of the time of 1e-8. A sensor with a kink, such as ``|x|``, gets at least 1e-5.
 
     Raises
     ------

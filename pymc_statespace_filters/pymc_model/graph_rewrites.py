@@ -223,14 +223,18 @@ def smooth_filters(model: pm.Model) -> dict[str, Filter]:
     return {name: op.filter.smooth(compile_system(op.system)) for name, op in ops.items()}
 
 
+def expensive_variables(model: pm.Model) -> list[str]:
+    """Names of the variables whose filter takes milliseconds: particles, members or a grid."""
+    filters = {name: node.op.filter for name, node in state_space_nodes(model).items()}
+    return [name for name, one in filters.items() if one.noisy or isinstance(one, GridFilter)]
+
+
 def pilot_filters(model: pm.Model) -> dict[str, Filter]:
     """An `EKF` in place of each expensive filter, by names; none if a system does not allow it."""
-    found: dict[str, Filter] = {}
-    for name, node in state_space_nodes(model).items():
-        if node.op.filter.noisy or isinstance(node.op.filter, GridFilter):
-            found[name] = EKF()
-            try:
-                check_system_and_filter(node.op.system, found[name])
-            except ModelError:
-                return {}
+    found: dict[str, Filter] = {name: EKF() for name in expensive_variables(model)}
+    try:
+        for name, ekf in found.items():
+            check_system_and_filter(state_space_nodes(model)[name].op.system, ekf)
+    except ModelError:
+        return {}
     return found

@@ -51,13 +51,13 @@ def sample_dram(
 ) -> DataTree | None:
     """Sample a model by adaptive Metropolis-Hastings, with whole chains in machine code.
 
-    Chains start in the posterior, which a population finds first, see `find_starts`; its size
-    follows that of the warm-up. Some proposals are the random walk of `DRAM` with delayed
-    rejection, the others are drawn from a mixture of Student-t distributions. It is fitted to the
-    draws of all chains after each quarter of the warm-up, and its share of the proposals follows
-    the jumps that it has made. Both are then frozen, so that the draws are exact, with an estimated
-    likelihood too. There is no Python between the draws: one costs as much as its likelihood.
-    Chains run in threads, and with MPI on several machines.
+    Chains start in the posterior, which a population finds first, see `find_starts`. Some proposals
+    are the random walk of `DRAM` with delayed rejection, the others are drawn from a mixture of
+    Student-t distributions. It is fitted to the draws of all chains after each quarter of the
+    warm-up, and its share of the proposals follows the jumps that it has made. Both are then
+    frozen, so that the draws are exact, with an estimated likelihood too. There is no Python
+    between the draws: one costs as much as its likelihood. Chains run in threads, and with MPI on
+    several machines.
 
     Parameters
     ----------
@@ -74,17 +74,20 @@ def sample_dram(
         With ``until_ess``, the most draws of each chain, after which a warning says what was
         reached. Default: 20 times ``draws``.
     chains : int
+        Independent chains, whose agreement R-hat measures.
     cores : int, optional
         Threads on each rank. Default: the number of available processors, at most the number of
         chains. The draws do not depend on it.
     model : pymc.Model, optional
         Default: the model of the ``with`` block. All its free variables must be continuous.
     random_seed : int or numpy.random.Generator, optional
+        The draws follow from it and the number of chains alone. Default: other draws at every call.
     initvals : dict, or sequence of dict, optional
-        Initial values, for all chains or for each, as in ``pm.sample``. Default: points of a
-        population that is led from the prior to the posterior, of fewer points if ``chains * tune``
-        is below 4000; the best of a few draws from the prior if that is below 800, if a prior is
-        improper, or with ``correlation``.
+        Initial values, for all chains or for each, as in ``pm.sample``. Default: with
+        ``tune > 0``, points of a population that is led from the prior to the posterior; the best
+        of a few draws from the prior if a prior is improper, or with ``correlation``. With a
+        particle, ensemble or grid filter the population is smaller if ``chains * tune`` is below
+        4000, and there is none below 800.
     pilot : xarray.DataTree, optional
         Draws from a posterior close to the model's, such as that of the same parameters with a
         cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is

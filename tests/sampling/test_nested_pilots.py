@@ -79,7 +79,7 @@ def test_the_population_is_that_of_the_larger_posterior(smaller, populations):
     sd = np.sqrt(cov.diagonal())
     shift = smaller["posterior"]["a"].mean().item() - mean[0]
     assert abs(shift) > 20 * sd[0]
-    tree = psf.sample_dram(1000, 1000, model=line(True), pilot=smaller, **QUIET)
+    tree = psf.sample_dram(1000, 500, model=line(True), pilot=smaller, **QUIET)
     for i, name in enumerate(("a", "bend", "b")):
         points = np.unique(populations[0].x[-256:, i])
         assert kstest(points, norm(mean[i], sd[i]).cdf).pvalue > 0.001
@@ -102,7 +102,7 @@ def test_a_close_pilot_saves_evaluations(searches, populations):
     counts = []
     for pilot in (None, close):
         searches.clear()
-        psf.sample_dram(10, 1000, model=line(True), pilot=pilot, **QUIET)
+        psf.sample_dram(10, 10, model=line(True), pilot=pilot, **QUIET)
         counts.append(sum(searches))
     assert counts[1] < 0.85 * counts[0]
     found = populations[1].x[-256:].std(axis=0)

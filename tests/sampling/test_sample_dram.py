@@ -338,7 +338,7 @@ def test_an_error_at_the_start(watched):
     assert caught.value.__notes__[-1].endswith("after 0 iterations")
     watched.calls = 0
     with pytest.raises(ArithmeticError) as caught:
-        sample_dram(watched.model, tune=400)  # a shorter warm-up has no search
+        sample_dram(watched.model)
     assert caught.value.__notes__[-1] == "in the search for starts"
 
 

@@ -10,6 +10,8 @@ from scipy.stats import kstest, norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.autoregression import autoregression, simulated
 
 
@@ -152,27 +154,55 @@ def evaluated(monkeypatch):
     return found
 
 
+@pytest.fixture
+def expensive(monkeypatch):
+    """Models count as having an expensive filter."""
+    monkeypatch.setattr(Target, "is_expensive", True)
+
+
+@pytest.mark.parametrize(
+    ("filter", "is_expensive"),
+    [
+        (psf.EKF(), False),
+        (psf.UKF(), False),
+        (psf.GridFilter(), True),
+        (psf.BootstrapPF(10), True),
+        (psf.EnKF(10), True),
+    ],
+)
+def test_filters_that_are_expensive(filter, is_expensive):
+    with pm.Model() as model:
+        pm.Normal("phi")
+        params = {"spread": 1.0}
+        psf.StateSpace("d", autoregression(), filter, steps=[1], observed=[0.3], params=params)
+    assert bool(expensive_variables(model)) == is_expensive
+
+
 @pytest.mark.parametrize(
     ("tune", "least", "most"), [(0, 0, 0), (199, 0, 0), (200, 400, 2000), (500, 800, 3600)]
 )
 def test_a_search_costs_no_more_than_the_chains_of_a_short_run(
-    narrow, evaluated, tune, least, most
+    narrow, expensive, evaluated, tune, least, most
 ):
     """Four chains with as many draws as warm-up make some 9.5 ``tune`` evaluations."""
     psf.sample_dram(10, tune, model=narrow, random_seed=1, progressbar=False)
     assert least <= sum(evaluated) <= most <= 10 * tune
 
 
-def test_a_long_warmup_has_the_complete_search(narrow, evaluated):
+@pytest.mark.parametrize(("is_expensive", "tune"), [(True, 1000), (False, 10)])
+def test_cheap_models_and_long_warmups_have_the_complete_search(
+    narrow, evaluated, monkeypatch, is_expensive, tune
+):
     psf.find_starts(narrow, random_seed=1, progressbar=False)
     complete = sum(evaluated)
     evaluated.clear()
-    psf.sample_dram(10, 1000, model=narrow, random_seed=1, progressbar=False)
+    monkeypatch.setattr(Target, "is_expensive", is_expensive)
+    psf.sample_dram(10, tune, model=narrow, random_seed=1, progressbar=False)
     assert sum(evaluated) == pytest.approx(complete, rel=0.2)  # other random numbers
     assert complete > 5000
 
 
-def test_chains_of_a_short_run_find_a_narrow_posterior(narrow):
+def test_chains_of_a_short_run_find_a_narrow_posterior(narrow, expensive):
     """From draws of the prior R-hat is above 1.5; the bound is that of four chains that agree."""
     tree = psf.sample_dram(200, 200, model=narrow, random_seed=1, progressbar=False)
     assert float(az.rhat(tree["posterior"].to_dataset())["mu"].max()) < 1.1
@@ -180,7 +210,7 @@ def test_chains_of_a_short_run_find_a_narrow_posterior(narrow):
     np.testing.assert_allclose(mean, [2.0, -5.0, 30.0], atol=5 * sd / np.sqrt(50))
 
 
-def test_the_starts_of_a_seed_do_not_depend_on_the_number_of_draws(narrow):
+def test_the_starts_of_a_seed_do_not_depend_on_the_number_of_draws(narrow, expensive):
     short, long = (
         psf.sample_dram(draws, 200, model=narrow, random_seed=1, progressbar=False)
         for draws in (10, 30)

@@ -148,15 +148,15 @@ class ModelTask:
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
             population=population,
-            proposal_cov=searched_cov(request, population),
+            proposal_cov=searched_cov(request, target, population),
             mixture=self.mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        None with a short warm-up, too, and if the noise is carried. A pilot that lacks no variable
-        has the points itself.
+        None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
+        that lacks no variable has the points itself.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class ModelTask:
         pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
         if pilot is not None and np.isfinite(pilot).all():
             return pilot
-        n_points = n_search_points(request)
+        n_points = n_search_points(request, target)
         if (
             n_points == 0
             or request.initvals is not None

@@ -15,7 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.pymc_model.graph_rewrites import pilot_filters
+from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
 from pymc_statespace_filters.pymc_model.inspection import (
     collapse_remedies,
     exactness,
@@ -128,6 +128,11 @@ class Target:
                 )
             graph = screening_density(model, settings.screen, settings.screen_power)
             self.screen = LogDensity(*self._shared, fixed_noise=settings.screen.noisy, graph=graph)
+
+    @cached_property
+    def is_expensive(self) -> bool:
+        """Whether an evaluation takes milliseconds, not microseconds."""
+        return bool(expensive_variables(self._model))
 
     def pilot_density(self) -> LogDensity | None:
         """Prior times the square root of an `EKF`'s likelihood, if the filters are expensive."""
