@@ -217,14 +217,14 @@ class ReportsRows(Protocol):
 
 @contextmanager
 def row_progress(
-    work: ReportsRows, *, enabled: bool, patience: float = PATIENCE
+    work: ReportsRows, *, enabled: bool, patience: float | None = None
 ) -> Iterator[Callable[[str, int], None]]:
-    """Show the progress of work that takes longer than ``patience`` seconds.
+    """Show the progress of work that takes longer than ``patience`` seconds, by default `PATIENCE`.
 
     Yields the function that begins a task, with its name and about how many rows it has.
     """
     with ExitStack() as stack:
-        bar = _RowProgress(stack, patience)
+        bar = _RowProgress(stack, PATIENCE if patience is None else patience)
         if enabled:
             work.on_progress = bar.advance
         yield bar.begin if enabled else lambda task, total: None

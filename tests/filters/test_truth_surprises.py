@@ -60,8 +60,10 @@ def test_the_remedy_where_no_exact_filter_is():
         initial_mean=[0.0, 0.0],
         initial_cov=[[0.1, 0.0], [0.0, 0.1]],
     )
-    with pytest.warns(psf.FilterWarning, match="these are 1 of 2 terms, j = 1. The log-") as caught:
+    with pytest.warns(
+        psf.FilterWarning, match="these are 1 of 2 terms, j = 1; at 5 seeds"
+    ) as caught:
         psf.log_likelihood(system, psf.BootstrapPF(30), {}, [1.0, 60.0], steps=[0, 1])
     (message,) = (str(w.message) for w in caught)
-    assert "GuidedPF(n)" in message
+    assert "Use GuidedPF(100)" in message
     assert not re.search(r"GridFilter|\bEKF|EnKF", message)
