@@ -133,7 +133,13 @@ CASES = {
 
 
 IN_BLOCKS = "chib_jeliazkov, 2 blocks"
-CALIBRATED = {**ESTIMATORS, IN_BLOCKS: ChibJeliazkov(n_blocks=2)}
+# What `estimate_evidence` does with no argument: evaluations until the standard error is small.
+TARGET_SE = 0.05
+STOPPED = {
+    f"{name}, se {TARGET_SE}": replace(ESTIMATORS[name], target_se=TARGET_SE)
+    for name in ("chib_jeliazkov", "bridge", "importance")
+}
+CALIBRATED = {**ESTIMATORS, IN_BLOCKS: ChibJeliazkov(n_blocks=2), **STOPPED}
 
 # How small an error 4 x 10 000 draws give.
 LONG_CHAINS = {
@@ -227,6 +233,8 @@ def applies(estimator, case):
         return not case.is_noisy
     if estimator == IN_BLOCKS:  # is for many parameters
         return case.n_parameters >= 12 and case in CASES.values()
+    if estimator in STOPPED:
+        return case in CASES.values()
     if estimator == "prior_monte_carlo":  # is for few parameters
         return case.n_parameters <= 4 and case in CASES.values()
     if estimator == "tempered_smc":  # takes as many evaluations however long the chains
