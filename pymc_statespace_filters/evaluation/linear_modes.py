@@ -68,7 +68,9 @@ def linear_modes(system: StateSpaceModel, params: Any, *, at: Any = None) -> pd.
     :math:`\lambda` oscillates with the frequency ``1 / (2 * dt)``.
 
     Modes of different draws are matched to those at the median of every parameter, by the
-    assignment of eigenvalues that has the least sum of distances in the complex plane.
+    assignment of eigenvalues that has the least sum of distances in the complex plane. A mode that
+    oscillates at the median and is overdamped at some draws has one of their two decays there;
+    the other is not in the table.
 
     Examples
     --------

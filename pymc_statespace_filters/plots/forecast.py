@@ -36,13 +36,14 @@ from pymc_statespace_filters.system.checks import check_count
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations
+GROUPS = ("predictions", "free_run")
 END = {"color": "B2", "linestyle": "C1"}
 
 
 def plot_forecast(
     idata: xr.DataTree,
     *,
-    group: str = "predictions",
+    group: str | None = None,
     var_name: str | None = None,
     truth: Any = None,
     n_past: int | None = None,
@@ -62,8 +63,8 @@ def plot_forecast(
     ----------
     idata : xarray.DataTree
         Result of `forecast` or of `free_run`.
-    group : {"predictions", "free_run"}
-        The group with the predicted observations.
+    group : {"predictions", "free_run"}, optional
+        The group with the predicted observations; by default the first of these that is there.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
@@ -120,7 +121,7 @@ def plot_forecast(
     """
     if n_past is not None:
         check_count("n_past", n_past, 0)
-    _, results = group_of(idata, group)
+    _, results = group_of(idata, *((group,) if group else GROUPS))
     name = variable_of(_predicted(results), var_name)
     draws = rename_last_dims(results[name], "time", "observable")
     record = data_of(idata, name)

@@ -117,7 +117,7 @@ class StateSpace(Continuous):
         given = {} if params is None else params
         check_names(system, given)
         values = dict(system.defaults) | _model_variables(system, model) | dict(given)
-        theta = symbolic_parameters(system, values)
+        theta = symbolic_parameters(system, values, others=tuple(model.named_vars))
         record = symbolic_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:

@@ -59,7 +59,8 @@ def free_run(
         The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
     observed : array_like, shape (R, p) or (R,), optional
         Measurements at these steps, to compare the predictions with; NaN where missing. By default
-        the record of the model, if the run has its inputs and steps, else none.
+        the record of the model from ``score_from`` on, if the run has its inputs and steps, else
+        none.
     noise : bool
         Whether the initial state, process noise and measurement noise are drawn. By default none
         is: a run starts at the initial mean, and its observations are those of `simulate` with
@@ -164,7 +165,9 @@ def _steps(at_draws: VariableAtDraws, steps: Any, times: Any) -> NDArray[np.int6
 def _record(variable: StateSpaceVariable, observed: Any, steps: NDArray[np.int64]) -> Array:
     """The measurements (R, p) to compare with: those given, else those of the model."""
     if observed is None:
-        return np.asarray(variable.observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
+        record = np.array(variable.observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
+        record[: variable.score_from] = np.nan
+        return record
     return check_observed(observed, variable.system, steps.size)
 
 

@@ -1,6 +1,6 @@
 """The flat parameter vector of a system, from values by name: numbers or symbols."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,9 +48,14 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     return np.concatenate([np.broadcast_to(p, (*batch, p.shape[-1])) for p in parts], axis=-1)
 
 
-def symbolic_parameters(system: StateSpaceModel, values: Mapping[str, Any]) -> TensorVariable:
-    """Parameter values, numbers or symbols, as a symbolic vector (k,)."""
-    _check_complete(system, values)
+def symbolic_parameters(
+    system: StateSpaceModel, values: Mapping[str, Any], others: Sequence[str]
+) -> TensorVariable:
+    """Parameter values, numbers or symbols, as a symbolic vector (k,).
+
+    ``others`` are the names among which a missing one may be, misspelt.
+    """
+    _check_complete(system, values, f"the model's variables are {sorted(others)}")
     parts = [
         _symbol(name, values[name], shape).ravel()
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
@@ -72,16 +77,16 @@ def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
     return pt.cast(symbol, "float64")
 
 
-def _check_complete(system: StateSpaceModel, found: Mapping[str, Any]) -> None:
+def _check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: str = "") -> None:
     """Raise unless every parameter has a value."""
     if missing := [name for name in system.parameters if name not in found]:
         optional = [name for name, _ in system.defaults]
         needed = [name for name in system.parameters if name not in optional]
         also = f" (optional, with a default: {optional})" if optional else ""
+        given = f"only for {sorted(name for name in found if name not in optional)}"
         raise ModelError(
             f"params must give every parameter without a default, {needed}{also}, got "
-            f"no value for the parameters {missing}, only for "
-            f"{sorted(name for name in found if name not in optional)}"
+            f"no value for the parameters {missing}; {others or given}"
         )
 
 

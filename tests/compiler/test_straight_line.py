@@ -55,6 +55,26 @@ def test_all_statements_mean_what_they_mean_to_numba():
     np.testing.assert_equal(*results)
 
 
+def test_operations_that_numba_takes_from_python_and_negative_powers():
+    """The first has no code of numba's: PyTensor gives it a function of any number of arguments."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0] + 0.5, x[1] + q[0]],
+        process_noise=[[0.01]],
+        observation=lambda x: [
+            pt.round(x[0], mode="half_away_from_zero"),
+            pt.clip(x[0] ** -17, -1e3, 1e3),
+        ],
+        observation_noise=np.eye(2),
+        initial_mean=[-0.5, 0.0],
+        initial_cov=np.zeros((2, 2)),
+    )
+    with pytest.warns(UserWarning, match="object mode to run RoundHalfAwayFromZero"):
+        path = psf.simulate(system, {}, steps=[0, 1, 2, 4], noise=False)
+    np.testing.assert_allclose(
+        path["observations"], [[-1.0, -1e3], [0.0, 1e3], [1.0, 1e3], [2.0, 1.5**-17]], rtol=1e-12
+    )
+
+
 def test_it_compiles_in_a_fraction_of_the_time():
     """Of numba, for 400 statements; the ratio is about 8."""
     lines = ["v0 = c[0]", *(f"v{i} = v{i - 1} * c[{i % 3}] + {i}.5" for i in range(1, 400))]

@@ -123,6 +123,15 @@ def test_a_free_run_beside_the_record(free_run, forecast):
     np.testing.assert_array_equal(drawn(shown, "truth")["speed"]["x"], TIMES[:31])
 
 
+def test_a_free_run_alone_needs_no_name_of_its_group(free_run):
+    alone = xr.DataTree.from_dict({name: free_run[name] for name in ("free_run", "observed_data")})
+    medians = [
+        drawn(plot_forecast(alone, group=group, backend="none"), "median")["speed"]["y"]
+        for group in (None, "free_run")
+    ]
+    np.testing.assert_array_equal(*medians)
+
+
 def test_a_free_run_on_the_second_part_of_the_record(free_run):
     part = free_run.copy(deep=True)
     part["free_run"] = part["free_run"].isel(d_time=slice(20, None))

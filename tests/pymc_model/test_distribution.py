@@ -9,6 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from tests.sampling.autoregression import autoregression
 from tests.small_systems import (
     FORCE,
     FORCED,
@@ -291,3 +292,14 @@ def test_several_records_share_parameters():
     assert model["second"].type.shape == (2, 2)
     logp = model.compile_logp([model["first"]], sum=False)
     np.testing.assert_allclose(logp({"a": 0.6})[0], pair_terms(0.6), rtol=1e-12)
+
+
+def test_a_misspelt_parameter_is_shown_among_the_models_variables():
+    with pm.Model():
+        pm.Normal("fi")
+        pm.HalfNormal("spread")
+        words = (
+            r"no value for the parameters \['phi'\]; the model's variables are \['fi', 'spread'\]"
+        )
+        with pytest.raises(psf.ModelError, match=words):
+            psf.StateSpace("d", autoregression(), psf.EKF(), steps=[1], observed=[0.3])

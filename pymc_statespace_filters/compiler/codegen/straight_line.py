@@ -175,8 +175,8 @@ class _Reader:
 
     def _binop(self, node: ast.BinOp) -> _Term:
         function, left = _OPERATORS[type(node.op)], self._term(node.left)
-        exponent = getattr(node.right, "value", None)
-        if function is operator.pow and isinstance(exponent, int) and left.type == types.float64:
+        exponent = _whole(node.right)
+        if function is operator.pow and exponent and left.type == types.float64:
             return _Term(types.float64, lambda frame: _power(frame, left.emit(frame), exponent))
         return self._called(function, left, self._term(node.right))
 
@@ -241,10 +241,23 @@ class _Reader:
                 kind = types.float64 if function in _ARITHMETIC else types.boolean
                 return _Term(kind, lambda f: instruction(f.builder, a.emit(f), b.emit(f)))
         resolved, sig = self._resolved(function, kinds)
-        arguments = [self._cast(t, k) for t, k in zip(terms, sig.args, strict=True)]
+        arguments = self._arguments(terms, sig.args)
         return _Term(
             sig.return_type, lambda f: f.call(resolved, sig, [a.emit(f) for a in arguments])
         )
+
+    def _arguments(self, terms: Sequence[_Term], kinds: Sequence) -> list[_Term]:
+        """Terms of the types of a signature, which takes those of ``*args`` as one tuple."""
+        n = len(kinds)
+        if kinds and isinstance(kinds[-1], types.StarArgTuple | types.StarArgUniTuple):
+            n -= 1
+            rest = [self._cast(t, k) for t, k in zip(terms[n:], kinds[-1], strict=True)]
+            packed = _Term(
+                kinds[-1],
+                lambda f: f.context.make_tuple(f.builder, kinds[-1], [t.emit(f) for t in rest]),
+            )
+            terms = [*terms[:n], packed]
+        return [self._cast(t, k) for t, k in zip(terms, kinds, strict=True)]
 
     def _resolved(self, function: Any, kinds: tuple) -> tuple:
         key = (id(function), kinds)
@@ -260,14 +273,23 @@ class _Reader:
 
 
 def _power(frame: _Frame, base: Any, exponent: int) -> Any:
-    """A whole power from 1 on, as products."""
-    result = None
-    while exponent:
-        if exponent % 2:
+    """A whole power other than 0, as products; of zero a negative one is infinite, as in numpy."""
+    result, rest = None, abs(exponent)
+    while rest:
+        if rest % 2:
             result = base if result is None else frame.builder.fmul(result, base)
-        exponent //= 2
+        rest //= 2
         base = frame.builder.fmul(base, base)
-    return result
+    one = frame.context.get_constant(types.float64, 1.0)
+    return result if exponent > 0 else frame.builder.fdiv(one, result)
+
+
+def _whole(node: Any) -> int:
+    """The whole number that an expression states, 0 if it states none."""
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        return -_whole(node.operand)
+    value = getattr(node, "value", None)
+    return value if type(value) is int else 0
 
 
 def _instruction(function: Any) -> Callable[[Any, Any, Any], ir.Value] | None:
