@@ -48,8 +48,8 @@ TRIED = 5  # times as many may be tried, at 20 us each: some turn out not to be 
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
 # Above one of these numbers, of statements and of results, a function is optimised and becomes
-# machine code in its callers only: 17 s instead of 28 s for the gradient of 20 states. The code of a
-# function that returns 1700 numbers, the constants of 40 states, took 40 s.
+# machine code in its callers only: 17 s instead of 28 s for the gradient of 20 states. The code of
+# a function that returns 1700 numbers, the constants of 40 states, took 40 s.
 LARGE = 1000
 LARGE_TUPLE = 400
 
@@ -234,6 +234,7 @@ def build(
     body: Sequence[str],
     writer: Writer,
     large: bool = False,
+    /,
     **blocks: tuple[str, Sequence[str]],
 ) -> CompiledFunction:
     """Compile a function body that calls blocks of a writer's statements.
