@@ -28,7 +28,12 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     function_of,
 )
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
-from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.source import (
+    VECTOR_NAMESPACE,
+    Writer,
+    depends_on,
+    n_operations,
+)
 from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.errors import LoweringError
@@ -39,11 +44,14 @@ _LOG = logging.getLogger("pymc_statespace_filters")
 # a full matrix of parameters has 27000 operations and takes 22 s. Array code takes 40 s for the EKF
 # of 12 states and 50 s for 20, and runs seventeen times slower there. CPU seconds of a first call.
 MAX_EXPRESSIONS = 30_000
+TRIED = 5  # times as many may be tried, at 20 us each: some turn out not to be needed
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
-# Above this number of statements a function is optimised and made machine code in its callers only:
-# 17 s instead of 28 s for the gradient of 20 states.
+# Above one of these numbers, of statements and of results, a function is optimised and becomes
+# machine code in its callers only: 17 s instead of 28 s for the gradient of 20 states. The code of
+# a function that returns 1700 numbers, the constants of 40 states, took 40 s.
 LARGE = 1000
+LARGE_TUPLE = 400
 
 # LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
 # 8 rows that are written and as many that are only read need 92.
@@ -64,8 +72,12 @@ def unrolled(graph: Graph) -> list[list[Value]]:
         raise NotUnrollableError(f"more than {MAX_OUTPUT_ELEMENTS} numbers")
     arena = Arena()
     values = [_input_elements(arena, name, v) for name, v in graph.inputs.items()]
-    arrays = unroll(arena, list(graph.inputs.values()), values, graph.outputs, MAX_EXPRESSIONS)
-    return [list(np.atleast_1d(a)) for a in arrays]
+    most = TRIED * MAX_EXPRESSIONS
+    arrays = unroll(arena, list(graph.inputs.values()), values, graph.outputs, most)
+    lists = [list(np.atleast_1d(a)) for a in arrays]
+    if n_operations(v for group in lists for v in group) > MAX_EXPRESSIONS:
+        raise NotUnrollableError(f"more than {MAX_EXPRESSIONS} scalar operations")
+    return lists
 
 
 def _input_elements(arena: Arena, name: str, variable: Variable) -> np.ndarray:
@@ -115,8 +127,15 @@ def _scalar_vector_function(name: str, function: VectorFunction, values: list) -
         for group, is_scalar in zip(values, function.scalar, strict=True)
     ]
     lines.append(f"return {', '.join(results)}")
-    arguments = function.arguments
-    return build(name, arguments, [f"return all({arguments})"], writer, all=(arguments, lines))
+    arguments, n_results = function.arguments, sum(map(len, values))
+    return build(
+        name,
+        arguments,
+        [f"return all({arguments})"],
+        writer,
+        n_results > LARGE_TUPLE,
+        all=(arguments, lines),
+    )
 
 
 def member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
@@ -188,6 +207,22 @@ def _staged_loop(
     return body, inputs, [*inside, *stores]
 
 
+def copy_elements(arguments: str, target: str, source: str, size: int) -> Any:
+    """``copy(arguments)`` sets ``target``, a place for element i, to the elements of a vector.
+
+    A tuple that is indexed in a loop compiles to a branch for each of its elements.
+    """
+    return straight_line(
+        arguments, [f"{target.format(i=i)} = {source}[{i}]" for i in range(size)], {}
+    )
+
+
+def all_finite(size: int) -> Any:
+    """``all_finite(vector)``: whether the first elements are finite, without a loop as above."""
+    tests = [f"abs(s[{i}]) < inf" for i in range(size)]
+    return straight_line("s", [f"return {' and '.join(tests)}"], {"inf": np.inf})
+
+
 def sorted_by_number(values: Iterable[Value]) -> list[Value]:
     """Expressions in order of creation, so that the source is canonical."""
     return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
@@ -198,6 +233,8 @@ def build(
     arguments: str,
     body: Sequence[str],
     writer: Writer,
+    large: bool = False,
+    /,
     **blocks: tuple[str, Sequence[str]],
 ) -> CompiledFunction:
     """Compile a function body that calls blocks of a writer's statements.
@@ -207,7 +244,7 @@ def build(
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     namespace = {**writer.namespace, **others}
     code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
-    large = sum(len(lines) for _, lines in blocks.values()) > LARGE
+    large |= sum(len(lines) for _, lines in blocks.values()) > LARGE
     function, source = function_of(name, arguments, body, {**namespace, **code}, large)
     texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
     operations = [repr(op) for op, _ in writer.fallbacks.values()]

@@ -204,3 +204,8 @@ def depends_on(values: Iterable[Value], inputs: frozenset[str]) -> set[Expressio
         elif any(isinstance(a, Expression) and a in dependent for a in expression.args):
             dependent.add(expression)
     return dependent
+
+
+def n_operations(values: Iterable[Value]) -> int:
+    """The number of operations under ``values``."""
+    return sum(expression.op is not None for expression in _in_order(values, {}))

@@ -14,7 +14,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
 from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
@@ -44,14 +44,13 @@ def followed_by_square_roots(
     flat = vector_functions({"moments": VectorFunction("c", graph)})["moments"]
     length, sizes = graph.outputs[0].type.shape[0], tuple(cov.type.shape[0] for cov in covs)
     moments, first = flat.function, length - sum(size**2 for size in sizes)
+    copy = copy_elements("values, c", "c[{i}]", "values", length)
     SQUARE_ROOT.compile()
     take_root = SQUARE_ROOT.external
 
     def prepare(theta):
         c = np.empty(length)
-        values = moments(theta)
-        for i in range(c.size):
-            c[i] = values[i]
+        copy(moments(theta), c)
         start = first
         for size in sizes:
             take_root(c[start:].ctypes.data, size)

@@ -14,7 +14,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     Graph,
     VectorFunction,
 )
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
 from pymc_statespace_filters.filters.gaussian.recursion import (
     GaussianFilterFunctions,
     compile_taped,
@@ -31,7 +31,8 @@ def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
     parameters, zeros, start_vjp, predict_vjp, update_vjp = (
         part.function for part in parts.values()
     )
-    dt = recursion.system.dt
+    dt, n_theta = recursion.system.dt, recursion.system.n_theta
+    copy = copy_elements("c_bar, theta_bar", "theta_bar[{i}]", "c_bar", n_theta)
 
     def reverse(theta, steps, observed, inputs, t0, seed, tape, terms_bar):
         theta_bar = np.zeros(theta.size)
@@ -53,8 +54,7 @@ def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
                 row -= np.uint64(1)
                 s_bar, c_bar = predict_vjp(c, inputs, k, t0 + k * dt, tape, row, s_bar, c_bar)
         c_bar = start_vjp(c, s_bar, c_bar)
-        for i in range(theta.size):
-            theta_bar[i] = c_bar[i]
+        copy(c_bar, theta_bar)
         return theta_bar
 
     return compiled_of(reverse, "reverse", parts, recursion)

@@ -16,7 +16,11 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import (
+    all_finite,
+    copy_elements,
+    vector_functions,
+)
 from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.filters.gaussian.linearization import Linearization
@@ -76,14 +80,12 @@ def _tape(size: int) -> _Tape:
         n_steps = steps[-1] if steps.size else 0
         return np.empty((n_steps + steps.size, size))
 
-    def save(tape, row, s):
-        for i in range(size):
-            tape[row, i] = s[i]
+    save = copy_elements("tape, row, s", "tape[row, {i}]", "s", size)
 
     def result(terms, health, tape, row, s):
         return terms, health, tape[: row if health[1] == NONE else 0]
 
-    return _Tape(jit(new), jit(save), jit(result))
+    return _Tape(jit(new), save, jit(result))
 
 
 def _tape_to_the_end(size: int) -> _Tape:
@@ -131,7 +133,7 @@ def _compile_forward(
     parameters, start, predict, update = (part.function for part in parts.values())
     valid = covariance_check(recursion.system)
     has_valid_covariances = valid.function
-    dt, n = recursion.system.dt, recursion.system.n
+    dt, is_finite = recursion.system.dt, all_finite(recursion.system.n)
     new, save, result = tape.new, tape.save, tape.result
 
     def forward(theta, steps, observed, inputs, t0, seed):
@@ -155,9 +157,7 @@ def _compile_forward(
             if is_missing(observed, j):
                 terms[j] = 0.0
                 continue
-            finite = np.isfinite(s[0])
-            for i in range(n):
-                finite &= np.isfinite(s[i])
+            finite = is_finite(s)
             s, terms[j] = update(c, inputs, k, t0 + k * dt, observed[j], s)
             if not np.isfinite(terms[j]):
                 terms[j:] = -np.inf

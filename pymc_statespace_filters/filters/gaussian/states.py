@@ -16,7 +16,10 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import (
+    copy_elements,
+    vector_functions,
+)
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariance_check,
     semidefinite_cholesky,
@@ -239,6 +242,8 @@ def _noise(smoother: BrysonFrazier) -> CompiledFunction:
     graph = Graph({"theta": theta}, [pt.concatenate([cov.ravel() for cov in covs])])
     flat = vector_functions({"covariances": VectorFunction("c", graph)})["covariances"]
     covariances, n_rows = flat.function, m + system.p
+    n_values = graph.outputs[0].type.shape[0]
+    copy = copy_elements("found, values", "values[{i}]", "found", n_values)
     FILL_NORMALS.compile()
     fill, purpose = FILL_NORMALS.external, np.int64(STATES)
 
@@ -247,7 +252,8 @@ def _noise(smoother: BrysonFrazier) -> CompiledFunction:
         X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
         fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
         fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
-        values = covariances(theta)
+        values = np.empty(n_values)
+        copy(covariances(theta), values)
         apply_covariance(values, 0, n, X)
         if not is_white:
             apply_covariance(values, n * n, m, Z)
