@@ -20,11 +20,11 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
 sources = []
 build = lowering.build
-def noted(name, arguments, body, writer, **blocks):
+def noted(name, arguments, body, writer, large=False, /, **blocks):
     sources.extend([name, arguments, *body])
     for block, (given, lines) in blocks.items():
         sources.extend([block, given, *lines])
-    return build(name, arguments, body, writer, **blocks)
+    return build(name, arguments, body, writer, large, **blocks)
 lowering.build = noted
 
 def drift(x, t, u, a, b=1.5):

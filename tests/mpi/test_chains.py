@@ -16,7 +16,7 @@ def draws_of_all(**settings):
     trees = psf.run_models(
         {name: state_space_model(*filters) for name, filters in FILTERS.items()},
         draws=150,
-        tune=100,
+        tune=300,
         chains=3,
         random_seed=4,
         discard_tuned_samples=False,
