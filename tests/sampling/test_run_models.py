@@ -85,8 +85,9 @@ def test_threads_are_shared_by_all_models(models, monkeypatch):
 
 
 def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
-    expected = psf.run_models(models, **SETTINGS)
-    settings = SETTINGS | {"checkpoint": tmp_path, "cores": 2}
+    settings = SETTINGS | {"tune": 400}  # long enough for a search by the expensive filter
+    expected = psf.run_models(models, **settings)
+    settings |= {"checkpoint": tmp_path, "cores": 2}
 
     def interrupted(pool, *others):
         while min(task.n_done for task in pool.running.values()) < 10:
