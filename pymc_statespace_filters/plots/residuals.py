@@ -81,25 +81,22 @@ def plot_residuals(
 
     Examples
     --------
-    >>> import pymc as pm
-    >>> import pymc_statespace_filters as psf
-    >>> system = psf.StateSpaceModel(
-    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
-    ...     process_noise=[[1.0]],
-    ...     observation=lambda x: [x[0]],
-    ...     observation_noise=[[0.5]],
-    ...     initial_mean=[0.0],
-    ...     initial_cov=[[1.0]],
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_residuals
+    >>> rng = np.random.default_rng(1)
+    >>> dims = ("d_time", "observable")
+    >>> diagnostics = xr.Dataset(
+    ...     {
+    ...         "d_innovation": (dims, 2.0 * rng.normal(size=(100, 1))),
+    ...         "d_innovation_cov": ((*dims, "observable_2"), np.full((100, 1, 1), 4.0)),
+    ...         "d_autocorrelation": (("lag", "observable"), 0.1 * rng.normal(size=(20, 1))),
+    ...         "d_predicted": (("chain", "draw", *dims), rng.normal(size=(2, 50, 100, 1))),
+    ...     },
+    ...     coords={"d_time": np.arange(100) / 10, "lag": np.arange(1, 21), "observable": ["x"]},
     ... )
-    >>> record = psf.simulate(system, {"a": 0.8}, steps=range(40), random_seed=1)
-    >>> with pm.Model() as model:
-    ...     a = pm.Normal("a", 0, 0.5)
-    ...     d = psf.StateSpace(
-    ...         "d", system, psf.EKF(), steps=range(40), observed=record["observations"]
-    ...     )
-    ...     idata = psf.sample_dram(500, tune=500, random_seed=1, progressbar=False)
-    >>> idata = psf.filter_diagnostics(idata, model, random_seed=2)
-    >>> collection = psf.plot_residuals(idata)
+    >>> idata = xr.DataTree.from_dict({"filter_diagnostics": diagnostics})
+    >>> collection = plot_residuals(idata)
     >>> collection.savefig("residuals.png")  # doctest: +SKIP
     """
     _, results = group_of(idata, "filter_diagnostics")

@@ -18,6 +18,7 @@ from tests.states.models import (
     SHAPE,
     T0,
     A,
+    counted_model,
     pair_law,
     pair_model,
     posterior,
@@ -154,16 +155,7 @@ def test_a_draw_at_which_the_filter_fails_has_no_forecast():
 
 def test_counts_are_forecast_as_counts():
     """Dispersion: the mean of counts is that of their rate, the variance larger by the mean."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, c: [0.8 * x[0] + q[0]],
-        process_noise=[[0.2]],
-        observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
-        initial_mean=[0.0],
-        initial_cov=[[0.5]],
-    )
-    with pm.Model() as model:
-        pm.Normal("c")
-        psf.StateSpace("d", system, psf.BootstrapPF(100), steps=[0, 1], observed=[1.0, 2.0])
+    model = counted_model(initial_mean=0.0)
     values = np.tile([0.3, 1.3], (2, 1500))
     values[1, 0] = 1e300  # the filter fails, and no count is that of an unknown rate
     with pytest.warns(psf.FilterWarning, match="in 1 of 6000 evaluations"):

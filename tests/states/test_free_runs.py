@@ -20,6 +20,7 @@ from tests.states.models import (
     SHAPE,
     T0,
     A,
+    counted_model,
     pair_model,
     posterior,
     pushed_model,
@@ -201,16 +202,7 @@ def test_coverage_is_that_of_measurements(noise):
 
 def test_counts():
     """Means of counts, compared with intervals of whole counts."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, c: [0.8 * x[0] + q[0]],
-        process_noise=[[0.2]],
-        observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
-        initial_mean=[1.0],
-        initial_cov=[[0.5]],
-    )
-    with pm.Model() as model:
-        pm.Normal("c")
-        psf.StateSpace("d", system, psf.BootstrapPF(100), steps=[0, 1], observed=[1.0, 2.0])
+    model = counted_model(initial_mean=1.0)
     idata = posterior(c=np.full((2, 500), 0.5))
     expected = np.exp(0.5 + 0.8 ** np.arange(3))
     group = runs(idata, model, steps=[0, 1, 2], observed=[3.0, np.nan, 20.0])

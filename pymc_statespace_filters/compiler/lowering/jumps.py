@@ -80,7 +80,7 @@ def _jumps(elements: Sequence[Value], states: frozenset[str], n: int) -> bool:
     order = sorted(everything, key=lambda e: e.number)
     stepped = [e for e in order if e in of_mean and isinstance(e.op, _STEPPED)]
     n_points = int(np.clip(_MOST_EVALUATIONS / (_N_LINES * len(order)), 16, 200)) // 2
-    far = np.geomspace(1e-3, 1e4, n_points)  # thresholds have any scale
+    far = np.geomspace(1e-3, 1e8, n_points)  # thresholds have the scale of the state
     distances = np.concatenate([-far[::-1], [0.0], far])
     rng = np.random.default_rng(0)
     lines = [_on_line(order, elements, stepped, states, rng) for _ in range(_N_LINES)]

@@ -175,6 +175,7 @@ def _is_within(first, end, tiles):
     return tiles.block.size > 0 and tiles.low <= first and end <= tiles.high
 
 
+# Two functions, because numba cannot link what makes both kinds of tiles into one.
 @njit_internal
 def with_targets(table, spacing, reach, first, end):
     """The table with tiles for a prediction of blocks [first, end)."""

@@ -1,6 +1,7 @@
-"""Statistics of a phase of a chain, and the warning about them when the chain ends."""
+"""Statistics of a phase of a chain, and the warnings about chains when they have ended."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,11 @@ from pymc_statespace_filters.sampling.kernel.state import (
     N_SCREEN_FAILED,
     N_SCREENED,
     STAGE,
+    ChainState,
     Draws,
     failure_reason,
 )
-from pymc_statespace_filters.sampling.target.target import Growth
+from pymc_statespace_filters.sampling.target.target import Growth, Target
 
 # Fraction of evaluations after warm-up that may fail without a warning: a chain that touches the
 # edge of the region where its filter works is normal.
@@ -220,3 +222,21 @@ def _failure_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
             f"rejected: {counted}. If the posterior extends into that region it is truncated there."
         )
     return None
+
+
+def chain_warnings(
+    target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
+) -> list[SamplerWarning]:
+    """Warnings about single chains, at most one for each."""
+    below = {shortfall.chain: shortfall for shortfall in shortfalls([d for d, _ in results], tune)}
+    warnings = []
+    for i, (draws, state) in enumerate(results):
+        statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
+        if statistics.iterations:
+            growth = target.growth(state.proposal_cov)
+            warning = closing_warning(statistics, growth, target.collapse_remedy)
+            if warning is not None:
+                warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
+            elif i in below:
+                warnings.append(below[i].warning())
+    return warnings

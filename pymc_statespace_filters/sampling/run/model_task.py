@@ -16,7 +16,6 @@ from pymc.stats.convergence import (
 )
 from xarray import DataTree
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import filters_used
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
@@ -36,29 +35,18 @@ from pymc_statespace_filters.sampling.output.report import (
 from pymc_statespace_filters.sampling.output.sample_stats import whole_chain
 from pymc_statespace_filters.sampling.output.warnings import (
     PhaseStatistics,
-    closing_warning,
+    chain_warnings,
     shortfalls,
 )
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from pymc_statespace_filters.sampling.run.population_search import search_population, searched_cov
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.run.warm_up import (
-    WarmUp,
-    generator_of,
-    n_search_points,
-    searched_cov,
-    stops_of,
-)
-from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
-from pymc_statespace_filters.sampling.starts.population import find_population
+from pymc_statespace_filters.sampling.run.warm_up import WarmUp, stops_of
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
-_UNUSABLE_PILOT = (
-    "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
-    "drawn from, no initval in the model, and no correlation"
-)
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
 _MOST_LIVE_DRAWS = 4000
@@ -155,48 +143,19 @@ class ModelTask:
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
-        None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
-        that lacks no variable has the points itself.
-
         Raises
         ------
         ModelError
             If no points can be found, though the pilot needs some.
         """
-        target, request = self.prepare(), self.request
-        pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
-        if pilot is not None and np.isfinite(pilot).all():
-            return pilot
-        n_points = n_search_points(request, target)
-        if (
-            n_points == 0
-            or request.initvals is not None
-            or not target.prior_draws.may_start
-            or target.carries_noise
-        ):
-            if pilot is not None:
-                raise ModelError(self._said(_UNUSABLE_PILOT))
-            return None
-        journal = None if self.checkpoint is None else self.checkpoint.journal("starts")
-        if journal is not None and (stored := journal.read()) is not None:
-            return stored.draws["population"]
-        try:
-            found = find_population(
-                target,
-                generator_of(request),
-                progressbar=progressbar,
-                n_points=n_points,
-                pilot=pilot,
-            )
-        except Exception as error:
-            of_model = f" of model {self.name!r}" if self.name else ""
-            error.add_note(f"in the search for starts{of_model}")
-            raise
-        if (message := modes_message(self.model, target.raveled, found)) is not None:
-            log_warnings([modes_warning(self._said(message))])
-        if journal is not None:
-            journal.append({"population": found.x}, {})
-        return found.x
+        return search_population(
+            self.model,
+            self.prepare(),
+            self.request,
+            self.checkpoint,
+            self._said,
+            progressbar=progressbar,
+        )
 
     def cost(self) -> float:
         """Estimate the seconds that a chain takes: as many evaluations as iterations."""
@@ -283,7 +242,7 @@ class ModelTask:
         target, request = self.prepare(), self.request
         closing = self._closing_messages(check_convergence, report_level)
         results = [self._results.pop(index) for index in range(self.request.chains)]
-        warnings = _chain_warnings(target, results, request.tune)
+        warnings = chain_warnings(target, results, request.tune)
         attrs, noise_warnings = self._measure_noise(target, results)
         warnings += noise_warnings
         chains = []
@@ -359,21 +318,3 @@ class ModelTask:
                 warnings = [] if warning is None else [warning]
                 return {"log_likelihood_variance": spread.variance}, warnings
         return {}, []
-
-
-def _chain_warnings(
-    target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
-) -> list[SamplerWarning]:
-    """Warnings about single chains, at most one for each."""
-    below = {shortfall.chain: shortfall for shortfall in shortfalls([d for d, _ in results], tune)}
-    warnings = []
-    for i, (draws, state) in enumerate(results):
-        statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
-        if statistics.iterations:
-            growth = target.growth(state.proposal_cov)
-            warning = closing_warning(statistics, growth, target.collapse_remedy)
-            if warning is not None:
-                warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
-            elif i in below:
-                warnings.append(below[i].warning())
-    return warnings

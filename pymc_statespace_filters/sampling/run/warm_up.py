@@ -13,18 +13,8 @@ from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
 from pymc_statespace_filters.sampling.kernel.state import Draws
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
-from pymc_statespace_filters.sampling.starts.population import N_POINTS
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.student_mixture import standardised
 
 _NO_CHAIN = 2**32 - 1
-# Iterations of the warm-up of all chains, with an expensive filter: from the first on, the search
-# for starts is complete, and below the second there is none. A search makes 200 evaluations, and 24
-# to 60 for each point: with as many draws as warm-up, a third of what the chains evaluate, or as
-# much for narrow posteriors.
-_LONG_WARMUP, _SHORT_WARMUP = 4000, 800
-_PER_POINT = 40  # of these iterations
-_FEWEST_POINTS = 32
 
 
 def stops_of(request: SamplingRequest) -> list[int]:
@@ -32,43 +22,10 @@ def stops_of(request: SamplingRequest) -> list[int]:
     return [*warmup_parts(request.tune), request.n_iterations]
 
 
-def n_search_points(request: SamplingRequest, target: Target) -> int:
-    """Points of the search for starts; 0 if there is no search.
-
-    Fewer with an expensive filter and a short warm-up: then a search would take longer than the
-    chains. The number of draws does not count, so that a long run contains every shorter one. A
-    pilot that lacks variables needs a search, however short.
-    """
-    iterations = request.chains * request.tune
-    if iterations == 0:
-        return 0
-    if iterations >= _LONG_WARMUP or not target.is_expensive:
-        return N_POINTS
-    if iterations < _SHORT_WARMUP and request.pilot is None:
-        return 0
-    return max(iterations // _PER_POINT, _FEWEST_POINTS)
-
-
 def generator_of(request: SamplingRequest, *key: int) -> np.random.Generator:
     """A generator of a model's own random numbers, which are not those of a chain."""
     seed = np.random.SeedSequence(request.entropy, spawn_key=(_NO_CHAIN, *key))
     return np.random.default_rng(seed)
-
-
-def searched_cov(
-    request: SamplingRequest, target: Target, population: np.ndarray | None
-) -> np.ndarray | None:
-    """The first proposal covariance after a short search; None if it is the user's or the prior's.
-
-    A mixture fitted to few points may suit none, and the prior may be a thousand times too wide.
-    """
-    is_complete = n_search_points(request, target) == N_POINTS
-    if population is None or request.proposal_cov is not None or is_complete:
-        return None
-    points = standardised(population)
-    if points is None:
-        return None
-    return np.asarray(points.chol @ points.chol.T * 2.38**2 / population.shape[1])
 
 
 class WarmUp:

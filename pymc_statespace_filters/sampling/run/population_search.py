@@ -1,0 +1,114 @@
+"""The search for starts of a model's chains: how long it is, and what comes of it."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pymc.model import Model
+from pymc.stats.convergence import log_warnings
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
+from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.run.warm_up import generator_of
+from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
+from pymc_statespace_filters.sampling.starts.population import N_POINTS, find_population
+from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.student_mixture import standardised
+
+_UNUSABLE_PILOT = (
+    "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
+    "drawn from, no initval in the model, and no correlation"
+)
+# Iterations of the warm-up of all chains, with an expensive filter: from the first on, the search
+# for starts is complete, and below the second there is none. A search makes 200 evaluations, and 24
+# to 60 for each point: with as many draws as warm-up, a third of what the chains evaluate, or as
+# much for narrow posteriors.
+_LONG_WARMUP, _SHORT_WARMUP = 4000, 800
+_PER_POINT = 40  # of these iterations
+_FEWEST_POINTS = 32
+
+
+def search_population(
+    model: Model,
+    target: Target,
+    request: SamplingRequest,
+    checkpoint: Checkpoint | None,
+    said: Callable[[str], str],
+    *,
+    progressbar: bool,
+) -> np.ndarray | None:
+    """Points of the posterior, stored in the checkpoint; None if starts are given otherwise.
+
+    None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
+    that lacks no variable has the points itself. ``said`` adds the model's name to a message.
+
+    Raises
+    ------
+    ModelError
+        If no points can be found, though the pilot needs some.
+    """
+    pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
+    if pilot is not None and np.isfinite(pilot).all():
+        return pilot
+    n_points = n_search_points(request, target)
+    if (
+        n_points == 0
+        or request.initvals is not None
+        or not target.prior_draws.may_start
+        or target.carries_noise
+    ):
+        if pilot is not None:
+            raise ModelError(said(_UNUSABLE_PILOT))
+        return None
+    journal = None if checkpoint is None else checkpoint.journal("starts")
+    if journal is not None and (stored := journal.read()) is not None:
+        return stored.draws["population"]
+    try:
+        found = find_population(
+            target,
+            generator_of(request),
+            progressbar=progressbar,
+            n_points=n_points,
+            pilot=pilot,
+        )
+    except Exception as error:
+        error.add_note(said("in the search for starts"))
+        raise
+    if (message := modes_message(model, target.raveled, found)) is not None:
+        log_warnings([modes_warning(said(message))])
+    if journal is not None:
+        journal.append({"population": found.x}, {})
+    return found.x
+
+
+def n_search_points(request: SamplingRequest, target: Target) -> int:
+    """Points of the search for starts; 0 if there is no search.
+
+    Fewer with an expensive filter and a short warm-up: then a search would take longer than the
+    chains. The number of draws does not count, so that a long run contains every shorter one. A
+    pilot that lacks variables needs a search, however short.
+    """
+    iterations = request.chains * request.tune
+    if iterations == 0:
+        return 0
+    if iterations >= _LONG_WARMUP or not target.is_expensive:
+        return N_POINTS
+    if iterations < _SHORT_WARMUP and request.pilot is None:
+        return 0
+    return max(iterations // _PER_POINT, _FEWEST_POINTS)
+
+
+def searched_cov(
+    request: SamplingRequest, target: Target, population: np.ndarray | None
+) -> np.ndarray | None:
+    """The first proposal covariance after a short search; None if it is the user's or the prior's.
+
+    A mixture fitted to few points may suit none, and the prior may be a thousand times too wide.
+    """
+    is_complete = n_search_points(request, target) == N_POINTS
+    if population is None or request.proposal_cov is not None or is_complete:
+        return None
+    points = standardised(population)
+    if points is None:
+        return None
+    return np.asarray(points.chol @ points.chol.T * 2.38**2 / population.shape[1])
