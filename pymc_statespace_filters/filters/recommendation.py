@@ -63,6 +63,15 @@ def exact_filter(system: System, *, without: Any = None) -> Filter | None:
     return next((f for f in filters if not f.noisy and f.is_exact_for(system)), None)
 
 
+def quiet_filter(system: System, filter: Any) -> Filter | None:
+    """A filter of the same likelihood with little noise or none, in place of a noisy one."""
+    exact = exact_filter(system, without=filter)
+    if exact is not None or isinstance(filter, GuidedPF):
+        return exact
+    followers = [f for f in _followers(system, filter) if f.is_exact_for(system)]
+    return next((f for f in followers if isinstance(f, GuidedPF)), None)
+
+
 def alternatives(system: System, filter: Any) -> str:
     """Say which other filters take a system, and which of them are exact."""
     filters = filters_for(system, without=filter)

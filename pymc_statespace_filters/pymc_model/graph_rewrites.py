@@ -17,7 +17,6 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.grid import GridFilter
-from pymc_statespace_filters.filters.guided_pf import GuidedPF
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.ops.distributed import (
@@ -32,8 +31,6 @@ from pymc_statespace_filters.pymc_model.inspection import (
     state_space_nodes,
 )
 from pymc_statespace_filters.system.model import StateSpaceModel
-
-_N_GUIDED = 100  # particles of a `quiet_filter`
 
 
 class CallbackLikelihoods(NamedTuple):
@@ -183,24 +180,6 @@ def likelihood_terms(graph: TensorVariable, model: pm.Model, name: str) -> Tenso
         if _is_likelihood_of(node, model, variable):
             return node.outputs[0]
     raise ModelError(f"the graph must contain the likelihood of {name}")
-
-
-def quiet_filter(model: pm.Model, name: str) -> Filter | None:
-    """A filter that computes the likelihood of a variable with little noise or none.
-
-    None if its system allows neither `GridFilter` nor `GuidedPF`, or the model has `GuidedPF`.
-    """
-    op = state_space_nodes(model)[name].op
-    if isinstance(op.filter, GuidedPF):
-        return None
-    for filter in (GridFilter(), GuidedPF(_N_GUIDED)):
-        try:
-            check_system_and_filter(op.system, filter)
-        except ModelError:
-            continue
-        if filter.is_exact_for(compile_system(op.system)):
-            return filter
-    return None
 
 
 def _is_likelihood_of(node: Any, model: pm.Model, variable: Any) -> bool:

@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import collapse_remedy, short_form
+from pymc_statespace_filters.filters.recommendation import collapse_remedy, quiet_filter, short_form
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
 
@@ -81,6 +81,12 @@ def collapse_remedies(model: pm.Model) -> str:
     if len(set(remedies.values())) <= 1:
         return "".join(set(remedies.values()))
     return " ".join(f"For {name!r}: {remedy}" for name, remedy in remedies.items())
+
+
+def quieter_filter(model: pm.Model, name: str) -> Filter | None:
+    """A filter of the same likelihood with little noise or none, for one variable."""
+    op = state_space_nodes(model)[name].op
+    return quiet_filter(compile_system(op.system), op.filter)
 
 
 def is_filter(value: object) -> bool:

@@ -13,6 +13,7 @@ from pymc_statespace_filters.filters.recommendation import (
     alternatives,
     collapse_remedy,
     filters_for,
+    quiet_filter,
     short_form,
 )
 from pymc_statespace_filters.pymc_model.inspection import collapse_remedies
@@ -152,3 +153,19 @@ def test_a_gradient_is_offered_by_filters_that_take_the_system():
             model.dlogp()
     assert "gradient: IPLF()." in str(caught.value)
     assert "EKF" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "filter", "expected"),
+    [
+        (dict(transition=lambda x, q: 0.9 * x[0] + q[0]), psf.BootstrapPF(9), psf.EKF()),
+        ({}, psf.BootstrapPF(9), psf.GridFilter()),
+        ({}, psf.GuidedPF(9), psf.GridFilter()),
+        (TWO | dict(process_noise=np.eye(2)), psf.BootstrapPF(9), psf.GuidedPF(100)),
+        (TWO | dict(process_noise=np.eye(2)), psf.GuidedPF(9), None),
+    ],
+)
+def test_a_filter_of_the_same_likelihood_with_less_noise(changes, filter, expected):
+    if "initial_mean" in changes:
+        changes = changes | dict(transition=lambda x, q: [pt.sin(x[1]) + q[0], x[0] + q[1]])
+    assert quiet_filter(compile_system(system(**changes)), filter) == expected

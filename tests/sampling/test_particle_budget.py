@@ -222,7 +222,7 @@ def test_an_interrupt_before_the_first_result_is_one(monkeypatch):
 
 
 def test_a_filter_is_named_if_it_has_been_seen_to_cope(monkeypatch):
-    """The search ends at the largest number, 16 000; GridFilter has no noise at all."""
+    """The search ends at the largest number, 16 000; on this linear system an EKF is exact."""
     with_points(monkeypatch, 0.8)
     noisy = SeedSpread(100, -1.0, 40.0, 30.0, 50.0, 0)
 
@@ -230,7 +230,7 @@ def test_a_filter_is_named_if_it_has_been_seen_to_cope(monkeypatch):
         return [measure(first)._replace(centre=noisy)]
 
     monkeypatch.setattr(particle_budget, "search", search)
-    with pytest.warns(FilterWarning, match=r"41 \(.* %\).*GridFilter.* without noise"):
+    with pytest.warns(FilterWarning, match=r"41 \(.* %\).*EKF\(\) computes .* without noise"):
         psf.suggest_particles(surprising_model(), random_seed=1, progressbar=False)
 
 
@@ -245,7 +245,7 @@ def test_a_noisy_pilot_is_repeated_by_a_filter_of_the_same_posterior(monkeypatch
     monkeypatch.setattr(NoisyLikelihood, "_pilot", watched)
     likelihood = NoisyLikelihood(model, None, np.random.default_rng(1), Effort(600.0))
     centre, _ = likelihood.points()
-    assert used == [psf.BootstrapPF(200), psf.GridFilter()]
+    assert used == [psf.BootstrapPF(200), psf.EKF()]
     exact = surprising_model(psf.EKF()).compile_logp()
     grid = np.linspace(0.6, 1.0, 401)
     best = grid[np.argmax([exact({"phi": x}) for x in grid])]

@@ -85,8 +85,8 @@ def test_a_chain_in_a_lower_mode_is_named(report_of, adaptation):
     assert "Chain 1 stayed 1290 nats below chain 0 (median log-density)." in record.message
     assert "Chain 0 " not in record.message
     assert "find_starts" in record.message
-    (warning,) = [text for text in messages if text.startswith("Chain 1: ")]
-    assert "1290 nats below that of chain 0" in warning
+    (warning,) = [text for text in messages if text.startswith("Chain 1 ")]
+    assert "stayed 1290 nats below chain 0" in warning
 
 
 def test_chains_share_a_warm_up_which_leads_out_of_a_lower_mode(report_of):

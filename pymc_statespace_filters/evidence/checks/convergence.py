@@ -6,16 +6,13 @@ from collections.abc import Iterator
 import arviz as az
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.lower_chains import lower_chains
 
 MAX_RHAT = 1.05
 # Effective draws of all chains with which R-hat and ESS are reliable (Vehtari et al. 2021).
 ENOUGH_EFFECTIVE = 400
-# Nats, plus one for each parameter, by which the median log-density of a chain may lie below that
-# of another: the log-density of a Gaussian posterior has a standard deviation of (d / 2)^(1 / 2).
-TOLERATED_SHORTFALL = 10.0
 
 
 def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) -> Iterator[str]:
@@ -32,8 +29,9 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     if rhat <= MAX_RHAT:
         return
     found = f"the chains disagree (R-hat {rhat:.2f})"
-    if low := _lower_chain(posterior.log_density, len(parameters)):
-        yield f"{found}: {low}: start it where the others are (initvals), or tune longer"
+    if low := lower_chains(dict(enumerate(posterior.log_density)), len(parameters)):
+        lowest = max(low, key=lambda chain: chain.nats)
+        yield f"{found}: {lowest}: start it where the others are (initvals), or tune longer"
         return
     ess = min(float(az.ess(v)) for v, one in zip(parameters, rhats, strict=True) if one > MAX_RHAT)
     factor = max(2, math.ceil(ENOUGH_EFFECTIVE / max(ess, 1.0)))
@@ -43,16 +41,6 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
         f"would give {ENOUGH_EFFECTIVE}{how}. If R-hat stays above {MAX_RHAT}, start the chains "
         "elsewhere (initvals) or tune longer"
     )
-
-
-def _lower_chain(log_density: NDArray[np.float64], n_parameters: int) -> str:
-    """Name the chain that stays furthest below the highest one, if it is too far; else empty."""
-    levels = np.median(log_density, axis=1)
-    low, high = int(levels.argmin()), int(levels.argmax())
-    below = levels[high] - levels[low]
-    if not below > TOLERATED_SHORTFALL + n_parameters:
-        return ""
-    return f"chain {low} stayed {below:.0f} nats below chain {high} (median log-density)"
 
 
 def _drawn_by_us(idata: xr.DataTree | None) -> bool:

@@ -7,12 +7,12 @@ import numpy as np
 from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning
 
+from pymc_statespace_filters.lower_chains import LowerChain
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, Convergence
 from pymc_statespace_filters.sampling.output.warnings import (
     PhaseStatistics,
-    Shortfall,
     sampler_warning,
 )
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
@@ -34,7 +34,7 @@ def element_names(model: Model, raveled: RaveledVariables) -> list[str]:
 def closing_report(
     statistics: Mapping[int, PhaseStatistics],
     tune: int,
-    shortfalls: Sequence[Shortfall],
+    lower: Sequence[LowerChain],
     found: Convergence | None,
     names: Sequence[str],
     until_ess: float | None,
@@ -48,8 +48,8 @@ def closing_report(
         _size(statistics, tune, found, names),
         _acceptance(statistics),
         _failures(statistics),
-        *(shortfall.described() + "." for shortfall in shortfalls),
-        _advice(statistics, shortfalls, found, until_ess),
+        *(f"{str(chain).capitalize()}." for chain in lower),
+        _advice(statistics, lower, found, until_ess),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
@@ -110,11 +110,11 @@ def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:
 
 def _advice(
     statistics: Mapping[int, PhaseStatistics],
-    shortfalls: Sequence[Shortfall],
+    lower: Sequence[LowerChain],
     found: Convergence | None,
     until_ess: float | None,
 ) -> str:
-    if shortfalls:
+    if lower:
         return (
             "These draws are not from one distribution: start the chains in the posterior "
             "(initvals=psf.find_starts()), or tune longer."

@@ -8,6 +8,7 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
+from pymc_statespace_filters.lower_chains import LowerChain, lower_chains
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
@@ -35,10 +36,6 @@ LONG_DWELL, LEAST_DWELL = 0.2, 100
 # Factor by which the proposals may be wider than the draws from the prior. With a proper prior they
 # are narrower; under a flat one draws around the model's initial point replace its draws.
 TOLERATED_GROWTH = 1e3
-
-# Nats, plus one for each dimension, by which the median log-density of a chain may lie below that
-# of another: the log-density of a Gaussian posterior has a standard deviation of (d / 2)^(1 / 2).
-TOLERATED_SHORTFALL = 10.0
 
 # Fraction of the draws whose particles may have collapsed: a rare surprise only costs mixing.
 TOLERATED_COLLAPSES = 0.5
@@ -124,42 +121,21 @@ def closing_warning(
     return None if message is None else sampler_warning(message)
 
 
-class Shortfall(NamedTuple):
-    """A chain whose log-density stayed far below that of the highest chain."""
-
-    chain: int
-    highest: int  # number of the highest chain
-    nats: float  # difference of their medians
-
-    def described(self) -> str:
-        """Name both chains and the difference."""
-        return (
-            f"Chain {self.chain} stayed {self.nats:.0f} nats below chain {self.highest} (median "
-            "log-density)"
-        )
-
-    def warning(self) -> SamplerWarning:
-        """Warn of the chain."""
-        return sampler_warning(
-            f"Chain {self.chain}: its log-density stayed {self.nats:.0f} nats below that of chain "
-            f"{self.highest} (median): it may be in a lower mode, or not have found the posterior. "
-            "Start it there (initvals, psf.find_starts) or tune longer."
-        )
-
-
-def shortfalls(chains: Sequence[Draws], tune: int) -> list[Shortfall]:
+def lower_chains_of(chains: Sequence[Draws], tune: int) -> list[LowerChain]:
     """Find the chains that stayed far below the highest one after the warm-up."""
-    levels = {
-        i: float(np.median(draws.numbers[tune:, LOG_DENSITY]))
+    log_densities = {
+        i: draws.numbers[tune:, LOG_DENSITY]
         for i, draws in enumerate(chains)
         if len(draws.positions) > tune
     }
-    if not levels:
-        return []
-    highest = max(levels, key=lambda i: levels[i])
-    tolerated = TOLERATED_SHORTFALL + chains[0].positions.shape[1]
-    below = {i: levels[highest] - level for i, level in levels.items()}
-    return [Shortfall(i, highest, nats) for i, nats in below.items() if nats > tolerated]
+    return lower_chains(log_densities, chains[0].positions.shape[1])
+
+
+def _lower_chain_warning(chain: LowerChain) -> SamplerWarning:
+    return sampler_warning(
+        f"{str(chain).capitalize()}: it may be in a lower mode, or not have found the posterior. "
+        "Start it there (initvals, psf.find_starts) or tune longer."
+    )
 
 
 def sampler_warning(message: str) -> SamplerWarning:
@@ -228,7 +204,7 @@ def chain_warnings(
     target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
 ) -> list[SamplerWarning]:
     """Warnings about single chains, at most one for each."""
-    below = {shortfall.chain: shortfall for shortfall in shortfalls([d for d, _ in results], tune)}
+    lower = {low.chain: low for low in lower_chains_of([draws for draws, _ in results], tune)}
     warnings = []
     for i, (draws, state) in enumerate(results):
         statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
@@ -237,6 +213,6 @@ def chain_warnings(
             warning = closing_warning(statistics, growth, target.collapse_remedy)
             if warning is not None:
                 warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
-            elif i in below:
-                warnings.append(below[i].warning())
+            elif i in lower:
+                warnings.append(_lower_chain_warning(lower[i]))
     return warnings

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.filters.recommendation import short_form
 from pymc_statespace_filters.pymc_model.inspection import resized
 from pymc_statespace_filters.sampling.particle_number.effort import Effort, OutOfTimeError
 from pymc_statespace_filters.sampling.particle_number.noisiest import (
@@ -85,7 +87,11 @@ class Measurement:
         """A filter that has been seen to have less variance at the same point, if there is one."""
         filter = self._likelihood.quiet_filter()
         if filter is None or not self._effort.has_left(1.0):
-            return [] if filter is None else [f"{filter!r} can treat this system: compare it"]
+            return (
+                []
+                if filter is None
+                else [f"{short_form(filter)} can treat this system: compare it"]
+            )
         self._likelihood.prepare(filter)
         self._effort.announce(f"Comparison with {type(filter).__name__}", _OTHER)
         try:
@@ -95,10 +101,14 @@ class Measurement:
         return _comparison(filter, found, variance)
 
 
-def _comparison(filter: object, found: Estimates, variance: float) -> Sequence[str]:
+def _comparison(filter: Filter, found: Estimates, variance: float) -> Sequence[str]:
     if not np.isfinite(found.totals).all():
         return []
     if found.totals.size == 1:
-        return [f"{filter!r} computes this likelihood without noise"]
+        return [f"{short_form(filter)} computes this likelihood without noise"]
     less = found.spread.variance
-    return [f"{filter!r} has a variance of {less:.2g} there"] if less < 0.5 * variance else []
+    return (
+        [f"{short_form(filter)} has a variance of {less:.2g} there"]
+        if less < 0.5 * variance
+        else []
+    )

@@ -11,10 +11,14 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.pymc_model.graph_rewrites import (
     likelihood_terms,
-    quiet_filter,
     with_filter,
 )
-from pymc_statespace_filters.pymc_model.inspection import noise_seeds, noisy_filters, resized
+from pymc_statespace_filters.pymc_model.inspection import (
+    noise_seeds,
+    noisy_filters,
+    quieter_filter,
+    resized,
+)
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     TOO_NOISY,
@@ -92,7 +96,7 @@ class NoisyLikelihood:
 
     def quiet_filter(self) -> Filter | None:
         """A filter with little noise that has the same posterior, if the system allows one."""
-        return quiet_filter(self._model, self.name)
+        return quieter_filter(self._model, self.name)
 
     def spread(self, n_particles: int, position: np.ndarray, n_seeds: int) -> SeedSpread:
         """Seed spread at a point, with fixed noise of the other variables."""
@@ -153,8 +157,8 @@ def noisy_variable(model: Any, var_name: Any) -> tuple[str, Any]:
     filters = noisy_filters(model)
     if not filters:
         raise ModelError(
-            "model must have a StateSpace variable with a noisy likelihood (EnKF, BootstrapPF, "
-            "PFEnKF), got a model without one"
+            "model must have a StateSpace variable with a noisy likelihood (particles or an "
+            "ensemble), got a model without one"
         )
     listed = ", ".join(map(repr, filters))
     if var_name is None and len(filters) > 1:

@@ -36,7 +36,7 @@ from pymc_statespace_filters.sampling.output.sample_stats import whole_chain
 from pymc_statespace_filters.sampling.output.warnings import (
     PhaseStatistics,
     chain_warnings,
-    shortfalls,
+    lower_chains_of,
 )
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
@@ -296,8 +296,8 @@ class ModelTask:
         if until_ess is not None and self.is_complete and n_draws == request.max_draws:
             if found is None or not found.reaches(until_ess):
                 messages.append(until_ess_warning(until_ess, n_draws, found, names))
-        below = shortfalls(draws, request.tune)
-        text = closing_report(statistics, request.tune, below, found, names, until_ess)
+        lower = lower_chains_of(draws, request.tune)
+        text = closing_report(statistics, request.tune, lower, found, names, until_ess)
         return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
 
     def _measure_noise(
