@@ -53,7 +53,18 @@ def guide(tmp_path_factory):
 
 
 def build(guide):
-    command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "--quiet", "-b", "html"]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-E",
+        "-W",
+        "--keep-going",
+        "--quiet",
+        "--no-color",
+        "-b",
+        "html",
+    ]
     return subprocess.run(
         [*command, str(guide), str(guide.parent / "html")], capture_output=True, text=True
     )

@@ -29,6 +29,7 @@ def drift(function, dt=0.05):
 JUMPS = {
     "switch": lambda x, a: pt.switch(x > a, x - 0.8, x + 0.5),
     "far threshold": lambda x, a: pt.switch(x > 700, 0.0, x),
+    "very far threshold": lambda x, a: pt.switch(x > 1e5, 0.5 * x, x),
     "two thresholds": lambda x, a: pt.switch(pt.and_(x > 0, x < a), 3.0, 0.0),
     "threshold model": lambda x, a: pt.switch(x > 0.5, a + x, x - a),
     "sign": lambda x, a: pt.sign(x - a),

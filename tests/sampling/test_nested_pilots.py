@@ -8,6 +8,7 @@ from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.sampling.run import population_search
 from pymc_statespace_filters.sampling.starts import population
 from pymc_statespace_filters.sampling.starts.nested import nested_reference
 
@@ -66,7 +67,7 @@ def populations(monkeypatch):
         found.append(find(*of, **named))
         return found[-1]
 
-    monkeypatch.setattr("pymc_statespace_filters.sampling.run.model_task.find_population", watched)
+    monkeypatch.setattr(population_search, "find_population", watched)
     return found
 
 

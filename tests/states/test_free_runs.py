@@ -181,6 +181,13 @@ def test_errors_of_the_predictions():
     assert group["interval"].values.tolist() == [0.5, 0.9]
 
 
+def test_rows_that_are_not_scored_are_not_compared():
+    model = pair_model(score_from=2)
+    rest = np.where(np.arange(len(STEPS))[:, None] < 2, np.nan, PAIR_DATA)
+    expected = runs(posterior(a=A), model, observed=rest)
+    np.testing.assert_array_equal(runs(posterior(a=A), model)["d_rmse"], expected["d_rmse"])
+
+
 @pytest.mark.parametrize("noise", [False, True])
 def test_coverage_is_that_of_measurements(noise):
     """Intervals cover as many of 400 data as they say, if these have the law of the predictions.
