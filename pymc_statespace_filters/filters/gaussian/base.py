@@ -79,7 +79,7 @@ class GaussianFilterBase:
 
     def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
-        return compile_states(_forward_pass(self.linearization, system.model), moment)
+        return compile_states(_forward_pass(self.linearization, system.model.gaussian), moment)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
@@ -90,7 +90,7 @@ class GaussianFilterBase:
         return "modified Bryson-Frazier"
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
-        return _functions(self.linearization, system.model)
+        return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
         """Raise if the observation is not a function with Gaussian noise."""
