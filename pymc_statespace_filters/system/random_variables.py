@@ -46,11 +46,17 @@ def trace_distributions(
 ) -> Drawn:
     """Call a function that returns distributions; its normals are the vector ``name``.
 
-    Random variables older than ``theta`` are not the function's own, and are refused later.
+    Random variables older than ``theta`` are not the function's own, and are refused.
     """
     role, entries = equation.role, _entries(equation, values)
     nodes = io_toposort([], entries)
-    variables = [n for n in nodes if _is_drawn(n) and is_made_after(n.outputs[-1], [theta])]
+    variables = [node for node in nodes if _is_drawn(node)]
+    for node in variables:
+        if not is_made_after(_output(node), [theta]):
+            raise ModelError(
+                f"{role} must use its arguments and constants only, got the random variable "
+                f"{_output(node)}; pass it as a parameter"
+            )
     laws = [_law_of(role, node) for node in variables]
     sizes = [
         law.count(_shape(node), parameters_of(node))

@@ -192,7 +192,8 @@ def _noises(symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """What the transition has as ``q``, and the same with normal variables."""
     if symbols.drawn is None:
         return symbols.values["q"], symbols.values["q"]
-    return symbols.drawn.exact, symbols.drawn.surrogate
+    # Named for messages about an index that is out of range.
+    return symbols.drawn.exact.copy(name="q"), symbols.drawn.surrogate.copy(name="q")
 
 
 @dataclass(frozen=True)
