@@ -172,7 +172,7 @@ def _record(variable: StateSpaceVariable, observed: Any, steps: NDArray[np.int64
 
 
 def _input_rows(at_draws: VariableAtDraws, inputs: Any, steps: NDArray[np.int64]) -> Array:
-    """The inputs (draws or 1, rows, n_inputs)."""
+    """The inputs (draws or 1, rows, n_input_columns)."""
     if inputs is None:
         rows = at_draws.inputs_until(steps)
     else:

@@ -15,6 +15,7 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.accumulators import reset
 from pymc_statespace_filters.system.checks import check_positive
 from pymc_statespace_filters.system.equations import (
     Equation,
@@ -56,10 +57,14 @@ class Functions:
 
 @dataclass(frozen=True)
 class Symbols:
-    """The symbols that the functions are called with: all parameters in one vector, and by name."""
+    """The symbols that the functions are called with: all parameters in one vector, and by name.
+
+    ``input_row`` is a row of inputs with the column of resets; ``values["u"]`` is without it.
+    """
 
     theta: TensorVariable
     values: Values
+    input_row: TensorVariable
     initial_mean: TensorVariable
 
     @property
@@ -112,7 +117,7 @@ def read(
     )
 
 
-def size(functions: Functions, signature: Signature) -> Symbols:
+def size(functions: Functions, signature: Signature, has_accumulators: bool = False) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
@@ -122,27 +127,37 @@ def size(functions: Functions, signature: Signature) -> Symbols:
     n = m0.type.shape[0]
     if n == 0:
         raise ModelError("initial_mean must have an entry for at least one state, got none")
+    n_inputs = len(signature.inputs)
+    u = pt.tensor("u", shape=(n_inputs + has_accumulators,), dtype="float64")
     values |= {
         "x": pt.tensor("x", shape=(n,), dtype="float64"),
-        "u": pt.tensor("u", shape=(len(signature.inputs),), dtype="float64"),
+        "u": u[:n_inputs] if has_accumulators else u,
         "t": pt.tensor("t", shape=(), dtype="float64"),
     }
     m = _noise_size(functions, values)
-    return Symbols(theta, values | {"q": pt.tensor("q", shape=(m,), dtype="float64")}, m0)
+    return Symbols(theta, values | {"q": pt.tensor("q", shape=(m,), dtype="float64")}, u, m0)
 
 
 def trace(
-    functions: Functions, symbols: Symbols, observables: Sequence[str] | None
+    functions: Functions,
+    symbols: Symbols,
+    observables: Sequence[str] | None,
+    accumulators: Sequence[int] = (),
 ) -> tuple[Equations, TracedObservation]:
-    """Call the functions with the symbols, and freeze what they return."""
+    """Call the functions with the symbols, and freeze what they return.
+
+    A step begins from the state in which the accumulators, given by their indices, are reset.
+    """
     values, n, m = symbols.values, symbols.n, symbols.m
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
     noise = functions.process_noise
     process_noise = None if noise is None else trace_covariance("process_noise", noise, m, values)
     initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
-    transition = as_vector("transition", functions.transition.step(values), n)
-    inputs = [symbols.theta, *(values[name] for name in "xqut"), seen.noise, seen.datum]
+    begin = {**values, "x": reset(values["x"], symbols.input_row, accumulators)}
+    transition = as_vector("transition", functions.transition.step(begin), n)
+    x, q, t = (values[name] for name in "xqt")
+    inputs = [symbols.theta, x, q, symbols.input_row, t, seen.noise, seen.datum]
 
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
