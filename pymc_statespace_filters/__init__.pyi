@@ -46,7 +46,7 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama
+from .system.integrators import EulerMaruyama, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
 from .system.record import nearest_steps
 from .system.second_order import second_order
@@ -74,6 +74,8 @@ __all__ = [
     "PFEnKF",
     "ParallelError",
     "ParallelWarning",
+    "RungeKutta4",
+    "SemiImplicitEuler",
     "StateSpace",
     "StateSpaceFiltersError",
     "StateSpaceModel",

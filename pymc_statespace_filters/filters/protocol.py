@@ -103,6 +103,10 @@ class System(Protocol):
         """The same for the normals of the state at step 0."""
 
     @property
+    def is_deterministic(self) -> bool:
+        """Whether the state is known to be a function of the parameters alone."""
+
+    @property
     def is_linear(self) -> bool:
         """Whether the system is known to be linear."""
 
@@ -302,7 +306,8 @@ class DifferentiableFilter(Filter, Protocol):
     A gradient is a forward pass, which leaves a tape, and a backward pass over it. A graph that
     holds the likelihood too shares the forward pass. The tape has a row before each prediction and
     before each update; without rows, the filter has failed. If a row is the mean of the state and
-    the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it.
+    the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it; for a
+    deterministic system the mean is enough.
     """
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:

@@ -87,7 +87,8 @@ def jump_problem(system: System, filter: Any) -> str | None:
 
     A drift that jumps moves the state by little in a step, and sigma points follow that.
     """
-    jumping = system.jumping_equations if isinstance(filter, GaussianFilterBase) else ()
+    linearises = isinstance(filter, GaussianFilterBase) and not system.is_deterministic
+    jumping = system.jumping_equations if linearises else ()
     if not isinstance(filter, EKF) and system.model.integrator is not None:
         jumping = tuple(name for name in jumping if name != "transition")
     if not jumping:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.graph_digest import describe, digest
-from pymc_statespace_filters.system.integrators import Integrator
+from pymc_statespace_filters.system.integrators.protocol import Integrator, bound_to_states
 from pymc_statespace_filters.system.signature import (
     checked_names,
     names_of_states,
@@ -104,7 +104,7 @@ class StateSpaceModel:
         accumulators: Sequence[str] = (),
     ) -> None:
         written = {
-            "transition": transition,
+            "transition": bound_to_states(transition, states),
             "observation": observation,
             "observation_noise": observation_noise,
             "observation_dist": observation_dist,

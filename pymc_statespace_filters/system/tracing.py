@@ -25,7 +25,7 @@ from pymc_statespace_filters.system.equations import (
     trace_covariance,
 )
 from pymc_statespace_filters.system.graph_digest import freeze
-from pymc_statespace_filters.system.integrators import Integrator
+from pymc_statespace_filters.system.integrators.protocol import Integrator
 from pymc_statespace_filters.system.observation import (
     DensityObservation,
     GaussianObservation,

@@ -227,6 +227,11 @@ class CompiledSystem:
     # Properties
 
     @cached_property
+    def is_deterministic(self) -> bool:
+        """Whether the state is a function of the parameters: no noise, and a known start."""
+        return structure.is_deterministic(self.model)
+
+    @cached_property
     def is_linear(self) -> bool:
         """Whether state and noise enter transition and observation linearly; False if unknown."""
         return structure.is_linear(self.model)
