@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.lowering import structure
+from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
@@ -30,6 +30,8 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
+
+quantiles.register()
 
 
 @lru_cache(maxsize=256)
