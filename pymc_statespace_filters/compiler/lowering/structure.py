@@ -6,6 +6,8 @@ import numpy as np
 import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
+from pymc.pytensorf import constant_fold
+from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
@@ -149,6 +151,9 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
 
 def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
     """Whether every element is zero whatever the symbols; False where that cannot be decided."""
+    (folded,) = constant_fold([matrix], raise_not_constant=False)
+    if not isinstance(folded, Variable):
+        return not np.any(folded)
     try:
         (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
     except NotUnrollableError:
