@@ -20,7 +20,7 @@ from pymc_statespace_filters.compiler.lowering.conditional_moments import (
     conditional_moments,
     unknown_moments,
 )
-from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
+from pymc_statespace_filters.compiler.lowering.gaussian import differentiable_log_density
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
 from pymc_statespace_filters.filters.gaussian.linearization import (
@@ -190,12 +190,8 @@ def _posterior(observation: Seen) -> _Posterior:
 
 
 def _log_p(system: StateSpaceModel, values: Symbols) -> list[TensorVariable]:
-    """log p(d | x). A missing datum of distributions is replaced: its gradient would be NaN."""
-    if system.gaussian_observation:
-        return [observation_log_density(system, values)]
-    missing = pt.isnan(values["d"])
-    there = observation_log_density(system, {**values, "d": pt.switch(missing, 1.0, values["d"])})
-    return [pt.switch(pt.any(missing), 0.0, there)]
+    """log p(d | x)."""
+    return [differentiable_log_density(system, values)]
 
 
 def _datum(system: StateSpaceModel, d: TensorVariable) -> TensorVariable:

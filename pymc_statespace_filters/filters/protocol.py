@@ -44,7 +44,7 @@ class System(Protocol):
     m: int
     p: int
     r: int
-    n_inputs: int
+    n_inputs: int  # columns of `inputs`, with that of resets if the system has accumulators
     n_theta: int
     n_constants: int
     dt: float
@@ -103,6 +103,10 @@ class System(Protocol):
     @property
     def start_back(self) -> CompiledFunction:
         """The same for the normals of the state at step 0."""
+
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether the state is known to be a function of the parameters alone."""
 
     @property
     def with_gaussian_steps(self) -> "System":
@@ -312,7 +316,8 @@ class DifferentiableFilter(Filter, Protocol):
     A gradient is a forward pass, which leaves a tape, and a backward pass over it. A graph that
     holds the likelihood too shares the forward pass. The tape has a row before each prediction and
     before each update; without rows, the filter has failed. If a row is the mean of the state and
-    the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it.
+    the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it; for a
+    deterministic system the mean is enough.
     """
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:

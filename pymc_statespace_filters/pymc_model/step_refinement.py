@@ -20,6 +20,7 @@ from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
+from pymc_statespace_filters.system.accumulators import without_resets
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 MAX_STEPS = 500
@@ -93,7 +94,8 @@ def path_eigenvalues(
     length, substeps = single.dt, round(system.dt / single.dt)
     start, advance, jacobian = _compile_path(single)
     if inputs.shape[1] == 0:  # a system without inputs
-        inputs = np.zeros((len(theta), 1, system.n_inputs))
+        inputs = np.zeros((len(theta), 1, system.n_input_columns))
+    inputs = without_resets(system, inputs)  # which belong to a step, not to each substep
     x = start(theta)
     eigenvalues = []
     n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)

@@ -7,10 +7,10 @@ from typing import Any
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.graph_digest import describe, digest
-from pymc_statespace_filters.system.integrators import Integrator
+from pymc_statespace_filters.system.integrators.protocol import Integrator, bound_to_states
 from pymc_statespace_filters.system.signature import (
-    carried_names,
     checked_names,
+    names_of_states,
     read_signature,
     size_of,
 )
@@ -59,6 +59,9 @@ class StateSpaceModel:
         Shapes of parameters that are not scalars, ``{"k": (2,)}``.
     carried : sequence of str
         States that no Kalman update touches (discrete memory); copied with their particle.
+    accumulators : sequence of str
+        States that are zero again right after every observation (missing ones too), such as the
+        cases of a week. At an observation a state has its value before that.
 
     Raises
     ------
@@ -100,9 +103,10 @@ class StateSpaceModel:
         inputs: Sequence[str] | None = None,
         shapes: Mapping[str, Sequence[int]] | None = None,
         carried: Sequence[str] = (),
+        accumulators: Sequence[str] = (),
     ) -> None:
         written = {
-            "transition": transition,
+            "transition": bound_to_states(transition, states),
             "observation": observation,
             "observation_noise": observation_noise,
             "observation_dist": observation_dist,
@@ -116,10 +120,13 @@ class StateSpaceModel:
         }
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs)
-        symbols = size(functions, signature)
-        equations, seen = trace(functions, symbols, observables)
-        p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
+        symbols = size(functions, signature, bool(accumulators))
         state_names = checked_names("states", states, [f"x{i}" for i in range(symbols.n)])
+        totals = names_of_states("accumulators", accumulators, state_names)
+        equations, seen = trace(
+            functions, symbols, observables, [state_names.index(name) for name in totals]
+        )
+        p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
         self._set(
             parameters=signature.parameters,
             defaults=signature.defaults,
@@ -133,7 +140,8 @@ class StateSpaceModel:
             states=state_names,
             observables=checked_names("observables", observables, [f"y{i}" for i in range(p)]),
             inputs=signature.inputs,
-            carried=carried_names(carried, state_names),
+            carried=names_of_states("carried", carried, state_names),
+            accumulators=totals,
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
@@ -142,7 +150,8 @@ class StateSpaceModel:
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         # For `with_integrator` alone: neither compared nor pickled.
-        self._set(_arguments=written | names | {"shapes": shapes, "carried": carried})
+        others = {"shapes": shapes, "carried": carried, "accumulators": accumulators}
+        self._set(_arguments=written | names | others)
 
     # Equality and hash are those of the fields, which `__init__` sets once.
     parameters: tuple[str, ...]
@@ -158,6 +167,7 @@ class StateSpaceModel:
     observables: tuple[str, ...]
     inputs: tuple[str, ...]
     carried: tuple[str, ...]
+    accumulators: tuple[str, ...]
     additive_noise: bool
     discrete_noise: bool
     gaussian_observation: bool
@@ -243,6 +253,11 @@ class StateSpaceModel:
         if self.integrator is None:
             raise ModelError(f"{self!r} must have an integrator, got a transition without one")
         return StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+
+    @property
+    def n_input_columns(self) -> int:
+        """Number of inputs, and the column of resets of a system with accumulators."""
+        return self.n_inputs + bool(self.accumulators)
 
     @property
     def n_theta(self) -> int:

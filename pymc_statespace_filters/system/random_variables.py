@@ -51,12 +51,7 @@ def trace_distributions(
     role, entries = equation.role, _entries(equation, values)
     nodes = io_toposort([], entries)
     variables = [node for node in nodes if _is_drawn(node)]
-    for node in variables:
-        if not is_made_after(_output(node), [theta]):
-            raise ModelError(
-                f"{role} must use its arguments and constants only, got the random variable "
-                f"{_output(node)}; pass it as a parameter"
-            )
+    _check_own(role, variables, theta)
     laws = [_law_of(role, node) for node in variables]
     sizes = [
         law.count(_shape(node), parameters_of(node))
@@ -94,6 +89,15 @@ def _entries(equation: Equation, values: Values) -> list[TensorVariable]:
             )
         symbols.append(symbol)
     return symbols
+
+
+def _check_own(role: str, variables: Sequence[Apply], theta: TensorVariable) -> None:
+    for node in variables:
+        if not is_made_after(node.outputs[-1], [theta]):
+            raise ModelError(
+                f"{role} must use its arguments and constants only, got the random variable "
+                f"{node.outputs[-1]}; pass it as a parameter"
+            )
 
 
 def _is_drawn(node: Apply) -> bool:

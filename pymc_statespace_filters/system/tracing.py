@@ -11,9 +11,11 @@ from typing import Any
 
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.accumulators import reset
 from pymc_statespace_filters.system.checks import check_positive
 from pymc_statespace_filters.system.equations import (
     Equation,
@@ -23,7 +25,7 @@ from pymc_statespace_filters.system.equations import (
     trace_covariance,
 )
 from pymc_statespace_filters.system.graph_digest import freeze
-from pymc_statespace_filters.system.integrators import Integrator
+from pymc_statespace_filters.system.integrators.protocol import Integrator
 from pymc_statespace_filters.system.observation import (
     DensityObservation,
     GaussianObservation,
@@ -62,10 +64,14 @@ class Functions:
 
 @dataclass(frozen=True)
 class Symbols:
-    """The symbols that the functions are called with: all parameters in one vector, and by name."""
+    """The symbols that the functions are called with: all parameters in one vector, and by name.
+
+    ``input_row`` is a row of inputs with the column of resets; ``values["u"]`` is without it.
+    """
 
     theta: TensorVariable
     values: Values
+    input_row: TensorVariable
     drawn: Drawn | None
     start: Start
 
@@ -129,16 +135,18 @@ def read(
     )
 
 
-def size(functions: Functions, signature: Signature) -> Symbols:
+def size(functions: Functions, signature: Signature, has_accumulators: bool = False) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
     values = parameter_symbols(theta, signature.parameters, signature.shapes)
     start = trace_start(functions.initial_mean, functions.initial_dist, values, theta)
     n = start.mean.type.shape[0]
+    n_inputs = len(signature.inputs)
+    u = pt.tensor("u", shape=(n_inputs + has_accumulators,), dtype="float64")
     values |= {
         "x": pt.tensor("x", shape=(n,), dtype="float64"),
-        "u": pt.tensor("u", shape=(len(signature.inputs),), dtype="float64"),
+        "u": u[:n_inputs] if has_accumulators else u,
         "t": pt.tensor("t", shape=(), dtype="float64"),
     }
     drawn = None
@@ -147,13 +155,19 @@ def size(functions: Functions, signature: Signature) -> Symbols:
         noise = drawn.normals
     else:
         noise = pt.tensor("q", shape=(_noise_size(functions, values),), dtype="float64")
-    return Symbols(theta, values | {"q": noise}, drawn, start)
+    return Symbols(theta, values | {"q": noise}, u, drawn, start)
 
 
 def trace(
-    functions: Functions, symbols: Symbols, observables: Sequence[str] | None
+    functions: Functions,
+    symbols: Symbols,
+    observables: Sequence[str] | None,
+    accumulators: Sequence[int] = (),
 ) -> tuple[Equations, TracedObservation]:
-    """Call the functions with the symbols, and freeze what they return."""
+    """Call the functions with the symbols, and freeze what they return.
+
+    A step begins from the state in which the accumulators, given by their indices, are reset.
+    """
     values, n, m = symbols.values, symbols.n, symbols.m
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
@@ -163,14 +177,16 @@ def trace(
     initial_cov = start.cov
     if functions.initial_dist is None:
         initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
-    inputs = [symbols.theta, *(values[name] for name in "xqut"), seen.noise, seen.datum]
+    x, q, t = (values[name] for name in "xqt")
+    inputs = [theta, x, q, symbols.input_row, t, seen.noise, seen.datum]
 
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
 
+    begin = reset(x, symbols.input_row, accumulators)
     transition, gaussian_transition = (
-        freeze(inputs, [functions.transition.step({**values, "q": q})], "transition")
-        for q in _noises(symbols)
+        freeze(inputs, graph_replace([step], {x: begin}, strict=False), "transition")
+        for step in _steps(functions, symbols)
     )
     density = "observation_logp" if seen.draw is None else "observation_dist"
     equations = Equations(
@@ -188,12 +204,15 @@ def trace(
     return equations, seen
 
 
-def _noises(symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
-    """What the transition has as ``q``, and the same with normal variables."""
-    if symbols.drawn is None:
-        return symbols.values["q"], symbols.values["q"]
-    # Named for messages about an index that is out of range.
-    return symbols.drawn.exact.copy(name="q"), symbols.drawn.surrogate.copy(name="q")
+def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
+    """The next state, and the same with normal variables."""
+    values, drawn = symbols.values, symbols.drawn
+    if drawn is None:
+        noises = [values["q"]]
+    else:  # named for messages about an index that is out of range
+        noises = [vector.copy(name="q") for vector in (drawn.exact, drawn.surrogate)]
+    steps = [functions.transition.step({**values, "q": q}) for q in noises]
+    return steps[0], steps[-1]
 
 
 @dataclass(frozen=True)

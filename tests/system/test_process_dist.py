@@ -255,7 +255,7 @@ def test_what_cannot_be_drawn_is_refused(distribution, message):
 
 def test_random_variables_from_outside_are_refused():
     outside = pm.Gamma.dist(2.0, 1.0, name="outside")
-    with pytest.raises(psf.ModelError, match="process_dist must use its arguments .* outside"):
+    with pytest.raises(psf.ModelError, match=r"process_dist must use its arguments .* outside"):
         system_of(lambda x: pm.Poisson.dist(outside))
 
 

@@ -76,8 +76,8 @@ class CompiledSystem:
         What the user wrote, for filters that work on its graphs.
     n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
         Numbers of states, of normals that a member takes at the start and in one step (see
-        `merged_noise`), of observables, of measurement noises, of inputs, of parameters, and the
-        length of ``c``.
+        `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
+        and the length of ``c``.
     dt : float
         Length of a step.
     free : ndarray of int
@@ -87,7 +87,7 @@ class CompiledSystem:
     def __init__(self, model: StateSpaceModel) -> None:
         self.model = model
         self.n, self.p, self.r = model.n, model.p, model.r
-        self.n_inputs, self.n_theta, self.dt = model.n_inputs, model.n_theta, model.dt
+        self.n_inputs, self.n_theta, self.dt = model.n_input_columns, model.n_theta, model.dt
         self.states, self.carried = tuple(model.states), tuple(model.carried)
         self.gaussian_observation = bool(model.gaussian_observation)
         self.additive_noise = bool(model.additive_noise)
@@ -233,6 +233,11 @@ class CompiledSystem:
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 
     # Properties
+
+    @cached_property
+    def is_deterministic(self) -> bool:
+        """Whether the state is a function of the parameters: no noise, and a known start."""
+        return structure.is_deterministic(self.model)
 
     @cached_property
     def with_gaussian_steps(self) -> "CompiledSystem":

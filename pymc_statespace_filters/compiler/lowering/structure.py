@@ -6,9 +6,12 @@ import numpy as np
 import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
+from pymc.pytensorf import constant_fold
+from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.expressions import is_constant
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import unrolled
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
@@ -44,6 +47,23 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
         return None
     cov = process_noise_cov(system, symbols, gain)
     return FrozenFunctionGraph.from_io([symbols[s] for s in SYMBOLS], [cov])
+
+
+def is_deterministic(system: StateSpaceModel) -> bool:
+    """Whether the state is a function of the parameters: known at step 0, and without noise.
+
+    False where that cannot be decided.
+    """
+    symbols, noise_cov = symbols_of(system), system.equations.process_noise
+    if not system.has_gaussian_start:
+        return False
+    if not _is_zero(call(system.equations.initial_cov, system, symbols), symbols):
+        return False
+    if system.m == 0 or is_free_of(
+        ("q",), call(system.equations.transition, system, symbols), symbols
+    ):
+        return True
+    return noise_cov is not None and _is_zero(call(noise_cov, system, symbols), symbols)
 
 
 def is_linear(system: StateSpaceModel) -> bool:
@@ -127,6 +147,18 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
             if np.linalg.matrix_rank(found / np.outer(sd, sd), tol=1e-10) == system.n:
                 return True
     return False
+
+
+def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
+    """Whether every element is zero whatever the symbols; False where that cannot be decided."""
+    (folded,) = constant_fold([matrix], raise_not_constant=False)
+    if not isinstance(folded, Variable):
+        return not np.any(folded)
+    try:
+        (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
+    except NotUnrollableError:
+        return False
+    return all(is_constant(value) and value == 0 for value in values)
 
 
 def is_free_of(

@@ -12,6 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 )
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.gaussian import deterministic
 from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_pullback
 from pymc_statespace_filters.filters.gaussian.batch import compile_batch
 from pymc_statespace_filters.filters.gaussian.linearization import (
@@ -54,8 +55,10 @@ class GaussianFilterBase:
         raise NotImplementedError
 
     def is_exact_for(self, system: System) -> bool:
-        """Whether the system is linear; False too where that cannot be decided."""
-        return system.is_linear
+        """Whether the system is linear, or deterministic; False where that cannot be decided."""
+        return system.is_linear or (
+            system.is_deterministic and system.has_exact_observation_density
+        )
 
     def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
         """Compile the log-likelihood."""
@@ -79,10 +82,14 @@ class GaussianFilterBase:
 
     def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+        if system.is_deterministic:
+            return deterministic.compile_states(self._functions(system))
         return compile_states(_forward_pass(self.linearization, system.model.gaussian), moment)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
+        if system.is_deterministic:
+            return deterministic.compile_run(self._functions(system))
         return compile_run(self._functions(system))
 
     def smoothing_method(self, system: System) -> str:
@@ -90,19 +97,21 @@ class GaussianFilterBase:
         return "modified Bryson-Frazier"
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
+        if system.is_deterministic:
+            return deterministic.filter_functions(system.model.gaussian)
         return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
-        """Raise if the observation is not a function with Gaussian noise."""
-        if not system.gaussian_observation:
+        """Raise if the observation of an uncertain state is not Gaussian."""
+        if not (system.gaussian_observation or system.is_deterministic):
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise, got "
                 f"observation_dist or observation_logp"
             )
 
     def _check_not_carried(self, system: System) -> None:
-        """Raise if a state is carried."""
-        if system.carried:
+        """Raise if an update would move a carried state."""
+        if system.carried and not system.is_deterministic:
             raise ModelError(
                 f"{type(self).__name__} cannot treat the carried states {list(system.carried)}, "
                 f"which no Kalman update may move"
@@ -122,7 +131,7 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
     forecast = predict(linearization, system, values)
     return GaussianFilterFunctions(
         system,
-        linearization,
+        linearization.has_short_rows,
         function("c", "theta", [start(system, values)], False),
         function("c, inputs, k, t, s", "theta u t s", [forecast], False),
         function(
@@ -137,4 +146,4 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
 
 @lru_cache(maxsize=256)
 def _forward_pass(linearization: Linearization, system: StateSpaceModel) -> ForwardPass:
-    return forward_pass(_functions(linearization, system))
+    return forward_pass(_functions(linearization, system), linearization)
