@@ -1,7 +1,7 @@
 """Quantiles of small counts, found by adding probabilities from zero upwards.
 
 All sums are compared with the probability sought, without a branch, so that loops over members
-vectorise. The numbers are scaled by P(N = 0), so the first term is 1.
+vectorise.
 """
 
 from typing import Any
@@ -11,64 +11,84 @@ from numba import types
 from numba.extending import intrinsic
 
 from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.exponential import exp
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import short_tail_ratio
+from pymc_statespace_filters.compiler.numerics.exponential import log1p
+from pymc_statespace_filters.compiler.numerics.quantiles.normal import short_exp, short_tail
 
 N_TERMS = 24
 """Numbers from this one on are undecided; with a mean of 8 one in 150 000 is."""
 
 UNDECIDED = -1.0
+TWO_52 = 2.0**52
 
 
-def _counted(builder: Any, factor: Any, low: Any, high: Any) -> Any:
+def _counted(builder: Any, first: Any, factor: Any, low: Any, high: Any) -> Any:
     """How many partial sums are below ``low`` and ``high``; undecided where these differ.
 
     Term j + 1 is term j times ``factor(j)`` / (j + 1).
     """
-    double = ir.DoubleType()
-    constant = lambda x: ir.Constant(double, x)  # noqa: E731
-    term = total = constant(1.0)
-    counts = [constant(0.0), constant(0.0)]
+    double, whole = ir.DoubleType(), ir.IntType(64)
+    power = total = first
+    counts = [ir.Constant(whole, 0)] * 2
+    divisor = 1.0
     for j in range(N_TERMS):
+        below = [builder.fcmp_ordered("<", total, limit) for limit in (low, high)]
         counts = [
-            builder.fadd(count, builder.uitofp(builder.fcmp_ordered("<", total, limit), double))
-            for count, limit in zip(counts, (low, high), strict=True)
+            builder.sub(count, builder.sext(b, whole))
+            for count, b in zip(counts, below, strict=True)
         ]
-        term = builder.fmul(term, builder.fmul(factor(j), constant(1.0 / (j + 1))))
-        total = builder.fadd(total, term)
-    decided = builder.fcmp_ordered("==", *counts)
-    decided = builder.and_(decided, builder.fcmp_ordered("<", counts[1], constant(N_TERMS)))
-    return builder.select(decided, counts[0], constant(UNDECIDED))
+        power, divisor = builder.fmul(power, factor(j)), divisor / (j + 1)
+        total = builder.fma(power, ir.Constant(double, divisor), total)
+    decided = builder.icmp_signed("==", *counts)
+    decided = builder.and_(
+        decided, builder.icmp_signed("<", counts[1], ir.Constant(whole, N_TERMS))
+    )
+    # Adding a small whole number to the bits of 2**52 adds it to 2**52.
+    bits = builder.add(counts[0], builder.bitcast(ir.Constant(double, TWO_52), whole))
+    count = builder.fsub(builder.bitcast(bits, double), ir.Constant(double, TWO_52))
+    return builder.select(decided, count, ir.Constant(double, UNDECIDED))
 
 
 @intrinsic
-def count_poisson(typing_context, mean, low, high):
-    """The least k whose scaled P(N <= k) is not below the limits, for a Poisson number."""
-
+def _count_poisson(typing_context, first, mean, low, high):
     def code(context, builder, signature, arguments):
-        mean, low, high = arguments
-        return _counted(builder, lambda j: mean, low, high)
-
-    return types.float64(types.float64, types.float64, types.float64), code
-
-
-@intrinsic
-def count_binomial(typing_context, n, odds, low, high):
-    """The same for successes in n trials, whose odds are p / (1 - p)."""
-
-    def code(context, builder, signature, arguments):
-        n, odds, low, high = arguments
-        rest = lambda j: builder.fsub(n, ir.Constant(ir.DoubleType(), float(j)))  # noqa: E731
-        return _counted(builder, lambda j: builder.fmul(rest(j), odds), low, high)
+        first, mean, low, high = arguments
+        return _counted(builder, first, lambda j: mean, low, high)
 
     return types.float64(*[types.float64] * 4), code
 
 
+@intrinsic
+def _count_binomial(typing_context, first, n, odds, low, high):
+    def code(context, builder, signature, arguments):
+        first, n, odds, low, high = arguments
+        product = builder.fmul(n, odds)
+
+        def factor(j):  # (n - j) odds
+            return builder.fma(ir.Constant(ir.DoubleType(), -float(j)), odds, product)
+
+        return _counted(builder, first, factor, low, high)
+
+    return types.float64(*[types.float64] * 5), code
+
+
 @inlined
-def limits(z, log_scale):
-    """Φ(z) exp(log_scale), less and more than its possible error."""
-    scale = exp(log_scale)
-    tail = exp(log_scale - 0.5 * z * z) * short_tail_ratio(abs(z))
-    sought = tail if z <= 0.0 else scale - tail
-    error = 5e-8 * tail + 1e-14 * scale
+def _limits(z):
+    """Φ(z) less and more the largest errors of it and of the sums."""
+    tail = short_tail(abs(z))
+    sought = tail if z <= 0.0 else 1.0 - tail
+    error = 1e-7 * tail + 3e-8
     return sought - error, sought + error
+
+
+@inlined
+def small_poisson(z, mean):
+    """The Poisson quantile, or `UNDECIDED`, for a mean below 8."""
+    low, high = _limits(z)
+    return _count_poisson(short_exp(-mean), mean, low, high)
+
+
+@inlined
+def small_binomial(z, n, p):
+    """The binomial quantile, or `UNDECIDED`, for n p < 8 and p <= 1/2."""
+    low, high = _limits(z)
+    return _count_binomial(short_exp(n * log1p(-p)), n, p / (1.0 - p), low, high)

@@ -13,8 +13,7 @@ from pymc_statespace_filters.compiler.numerics.exponential import exp
 from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
     UNDECIDED,
-    count_poisson,
-    limits,
+    small_poisson,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -29,22 +28,33 @@ _SMALL, _LARGE = 8.0, 1e6
 
 
 @inlined
+def _valid(z, mean):
+    return (mean >= 0.0) & (mean < np.inf) & (z == z)
+
+
+@inlined
+def _large_poisson(z, mean):
+    """The quantile, or `UNDECIDED`, for a mean from 8 on."""
+    offset, error = short_series(z, sqrt(mean), 1.0)
+    whole = np.floor(mean)
+    x = (mean - whole) + offset
+    k = whole + np.floor(x)
+    return k if (abs(x - np.rint(x)) > error) & (k >= 0.0) else UNDECIDED
+
+
+@inlined
+def fast_large_poisson(z, mean):
+    """As `fast_poisson`, for a mean from 8 on."""
+    return _large_poisson(limited(z), mean) if _valid(z, mean) else np.nan
+
+
+@inlined
 def fast_poisson(z, mean):
-    """The quantile, or `UNDECIDED`; NaN for z or a mean that is invalid."""
-    z = limited(z)
-    small_mean = mean if mean < _SMALL else _SMALL
-    low, high = limits(z, small_mean)
-    small = count_poisson(small_mean, low, high)
-    large_mean = mean if mean > _SMALL else _SMALL
-    offset, error = short_series(z, sqrt(large_mean), 1.0)
-    whole = np.floor(large_mean)
-    x = (large_mean - whole) + offset
-    large = whole + np.floor(x)
-    decided = (abs(x - np.rint(x)) > error) & (large >= 0.0)
-    large = large if decided else UNDECIDED
-    result = small if mean < _SMALL else large
-    valid = (mean >= 0.0) & (mean < np.inf) & (z == z)
-    return result if valid else np.nan
+    """The quantile, or `UNDECIDED`, without branches; NaN for z or a mean that is invalid."""
+    limited_z = limited(z)
+    small = small_poisson(limited_z, mean if mean < _SMALL else _SMALL)
+    large = _large_poisson(limited_z, mean if mean > _SMALL else _SMALL)
+    return (small if mean < _SMALL else large) if _valid(z, mean) else np.nan
 
 
 @njit_internal
@@ -92,5 +102,28 @@ def exact_poisson(z, mean):
 @njit_internal
 def poisson_quantile(z, mean):
     """The quantile; NaN for z or a mean that is invalid."""
-    k = fast_poisson(z, mean)
+    if not _valid(z, mean):
+        return np.nan
+    z = limited(z)
+    k = small_poisson(z, mean) if mean < _SMALL else _large_poisson(z, mean)
     return exact_poisson(z, mean) if k == UNDECIDED else k
+
+
+@njit_internal
+def poisson_block(buffer, z, mean, out, size):
+    """The quantiles of the rows ``z`` and ``mean`` of a buffer, into its row ``out``."""
+    n_large = 0
+    for j in range(size):
+        n_large += buffer[mean, np.uint64(j)] >= _SMALL
+    if n_large == size:
+        for j in range(size):
+            i = np.uint64(j)
+            buffer[out, i] = fast_large_poisson(buffer[z, i], buffer[mean, i])
+    else:
+        for j in range(size):
+            i = np.uint64(j)
+            buffer[out, i] = fast_poisson(buffer[z, i], buffer[mean, i])
+    for j in range(size):
+        i = np.uint64(j)
+        if buffer[out, i] == UNDECIDED:
+            buffer[out, i] = exact_poisson(buffer[z, i], buffer[mean, i])

@@ -115,6 +115,7 @@ def short_series(z, deviation, d):
     inverse = 1.0 / deviation
     a, b, c = inverse * inverse, z * z, d * d
     value = deviation * z + (0.5 + d * _short_even(a, b, c) + z * inverse * _short_odd(a, b, c))
-    x = inverse * (abs(z) + 2.0)
+    x = inverse * (abs(z) + 1.5)
     x3 = x * x * x
-    return value, 1e-4 * (deviation * x3) * (deviation * x3) * x + 1e-15 * deviation * abs(z)
+    error = (deviation * x3) * (deviation * x3) * x * (1.5e-4 + 0.8e-4 * x3 * x)
+    return value, error + 1e-15 * deviation * abs(z)
