@@ -33,7 +33,7 @@ from pymc_statespace_filters.compiler.numerics.quantiles.binomial import (
     binomial_block,
     binomial_quantile,
 )
-from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_quantile
+from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_block, gamma_quantile
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
 from pymc_statespace_filters.compiler.numerics.quantiles.poisson import (
     poisson_block,
@@ -54,7 +54,11 @@ QUANTILES = {
 """By the names that operations have as ``machine_code``."""
 
 # The same for a block of members, as vector code: functions of rows of a buffer.
-BLOCKS = {"poisson_quantile": poisson_block, "binomial_quantile": binomial_block}
+BLOCKS = {
+    "poisson_quantile": poisson_block,
+    "binomial_quantile": binomial_block,
+    "gamma_quantile": gamma_block,
+}
 
 # For single numbers, where the tables of the system's library are faster.
 SCALAR_NAMESPACE = {

@@ -9,8 +9,10 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp, log1p
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    SMALL,
+    TINY,
     UNDECIDED,
-    small_binomial,
+    bottom_up_binomial,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -21,7 +23,8 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
 
-_SMALL, _LARGE = 8.0, 1e6
+_LARGE = 1e6
+_small_binomial, _tiny_binomial = bottom_up_binomial(SMALL), bottom_up_binomial(TINY)
 
 
 @inlined
@@ -46,27 +49,6 @@ def _large_binomial(z, n, p):
     x = ((mean - whole) + fma(n, p, -mean)) + offset
     k = whole + np.floor(x)
     return k if (abs(x - np.rint(x)) > error) & (k >= 0.0) & (k <= n) else UNDECIDED
-
-
-@inlined
-def fast_large_binomial(z, n, p):
-    """As `fast_binomial`, for n p >= 8 and n (1 - p) >= 8."""
-    rarer_z, rarer_p, flipped = _rarer(limited(z), p)
-    k = _large_binomial(rarer_z, n, rarer_p)
-    k = n - k if flipped & (k != UNDECIDED) else k
-    return k if _valid(z, n, p) else np.nan
-
-
-@inlined
-def fast_binomial(z, n, p):
-    """The quantile, or `UNDECIDED`, without branches; NaN for z or parameters that are invalid."""
-    rarer_z, rarer_p, flipped = _rarer(limited(z), p)
-    is_small = n * rarer_p < _SMALL
-    small = small_binomial(rarer_z, n, rarer_p if is_small else 0.0)
-    large = _large_binomial(rarer_z, n, rarer_p)
-    k = small if is_small else large
-    k = n - k if flipped & (k != UNDECIDED) else k
-    return k if _valid(z, n, p) else np.nan
 
 
 @njit_internal
@@ -127,8 +109,8 @@ def binomial_quantile(z, n, p):
     if not _valid(z, n, p):
         return np.nan
     rarer_z, rarer_p, flipped = _rarer(limited(z), p)
-    if n * rarer_p < _SMALL:
-        k = small_binomial(rarer_z, n, rarer_p)
+    if n * rarer_p < SMALL:
+        k = _small_binomial(rarer_z, n, rarer_p)
     else:
         k = _large_binomial(rarer_z, n, rarer_p)
     if k == UNDECIDED:
@@ -139,18 +121,37 @@ def binomial_quantile(z, n, p):
 @njit_internal
 def binomial_block(buffer, z, n, p, out, size):
     """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
-    n_large = 0
+    n_large = n_tiny = 0
     for j in range(size):
         i = np.uint64(j)
-        n_large += buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i]) >= _SMALL
-    if n_large == size:
+        mean = buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i])
+        n_large += mean >= SMALL
+        n_tiny += mean < TINY
+    if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
-            buffer[out, i] = fast_large_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
-    else:
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            k = _large_binomial(rarer_z, buffer[n, i], rarer_p)
+            buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+    if n_tiny == size:
         for j in range(size):
             i = np.uint64(j)
-            buffer[out, i] = fast_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            k = _tiny_binomial(rarer_z, buffer[n, i], rarer_p)
+            buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+    elif n_large < size:
+        for j in range(size):
+            i = np.uint64(j)
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            is_small, other = buffer[n, i] * rarer_p < SMALL, buffer[out, i]
+            k = _small_binomial(rarer_z, buffer[n, i], rarer_p if is_small else 0.0)
+            k = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+            buffer[out, i] = k if is_small else other
+    for j in range(size):
+        i = np.uint64(j)
+        buffer[out, i] = (
+            buffer[out, i] if _valid(buffer[z, i], buffer[n, i], buffer[p, i]) else np.nan
+        )
     for j in range(size):
         i = np.uint64(j)
         if buffer[out, i] == UNDECIDED:

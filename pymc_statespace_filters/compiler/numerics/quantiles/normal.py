@@ -55,8 +55,10 @@ def tail(x):
     """Φ(-x) for 0 <= x <= 37, to 3 ulp."""
     square = x * x
     lost = fma(x, x, -square)
-    ratio = polynomial((x - 5.0) / (x + 5.0), _RATIO)
-    return exp(-0.5 * square) * (ratio - 0.5 * lost * ratio) / (1.0 + x)
+    one, five = x + 1.0, x + 5.0
+    inverse = 1.0 / (one * five)
+    ratio = polynomial((x - 5.0) * one * inverse, _RATIO)
+    return exp(-0.5 * square) * fma(-0.5 * lost, ratio, ratio) * (five * inverse)
 
 
 @inlined

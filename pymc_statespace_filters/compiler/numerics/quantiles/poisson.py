@@ -12,8 +12,10 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp
 from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    SMALL,
+    TINY,
     UNDECIDED,
-    small_poisson,
+    bottom_up_poisson,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -24,7 +26,8 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
 
-_SMALL, _LARGE = 8.0, 1e6
+_LARGE = 1e6
+_small_poisson, _tiny_poisson = bottom_up_poisson(SMALL), bottom_up_poisson(TINY)
 
 
 @inlined
@@ -40,21 +43,6 @@ def _large_poisson(z, mean):
     x = (mean - whole) + offset
     k = whole + np.floor(x)
     return k if (abs(x - np.rint(x)) > error) & (k >= 0.0) else UNDECIDED
-
-
-@inlined
-def fast_large_poisson(z, mean):
-    """As `fast_poisson`, for a mean from 8 on."""
-    return _large_poisson(limited(z), mean) if _valid(z, mean) else np.nan
-
-
-@inlined
-def fast_poisson(z, mean):
-    """The quantile, or `UNDECIDED`, without branches; NaN for z or a mean that is invalid."""
-    limited_z = limited(z)
-    small = small_poisson(limited_z, mean if mean < _SMALL else _SMALL)
-    large = _large_poisson(limited_z, mean if mean > _SMALL else _SMALL)
-    return (small if mean < _SMALL else large) if _valid(z, mean) else np.nan
 
 
 @njit_internal
@@ -105,24 +93,35 @@ def poisson_quantile(z, mean):
     if not _valid(z, mean):
         return np.nan
     z = limited(z)
-    k = small_poisson(z, mean) if mean < _SMALL else _large_poisson(z, mean)
+    k = _small_poisson(z, mean) if mean < SMALL else _large_poisson(z, mean)
     return exact_poisson(z, mean) if k == UNDECIDED else k
 
 
 @njit_internal
 def poisson_block(buffer, z, mean, out, size):
     """The quantiles of the rows ``z`` and ``mean`` of a buffer, into its row ``out``."""
-    n_large = 0
+    n_large = n_tiny = 0
     for j in range(size):
-        n_large += buffer[mean, np.uint64(j)] >= _SMALL
-    if n_large == size:
+        n_large += buffer[mean, np.uint64(j)] >= SMALL
+        n_tiny += buffer[mean, np.uint64(j)] < TINY
+    if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
-            buffer[out, i] = fast_large_poisson(buffer[z, i], buffer[mean, i])
-    else:
+            m = buffer[mean, i]
+            buffer[out, i] = _large_poisson(limited(buffer[z, i]), m if m > SMALL else SMALL)
+    if n_tiny == size:
         for j in range(size):
             i = np.uint64(j)
-            buffer[out, i] = fast_poisson(buffer[z, i], buffer[mean, i])
+            buffer[out, i] = _tiny_poisson(limited(buffer[z, i]), buffer[mean, i])
+    elif n_large < size:
+        for j in range(size):
+            i = np.uint64(j)
+            m, other = buffer[mean, i], buffer[out, i]
+            k = _small_poisson(limited(buffer[z, i]), m if m < SMALL else SMALL)
+            buffer[out, i] = k if m < SMALL else other
+    for j in range(size):
+        i = np.uint64(j)
+        buffer[out, i] = buffer[out, i] if _valid(buffer[z, i], buffer[mean, i]) else np.nan
     for j in range(size):
         i = np.uint64(j)
         if buffer[out, i] == UNDECIDED:

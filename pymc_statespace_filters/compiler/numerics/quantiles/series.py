@@ -75,17 +75,19 @@ _ODD = (
 )  # fmt: skip
 
 
-def _in_three_variables(table: Sequence) -> Any:
-    """The function of (a, b, c) with the coefficients ``table[i][j][k]`` of a**i b**j c**k."""
+def in_variables(table: Sequence, n: int) -> Any:
+    """The polynomial in n variables with the coefficients ``table[i][j]...`` of a**i b**j ..."""
 
-    @intrinsic
-    def evaluate(typing_context, a, b, c):
-        def code(context, builder, signature, arguments):
-            return _horner(builder, table, arguments)
+    def code(context, builder, signature, arguments):
+        return _horner(builder, table, arguments)
 
-        return types.float64(types.float64, types.float64, types.float64), code
-
-    return evaluate
+    kinds = types.float64(*[types.float64] * n)
+    forms = (
+        lambda typing_context, a: (kinds, code),
+        lambda typing_context, a, b: (kinds, code),
+        lambda typing_context, a, b, c: (kinds, code),
+    )
+    return intrinsic(forms[n - 1])
 
 
 def _horner(builder: Any, coefficients: Any, variables: Sequence) -> Any:
@@ -97,8 +99,8 @@ def _horner(builder: Any, coefficients: Any, variables: Sequence) -> Any:
     return total
 
 
-_even, _odd = _in_three_variables(_EVEN), _in_three_variables(_ODD)
-_short_even, _short_odd = _in_three_variables(_EVEN[:3]), _in_three_variables(_ODD[:2])
+_even, _odd = in_variables(_EVEN, 3), in_variables(_ODD, 3)
+_short_even, _short_odd = in_variables(_EVEN[:3], 3), in_variables(_ODD[:2], 3)
 
 
 @inlined
