@@ -207,7 +207,10 @@ def trace(
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """The next state, and the same with normal variables."""
     values, drawn = symbols.values, symbols.drawn
-    noises = (values["q"],) if drawn is None else (drawn.exact, drawn.surrogate)
+    if drawn is None:
+        noises = [values["q"]]
+    else:  # named for messages about an index that is out of range
+        noises = [vector.copy(name="q") for vector in (drawn.exact, drawn.surrogate)]
     steps = [functions.transition.step({**values, "q": q}) for q in noises]
     return steps[0], steps[-1]
 
