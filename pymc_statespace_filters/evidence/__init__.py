@@ -13,7 +13,7 @@ from pymc_statespace_filters.evidence.estimation import (
     estimate_evidence,
 )
 from pymc_statespace_filters.evidence.evidence import Evidence
-from pymc_statespace_filters.evidence.step_error import step_error
+from pymc_statespace_filters.evidence.shorter_steps import step_error
 
 __all__ = [
     "DimensionCorrection",

@@ -13,7 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.evidence.step_error import _jackknifed, _log_ratio
+from pymc_statespace_filters.evidence.shorter_steps import _jackknifed, _log_ratio
 from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
