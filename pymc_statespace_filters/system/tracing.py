@@ -19,6 +19,7 @@ from pymc_statespace_filters.system.accumulators import reset
 from pymc_statespace_filters.system.checks import check_positive
 from pymc_statespace_filters.system.equations import (
     Equation,
+    as_matrix,
     as_vector,
     read_covariance,
     read_equation,
@@ -82,7 +83,7 @@ class Symbols:
 class Equations:
     """The traced functions of a system, frozen graphs of theta, x, q, u, t, e and d.
 
-    ``process_noise`` is None for an integrator, whose noises are standard normals.
+    ``process_noise`` is None for an integrator whose noises are standard normals.
     """
 
     transition: FrozenFunctionGraph
@@ -151,8 +152,7 @@ def trace(
     values, n, m = symbols.values, symbols.n, symbols.m
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
-    noise = functions.process_noise
-    process_noise = None if noise is None else trace_covariance("process_noise", noise, m, values)
+    process_noise = _trace_process_noise(functions, values, m)
     initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
     begin = {**values, "x": reset(values["x"], symbols.input_row, accumulators)}
     transition = as_vector("transition", functions.transition.step(begin), n)
@@ -242,6 +242,14 @@ def _read_initial_mean(value: Any) -> Any:
             f"initial_mean must be a finite vector, one entry per state, got {value!r}"
         )
     return np.atleast_1d(mean)
+
+
+def _trace_process_noise(functions: Functions, values: Values, m: int) -> TensorVariable | None:
+    """The covariance of q; None where q are standard normals."""
+    if functions.process_noise is not None:
+        return trace_covariance("process_noise", functions.process_noise, m, values)
+    declared = getattr(functions.transition, "noise_cov", None)
+    return None if declared is None else as_matrix("noise_cov", declared(values), m, m)
 
 
 def _noise_size(functions: Functions, values: Values) -> int:

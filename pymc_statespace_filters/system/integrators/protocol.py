@@ -19,6 +19,8 @@ class Integrator(Protocol):
 
     * ``bound_to(states)``: the integrator with indices in place of names of states. ``states`` are
       the names that the system was given, or None.
+    * ``noise_cov(values)``: the covariance of ``q``, a function of parameters alone, where ``q``
+      are not standard normals.
     """
 
     @property
