@@ -42,7 +42,7 @@ class System(Protocol):
     m: int
     p: int
     r: int
-    n_inputs: int
+    n_inputs: int  # columns of `inputs`, with that of resets if the system has accumulators
     n_theta: int
     n_constants: int
     dt: float

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.lowering import structure
+from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.constants import (
     after_extension,
     between_extensions,
@@ -37,6 +37,8 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
+
+quantiles.register()
 
 
 @lru_cache(maxsize=256)
@@ -92,7 +94,8 @@ class CompiledSystem:
 
     def __init__(self, written: StateSpaceModel) -> None:
         found = lowered(written)
-        self.model = model = found.model
+        self.model = found.model
+        model = self.model
         self._extension = found.extension
         self.n, self.p, self.r = model.n, model.p, model.r
         self.n_inputs, self.n_theta, self.dt = model.n_input_columns, model.n_theta, model.dt

@@ -98,7 +98,8 @@ def _constants(
     theta: TensorVariable, inputs: Sequence[Variable], output: TensorVariable
 ) -> list[TensorVariable]:
     """The largest parts with linear algebra that depend on theta alone."""
-    varying, heavy = set(inputs[1:]), set()
+    varying: set[Variable] = set(inputs[1:])
+    heavy: set[Variable] = set()
     nodes = io_toposort(inputs, [output])
     for node in nodes:
         if varying.intersection(node.inputs):
