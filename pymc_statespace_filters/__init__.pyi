@@ -48,6 +48,7 @@ from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.integrators import EulerMaruyama, ExactLinear, Milstein, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
+from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
 from .system.second_order import second_order
 
@@ -87,12 +88,14 @@ __all__ = [
     "compute_log_likelihood",
     "cubic",
     "estimate_evidence",
+    "euler_multinomial",
     "filter_diagnostics",
     "filtered_states",
     "find_starts",
     "forecast",
     "free_run",
     "freeplay",
+    "gamma_white_noise",
     "hysteresis",
     "hysteresis_branch",
     "leave_future_out",

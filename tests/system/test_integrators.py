@@ -226,6 +226,18 @@ def test_milstein_is_euler_maruyama_with_additive_noise():
     assert milstein.equations == system_of(psf.EulerMaruyama(**settings, dt=0.1)).equations
 
 
+def test_filters_of_moments_take_the_mean_and_covariance_of_milstein_steps():
+    """Without noise a Milstein step is biased: the mean of q^2 - 1 is zero, not its value at 0."""
+    settings = dict(drift=lambda x, a: [-a * x[0]], diffusion=lambda x: [[0.5 * x[0]]])
+    values = [
+        psf.log_likelihood(
+            system_of(integrator, mean=(1.0,)), psf.EKF(), {"a": 0.3}, [[0.8]], steps=[3]
+        )
+        for integrator in (psf.Milstein(**settings, dt=0.2), psf.EulerMaruyama(**settings, dt=0.2))
+    ]
+    assert values[0] == values[1]
+
+
 def test_runge_kutta_adds_noise_at_the_end_of_a_substep():
     def drift(x, a):
         return [-a * x[0]]
@@ -468,7 +480,7 @@ BAD = {
     ),
     "no such name": (
         lambda: system_of(psf.SemiImplicitEuler(pull, dt=0.1, velocities="w"), states=["p", "v"]),
-        rr"velocities must be names of states, \['p', 'v'\].*got 'w'",
+        r"velocities must be names of states, \['p', 'v'\].*got 'w'",
     ),
     "a name without names": (
         lambda: system_of(psf.SemiImplicitEuler(pull, dt=0.1, velocities="v")),

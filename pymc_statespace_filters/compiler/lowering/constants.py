@@ -29,7 +29,8 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Functions that are called at every step; the others, once per evaluation.
 _AT_EVERY_STEP = (
-    "transition", "process_noise", "observation", "observation_noise", "observation_logp",
+    "transition", "gaussian_transition", "process_noise", "observation", "observation_noise",
+    "observation_logp",
 )  # fmt: skip
 
 

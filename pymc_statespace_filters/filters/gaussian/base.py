@@ -85,7 +85,8 @@ class GaussianFilterBase:
         if system.is_deterministic:
             states = deterministic.compile_states(self._functions(system))
         else:
-            states = compile_states(_forward_pass(self.linearization, system.model), moment)
+            forward = _forward_pass(self.linearization, system.model.gaussian)
+            states = compile_states(forward, moment)
         return system.at_parameters(states)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
@@ -99,8 +100,8 @@ class GaussianFilterBase:
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         if system.is_deterministic:
-            return deterministic.filter_functions(system.model)
-        return _functions(self.linearization, system.model)
+            return deterministic.filter_functions(system.model.gaussian)
+        return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
         """Raise if the observation of an uncertain state is not Gaussian."""

@@ -54,9 +54,10 @@ class Milstein(SubstepIntegrator):
 
     Notes
     -----
-    ``q`` enters by its square. Filters of means and covariances (`EKF`, `UKF`, `IPLF`) linearise
-    steps in the noise: they take the steps of `EulerMaruyama`, which have the same mean and, to
-    leading order, the same covariance.
+    ``q`` enters by its square. `EKF`, `UKF`, `IPLF` and `EnKF` take noise by its mean and
+    covariance: they use the steps of `EulerMaruyama`, which have the same mean and, to leading
+    order in ``h``, the same covariance. `BootstrapPF` and `PFEnKF` take the steps as they are;
+    `GuidedPF` and `GridFilter`, which need Gaussian noise, refuse them.
 
     References
     ----------
