@@ -17,11 +17,10 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.conditional_moments import (
-    MOMENTS,
     conditional_moments,
     unknown_moments,
 )
-from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
+from pymc_statespace_filters.compiler.lowering.gaussian import differentiable_log_density
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
 from pymc_statespace_filters.filters.gaussian.linearization import (
@@ -36,6 +35,7 @@ from pymc_statespace_filters.filters.gaussian.sigma_points import (
 )
 from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.system.checks import check_count
+from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -98,7 +98,7 @@ class IPLF(GaussianFilterBase):
             )
         unknown = unknown_moments(system.model)
         if unknown:
-            names = ", ".join(sorted(kind.__name__.removesuffix("RV") for kind in MOMENTS))
+            names = ", ".join(sorted(map(law_name, SCALAR_LAWS)))
             raise ModelError(
                 f"IPLF needs the mean and variance of an observation, which it knows for {names}; "
                 f"got {', '.join(unknown)}"
@@ -190,12 +190,8 @@ def _posterior(observation: Seen) -> _Posterior:
 
 
 def _log_p(system: StateSpaceModel, values: Symbols) -> list[TensorVariable]:
-    """log p(d | x). A missing datum of distributions is replaced: its gradient would be NaN."""
-    if system.gaussian_observation:
-        return [observation_log_density(system, values)]
-    missing = pt.isnan(values["d"])
-    there = observation_log_density(system, {**values, "d": pt.switch(missing, 1.0, values["d"])})
-    return [pt.switch(pt.any(missing), 0.0, there)]
+    """log p(d | x)."""
+    return [differentiable_log_density(system, values)]
 
 
 def _datum(system: StateSpaceModel, d: TensorVariable) -> TensorVariable:

@@ -5,6 +5,7 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import (
     jacobian_of,
     observation_moments,
@@ -36,6 +37,8 @@ def gaussian_predictions(variable: StateSpaceVariable) -> Graphs | None:
     rows = variable.steps + pt.arange(variable.steps.shape[0])
     padding = pt.full((rows.shape[0] + variable.steps[-1], tape.shape[1]), np.nan)
     before = pt.concatenate([tape, padding])[rows]
+    if compile_system(variable.system).is_deterministic:
+        return [terms, *_observation_moments(variable, before[:, :n], None)]
     position = np.zeros((n, n), dtype=np.int64)
     position[np.tril_indices(n)] = np.arange(n, n + n * (n + 1) // 2)
     cov = before[:, np.maximum(position, position.T)]
@@ -72,7 +75,7 @@ def _observation_moments(
     rows = {
         x: mean,
         symbols["t"]: variable.t0 + variable.steps * system.dt,
-        symbols["u"]: pt.zeros((n_rows, system.n_inputs)) if used is None else used,
+        symbols["u"]: pt.zeros((n_rows, system.n_input_columns)) if used is None else used,
         symbols["theta"]: pt.broadcast_to(variable.theta, (n_rows, system.n_theta)),
     }
     if cov is not None:

@@ -90,7 +90,7 @@ def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
     of_predict, of_update = size if n == 1 else n, size + 1 if n <= 2 else 0
     if n > MAX_EXPLICIT:
         of_predict = 0
-    if not recursion.linearization.has_short_rows:
+    if not recursion.has_short_rows:
         of_predict = of_update = 0
 
     def vjp(part: VectorFunction, wrt: list, cotangents: dict, n_explicit: int) -> VectorFunction:

@@ -12,6 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 )
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.gaussian import deterministic
 from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_pullback
 from pymc_statespace_filters.filters.gaussian.batch import compile_batch
 from pymc_statespace_filters.filters.gaussian.linearization import (
@@ -54,55 +55,65 @@ class GaussianFilterBase:
         raise NotImplementedError
 
     def is_exact_for(self, system: System) -> bool:
-        """Whether the system is linear; False too where that cannot be decided."""
-        return system.is_linear
+        """Whether the system is linear, or deterministic; False where that cannot be decided."""
+        return system.is_linear or (
+            system.is_deterministic and system.has_exact_observation_density
+        )
 
     def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
         """Compile the log-likelihood."""
-        return compile_value(self._functions(system))
+        return system.at_parameters(compile_value(self._functions(system)))
 
     def compile_batch(self, system: System) -> CompiledFunction:
         """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
-        return compile_batch(self._functions(system))
+        return system.at_parameters(compile_batch(self._functions(system)), of_many=True)
 
     def compile_taped(self, system: System) -> CompiledFunction:
         """Compile the forward pass, with a third result: the tape."""
-        return compile_taped(self._functions(system))
+        return system.at_parameters(compile_taped(self._functions(system)))
 
     def compile_pullback(self, system: System) -> CompiledFunction:
         """Compile the backward pass along the tape."""
-        return compile_pullback(self._functions(system))
+        return system.derivative_at_parameters(compile_pullback(self._functions(system)))
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
         """Compile both passes as one function."""
-        return compile_gradient(self._functions(system))
+        return system.derivative_at_parameters(compile_gradient(self._functions(system)))
 
     def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
-        return compile_states(_forward_pass(self.linearization, system.model), moment)
+        if system.is_deterministic:
+            states = deterministic.compile_states(self._functions(system))
+        else:
+            forward = _forward_pass(self.linearization, system.model.gaussian)
+            states = compile_states(forward, moment)
+        return system.at_parameters(states)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
-        return compile_run(self._functions(system))
+        compile = deterministic.compile_run if system.is_deterministic else compile_run
+        return system.at_parameters(compile(self._functions(system)))
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
         return "modified Bryson-Frazier"
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
-        return _functions(self.linearization, system.model)
+        if system.is_deterministic:
+            return deterministic.filter_functions(system.model.gaussian)
+        return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
-        """Raise if the observation is not a function with Gaussian noise."""
-        if not system.gaussian_observation:
+        """Raise if the observation of an uncertain state is not Gaussian."""
+        if not (system.gaussian_observation or system.is_deterministic):
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise, got "
                 f"observation_dist or observation_logp"
             )
 
     def _check_not_carried(self, system: System) -> None:
-        """Raise if a state is carried."""
-        if system.carried:
+        """Raise if an update would move a carried state."""
+        if system.carried and not system.is_deterministic:
             raise ModelError(
                 f"{type(self).__name__} cannot treat the carried states {list(system.carried)}, "
                 f"which no Kalman update may move"
@@ -122,7 +133,7 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
     forecast = predict(linearization, system, values)
     return GaussianFilterFunctions(
         system,
-        linearization,
+        linearization.has_short_rows,
         function("c", "theta", [start(system, values)], False),
         function("c, inputs, k, t, s", "theta u t s", [forecast], False),
         function(
@@ -137,4 +148,4 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
 
 @lru_cache(maxsize=256)
 def _forward_pass(linearization: Linearization, system: StateSpaceModel) -> ForwardPass:
-    return forward_pass(_functions(linearization, system))
+    return forward_pass(_functions(linearization, system), linearization)

@@ -39,6 +39,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
 from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
 from pymc_statespace_filters.filters.gaussian.linearization import (
+    Linearization,
     Symbols,
     innovation_of,
     pack,
@@ -55,7 +56,7 @@ class BrysonFrazier:
     ``draws_q``, standard normals for each state otherwise, then standard normals for v.
     """
 
-    def __init__(self, recursion: GaussianFilterFunctions) -> None:
+    def __init__(self, recursion: GaussianFilterFunctions, linearization: Linearization) -> None:
         self.recursion = recursion
         system, size = recursion.system, recursion.size
         graphs = (recursion.start.graph, recursion.predict.graph, recursion.update.graph)
@@ -64,9 +65,9 @@ class BrysonFrazier:
         vector = {"dtype": "float64", "shape": (self.size,)}
         self._whole, self._adjoint = pt.tensor("s", **vector), pt.tensor("s_bar", **vector)
         self._error = pt.tensor("error", dtype="float64", shape=(system.n,))
-        state = recursion.linearization.state(*self._moments())
-        self._step = recursion.linearization.transition(system, self._symbols, state)
-        self._seen = recursion.linearization.observation(system, self._symbols, state)
+        state = linearization.state(*self._moments())
+        self._step = linearization.transition(system, self._symbols, state)
+        self._seen = linearization.observation(system, self._symbols, state)
         self._state_jac, self._observation_jac = map(
             state.by_state, (self._step.jac, self._seen.jac)
         )

@@ -23,7 +23,6 @@ from pymc_statespace_filters.compiler.codegen.functions import (
 )
 from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.filters.gaussian.linearization import Linearization
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -40,10 +39,12 @@ class GaussianFilterFunctions:
     * ``start(c) -> s`` at step 0; ``c`` are the parameters.
     * ``predict(c, inputs, k, t, s) -> s`` from step k to k + 1.
     * ``update(c, inputs, k, t, d, s) -> (s, term)`` with log p(d_j | d_1 .. d_{j-1}).
+
+    ``has_short_rows`` says whether a row of the Jacobian of a prediction takes few operations.
     """
 
     system: StateSpaceModel
-    linearization: Linearization
+    has_short_rows: bool
     start: VectorFunction
     predict: VectorFunction
     update: VectorFunction

@@ -29,6 +29,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, FILL_NORMALS
 from pymc_statespace_filters.compiler.numerics.philox import STATES
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
+from pymc_statespace_filters.filters.gaussian.linearization import Linearization
 from pymc_statespace_filters.filters.gaussian.recursion import (
     GaussianFilterFunctions,
     compile_taped_to_the_end,
@@ -54,9 +55,9 @@ class ForwardPass:
     forwards: CompiledFunction
 
 
-def forward_pass(recursion: GaussianFilterFunctions) -> ForwardPass:
+def forward_pass(recursion: GaussianFilterFunctions, linearization: Linearization) -> ForwardPass:
     """The forward pass of a filter with a simulated error of it."""
-    smoother = BrysonFrazier(recursion)
+    smoother = BrysonFrazier(recursion, linearization)
     return ForwardPass(smoother, _noise(smoother), _forwards(smoother))
 
 

@@ -1,0 +1,101 @@
+"""What all integrators have in common that repeat a substep of dx = f dt + G dW."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import check_count
+from pymc_statespace_filters.system.equations import (
+    Equation,
+    as_matrix,
+    as_vector,
+    read_equation,
+)
+from pymc_statespace_filters.system.integrators.diffusion import constant_diffusion
+
+Values = Mapping[str, TensorVariable]
+
+
+class SubstepIntegrator:
+    """An integrator that divides a step into substeps of one kind, `advance`.
+
+    Subclasses are frozen dataclasses with the fields below.
+    """
+
+    drift: Callable
+    diffusion: Any
+    dt: float
+    substeps: int
+
+    def __post_init__(self) -> None:
+        if self.diffusion is not None and not callable(self.diffusion):
+            object.__setattr__(self, "diffusion", constant_diffusion(self.diffusion))
+        _ = self.equations  # checks the functions
+        check_count("substeps", self.substeps, 1)
+
+    def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
+        """The state after a substep, from the values at its start and its standard normals."""
+        raise NotImplementedError
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        """The user's functions, in the order in which their parameters are listed."""
+        drift = read_equation("drift", self.drift, "xut")
+        if not callable(self.diffusion):
+            return (drift,)
+        return drift, read_equation("diffusion", self.diffusion, "xut")
+
+    def noise_size(self, values: Values) -> int:
+        """Number of standard normals that one step of length ``dt`` uses."""
+        return self.substeps * self._diffusion(values).type.shape[1]
+
+    def step(self, values: Values) -> TensorVariable:
+        """The state one step later, given the symbols ``x``, ``q``, ``u``, ``t`` and parameters."""
+        state, time, length = values["x"], values["t"], self.dt / self.substeps
+        n_noises = values["q"].type.shape[0] // self.substeps
+        for i in range(self.substeps):
+            now = {**values, "x": state, "t": time + i * length}
+            noise = values["q"][i * n_noises : (i + 1) * n_noises]
+            state = self.advance(now, noise, length)
+        return state
+
+    def substep(self) -> Self:
+        """One step of the same kind, of length ``dt / substeps``."""
+        return self._replace(dt=self.dt / self.substeps, substeps=1)
+
+    def refined(self) -> Self:
+        """The same integrator with twice as many substeps."""
+        return self._replace(substeps=2 * self.substeps)
+
+    def _replace(self, **changes: Any) -> Self:
+        return replace(self, **changes)  # type: ignore[type-var]
+
+    def _drift(self, now: Values) -> TensorVariable:
+        return as_vector("drift", self.equations[0](now), now["x"].type.shape[0])
+
+    def _diffusion(self, now: Values) -> TensorVariable:
+        """The matrix G (n, m), without columns where the equation has no noise."""
+        n = now["x"].type.shape[0]
+        if self.diffusion is None:
+            return pt.zeros((n, 0))
+        if callable(self.diffusion):
+            return as_matrix("diffusion", self.equations[1](now), rows=n)
+        return as_matrix("diffusion", self.diffusion, rows=n)
+
+    def _shock(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
+        """The noise sqrt(h) G q of a substep."""
+        return (np.sqrt(length) * self._diffusion(now)) @ noise
+
+
+def check_needed(diffusion: Any, integrator: str) -> None:
+    """Raise if an integrator that needs a diffusion has none."""
+    if diffusion is None:
+        raise ModelError(
+            f"diffusion must be a function or a matrix of numbers in {integrator}, got None; "
+            "RungeKutta4 takes equations without noise"
+        )
