@@ -208,7 +208,10 @@ def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, Tens
     """The next state, and the same with normal variables."""
     values, drawn = symbols.values, symbols.drawn
     noises = (values["q"],) if drawn is None else (drawn.exact, drawn.surrogate)
-    steps = [functions.transition.step({**values, "q": q}) for q in noises]
+    steps = [
+        as_vector("transition", functions.transition.step({**values, "q": q}), symbols.n)
+        for q in noises
+    ]
     return steps[0], steps[-1]
 
 
