@@ -47,7 +47,7 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama, Milstein, RungeKutta4, SemiImplicitEuler
+from .system.integrators import EulerMaruyama, ExactLinear, Milstein, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
 from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
@@ -66,6 +66,7 @@ __all__ = [
     "EulerMaruyama",
     "Evidence",
     "EvidenceWarning",
+    "ExactLinear",
     "FilterWarning",
     "GradientUnavailableError",
     "GridFilter",

@@ -168,13 +168,14 @@ def path_eigenvalues(
 ) -> NDArray[np.complex128]:
     """Eigenvalues (m, K, n) of the Jacobian of a substep at K states of the path without noise.
 
-    The arguments are those of the likelihood at m points. The path starts from the initial mean.
-    Eigenvalues are NaN where the Jacobian is not finite.
+    It is that of the substep which the integrator names for this, if it names one. The arguments
+    are those of the likelihood at m points. The path starts from the initial mean. Eigenvalues are
+    NaN where the Jacobian is not finite.
     """
     assert system.integrator is not None
     single = system.with_integrator(system.integrator.substep())
     length, substeps = single.dt, round(system.dt / single.dt)
-    start, advance, jacobian = _compile_path(single)
+    start, advance, jacobian = _compile_path(single, _examined(system))
     if inputs.shape[1] == 0:  # a system without inputs
         inputs = np.zeros((len(theta), 1, system.n_input_columns))
     inputs = without_resets(system, inputs)  # which belong to a step, not to each substep
@@ -197,14 +198,23 @@ def _eigenvalues(jacobians: Array) -> NDArray[np.complex128]:
     return found
 
 
-def _compile_path(system: StateSpaceModel) -> list[Callable]:
-    """Initial mean, next state and Jacobian of the step, each for many points at once."""
+def _examined(system: StateSpaceModel) -> StateSpaceModel:
+    """The system with the substep whose eigenvalues its integrator reads."""
+    assert system.integrator is not None
+    substep = system.integrator.substep()
+    examined = getattr(substep, "examined_step", substep.substep)
+    return system.with_integrator(examined())
+
+
+def _compile_path(system: StateSpaceModel, examined: StateSpaceModel) -> list[Callable]:
+    """Initial mean, next state, and Jacobian of the examined step, each for many points at once."""
     symbols = symbols_of(system)
     theta, now = symbols["theta"], [symbols[name] for name in ("theta", "x", "u", "t")]
     values = dict(zip(("theta", "x", "u", "t"), now, strict=True))
     advanced = call(system.equations.transition, system, values)
     start = call(system.equations.initial_mean, system, {"theta": theta})
-    graphs = [([theta], start), (now, advanced), (now, jacobian_of(advanced, values["x"]))]
+    seen = call(examined.equations.transition, examined, values)
+    graphs = [([theta], start), (now, advanced), (now, jacobian_of(seen, values["x"]))]
     return [interpreted_at_points(arguments, output) for arguments, output in graphs]
 
 
