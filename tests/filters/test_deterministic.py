@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -237,6 +238,46 @@ def test_the_gradient_is_that_of_the_closed_form():
         theta, steps, DECAY[:, None], np.zeros((251, 0)), 0.0, 0, np.ones(4)
     )
     np.testing.assert_allclose(found, [truth[name] for name in system.parameters], atol=1e-8)
+
+
+def test_boluses_enter_by_input_rows():
+    """One compartment with absorption, doses at 0 and 1.5 hours: the closed form to 1e-8."""
+    between = psf.RungeKutta4(lambda x, ka, k: [-ka * x[0], ka * x[0] - k * x[1]], dt=0.005)
+
+    def step(x, u, t, ka, k):
+        dosed = {"x": x + pt.stack([u[0], 0.0]), "t": t, "q": pt.zeros(0)}
+        return between.step(dosed | {"ka": ka, "k": k})
+
+    system = psf.StateSpaceModel(
+        transition=step, dt=0.005, observation=lambda x: x[1], observation_noise=0.01,
+        initial_mean=[0.0, 0.0], initial_cov=np.zeros((2, 2)), inputs=["dose"],
+    )  # fmt: skip
+    ka, k, times, doses = 1.4, 0.3, np.array([0.5, 1.5, 2.0, 4.0]), np.zeros((800, 1))
+    doses[[0, 300], 0] = 3.0, 2.0
+
+    def after(t, dose):
+        t = np.maximum(t, 0.0)
+        return dose * ka / (ka - k) * (np.exp(-k * t) - np.exp(-ka * t))
+
+    observed = np.array([1.1, 1.8, 2.5, 1.6])
+    truth = stats.norm.logpdf(observed, after(times, 3.0) + after(times - 1.5, 2.0), 0.1)
+    params = {"ka": ka, "k": k}
+    found = psf.log_likelihood(system, psf.EKF(), params, observed, times=times, inputs=doses)
+    np.testing.assert_allclose(found, truth, rtol=0.0, atol=1e-8)
+
+
+def test_predictions_have_the_noise_of_the_sensor_alone():
+    values = {"k": 1.1, "x0": 3.0, "s": 0.2}
+    with pm.Model() as model:
+        for name in values:
+            pm.HalfNormal(name)
+        psf.StateSpace("d", decay(), psf.EKF(), times=TIMES, observed=DECAY)
+    idata = az.from_dict({"posterior": {name: np.full((1, 4), v) for name, v in values.items()}})
+    found = psf.filter_diagnostics(idata, model, random_seed=1, progressbar=False)
+    found = found["filter_diagnostics"]
+    innovation = DECAY - 3.0 * np.exp(-1.1 * TIMES)
+    np.testing.assert_allclose(found["d_innovation"].values[:, 0], innovation, atol=1e-8)
+    np.testing.assert_allclose(found["d_innovation_cov"].values, 0.04, rtol=1e-12)
 
 
 # Observations of any kind
