@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -16,6 +15,8 @@ from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER
 from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.pymc_model.prediction_graphs import gaussian_predictions
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])
@@ -267,17 +268,19 @@ def test_boluses_enter_by_input_rows():
 
 
 def test_predictions_have_the_noise_of_the_sensor_alone():
-    values = {"k": 1.1, "x0": 3.0, "s": 0.2}
-    with pm.Model() as model:
-        for name in values:
-            pm.HalfNormal(name)
-        psf.StateSpace("d", decay(), psf.EKF(), times=TIMES, observed=DECAY)
-    idata = az.from_dict({"posterior": {name: np.full((1, 4), v) for name, v in values.items()}})
-    found = psf.filter_diagnostics(idata, model, random_seed=1, progressbar=False)
-    found = found["filter_diagnostics"]
-    innovation = DECAY - 3.0 * np.exp(-1.1 * TIMES)
-    np.testing.assert_allclose(found["d_innovation"].values[:, 0], innovation, atol=1e-8)
-    np.testing.assert_allclose(found["d_innovation_cov"].values, 0.04, rtol=1e-12)
+    theta = theta_of()
+    record = {"steps": STEPS, "observed": OBSERVED, "inputs": FORCE, "t0": T0, "seed": 0}
+    constants = {name: pt.constant(value) for name, value in record.items()}
+    others = {"name": "d", "dims": ("d_time", "observable"), "score_from": 0}
+    variable = StateSpaceVariable(
+        system=KNOWN, filter=psf.EKF(), theta=pt.dvector(), **constants, **others
+    )
+    graphs = gaussian_predictions(variable)
+    _, mean, cov = (graph.eval({variable.theta: theta}, mode="FAST_COMPILE") for graph in graphs)
+    x = path(theta)[STEPS]
+    seen = np.column_stack([x[:, 0] + THETA["c"] * x[:, 1] ** 2, np.exp(0.3 * x[:, 1])])
+    np.testing.assert_allclose(mean, seen, rtol=1e-12)
+    np.testing.assert_allclose(cov, np.broadcast_to(NOISE, (4, 2, 2)), rtol=1e-12)
 
 
 # Observations of any kind
