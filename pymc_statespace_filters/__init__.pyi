@@ -28,6 +28,7 @@ from .evidence import (
     estimate_evidence,
     marginal_modes,
     prior_sensitivity,
+    step_error,
 )
 from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
 from .plots import (
@@ -46,8 +47,9 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama, RungeKutta4
+from .system.integrators import EulerMaruyama, ExactLinear, Milstein, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
+from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
 from .system.second_order import second_order
 
@@ -64,17 +66,20 @@ __all__ = [
     "EulerMaruyama",
     "Evidence",
     "EvidenceWarning",
+    "ExactLinear",
     "FilterWarning",
     "GradientUnavailableError",
     "GridFilter",
     "GuidedPF",
     "LoweringError",
     "MaximumLikelihoodEstimate",
+    "Milstein",
     "ModelError",
     "PFEnKF",
     "ParallelError",
     "ParallelWarning",
     "RungeKutta4",
+    "SemiImplicitEuler",
     "StateSpace",
     "StateSpaceFiltersError",
     "StateSpaceModel",
@@ -84,12 +89,14 @@ __all__ = [
     "compute_log_likelihood",
     "cubic",
     "estimate_evidence",
+    "euler_multinomial",
     "filter_diagnostics",
     "filtered_states",
     "find_starts",
     "forecast",
     "free_run",
     "freeplay",
+    "gamma_white_noise",
     "hysteresis",
     "hysteresis_branch",
     "leave_future_out",
@@ -114,5 +121,6 @@ __all__ = [
     "second_order",
     "simulate",
     "smoothed_states",
+    "step_error",
     "suggest_particles",
 ]

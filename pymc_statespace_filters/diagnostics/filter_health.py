@@ -39,6 +39,7 @@ from pymc_statespace_filters.states.variable import (
     select_variables,
     simulate_observations,
 )
+from pymc_statespace_filters.system.accumulators import inputs_of_user
 from pymc_statespace_filters.system.checks import check_random_seed
 
 Array = NDArray[np.float64]
@@ -263,7 +264,8 @@ def _innovations(
     if not system.n_inputs:
         return found
     # The mean over the draws, where inputs depend on them.
-    inputs = inputs_before(at_draws.inputs().mean(axis=0), at_draws.steps)
+    given = inputs_of_user(system, at_draws.inputs())
+    inputs = inputs_before(given.mean(axis=0), at_draws.steps)
     past = np.insert(lags, 0, 0)
     return found.assign(
         {

@@ -143,7 +143,7 @@ def _states(system: StateSpaceModel, at: Any, draws: Array) -> Array:
 
 
 def _eigenvalues(field: VectorField, draws: Array, points: Array) -> NDArray[np.complex128]:
-    jacobians = field.jacobian(draws, points)
+    jacobians = field.jacobian(draws, points)[:, :, field.resting]
     finite = np.isfinite(jacobians).all(axis=(1, 2))
     if not finite.all():
         raise ModelError(

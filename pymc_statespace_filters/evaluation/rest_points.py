@@ -26,13 +26,15 @@ Array = NDArray[np.float64]
 class VectorField(NamedTuple):
     """What is zero at a rest point: the drift, or the step less the state before it.
 
-    ``value(theta, x)`` (m, n), ``jacobian(theta, x)`` (m, n, n) and ``start(theta)`` (m, n), the
-    initial mean, take m points; inputs, time and noise are zero.
+    ``value(theta, x)`` (m, r), ``jacobian(theta, x)`` (m, r, n) and ``start(theta)`` (m, n), the
+    initial mean, take m points; inputs, time and noise are zero. ``resting`` are the r states that
+    can come to rest: all but accumulators, which sum.
     """
 
     value: Callable[[Array, Array], Array]
     jacobian: Callable[[Array, Array], Array]
     start: Callable[[Array], Array]
+    resting: list[int]
     is_drift: bool
     dt: float
 
@@ -43,14 +45,18 @@ def vector_field(system: StateSpaceModel) -> VectorField:
     theta, x = symbols["theta"], symbols["x"]
     drift = _drift(system, theta, x)
     if drift is None:
-        value = call(system.equations.transition, system, {"theta": theta, "x": x}) - x
+        step = system.with_gaussian_steps.equations.transition
+        value = call(step, system, {"theta": theta, "x": x}) - x
     else:
         value = drift
     start = call(system.equations.initial_mean, system, {"theta": theta})
+    resting = [i for i, name in enumerate(system.states) if name not in system.accumulators]
+    value = value[resting]
     return VectorField(
         interpreted_at_points([theta, x], value),
         interpreted_at_points([theta, x], jacobian_of(value, x)),
         interpreted_at_points([theta], start),
+        resting,
         drift is not None,
         system.dt,
     )
@@ -109,7 +115,7 @@ def _where(found: NDArray[np.bool_], several: bool) -> str:
 def _newton_step(jacobian: Array, value: Array) -> Array:
     """The least step that solves the linearised equations best; 0 where they are not finite."""
     finite = np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(value).all(axis=1)
-    step = np.zeros_like(value)
+    step = np.zeros(jacobian.shape[::2])
     # The pseudoinverse, because rest points may fill a line: a position that no spring holds.
     step[finite] = -(np.linalg.pinv(jacobian[finite]) @ value[finite, :, None])[..., 0]
     return step

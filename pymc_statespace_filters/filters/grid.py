@@ -136,6 +136,11 @@ class GridFilter:
                 f"GridFilter cannot treat the carried states {list(system.carried)}: a memory has "
                 f"no density"
             )
+        if system.gaussian is not system:
+            raise ModelError(
+                "GridFilter integrates over Gaussian noise and a Gaussian start, got other "
+                "distributions in process_dist or initial_dist, or steps of Milstein"
+            )
         if system.m == 0:
             raise ModelError(
                 "GridFilter needs process noise, which makes the density smooth, and this system "

@@ -130,20 +130,20 @@ def evaluator(op: FilterOp) -> Any:
 
 def check_record(system: StateSpaceModel) -> Any:
     """A compiled check of what `pm.set_data` may have replaced; kernels do not check bounds."""
-    return _check_of_inputs(system.n_inputs, int(system.observation_uses_inputs))
+    return _check_of_inputs(system.n_input_columns, int(system.observation_uses_inputs))
 
 
 # Made once for all systems of one shape: a fresh one would be compiled by the next call.
 @cache
-def _check_of_inputs(n_inputs: int, last_row: int) -> Any:
+def _check_of_inputs(n_columns: int, last_row: int) -> Any:
     @jit
     def check(steps, inputs):
         for j in range(steps.size):
             if steps[j] < 0 or (j > 0 and steps[j] <= steps[j - 1]):
                 raise ModelError("steps must not be negative and must increase strictly")
-        if n_inputs and inputs.shape[1] != n_inputs:
+        if n_columns and inputs.shape[1] != n_columns:
             raise ModelError("inputs must have one column for each input of the system")
-        if n_inputs and steps.size and inputs.shape[0] < steps[-1] + last_row:
+        if n_columns and steps.size and inputs.shape[0] < steps[-1] + last_row:
             raise ModelError("inputs has too few rows: row k holds during step k")
 
     return check
@@ -167,7 +167,7 @@ def check_observed(p: int) -> Any:
 
 def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None:
     """The key of a compiled function together with the checks of its record."""
-    checked = (system.p, system.n_inputs, system.observation_uses_inputs)
+    checked = (system.p, system.n_input_columns, system.observation_uses_inputs)
     return key_of(f"checked for {checked}", compiled.key)
 
 

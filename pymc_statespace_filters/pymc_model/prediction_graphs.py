@@ -75,7 +75,7 @@ def _observation_moments(
     rows = {
         x: mean,
         symbols["t"]: variable.t0 + variable.steps * system.dt,
-        symbols["u"]: pt.zeros((n_rows, system.n_inputs)) if used is None else used,
+        symbols["u"]: pt.zeros((n_rows, system.n_input_columns)) if used is None else used,
         symbols["theta"]: pt.broadcast_to(variable.theta, (n_rows, system.n_theta)),
     }
     if cov is not None:

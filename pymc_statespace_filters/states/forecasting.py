@@ -39,7 +39,7 @@ def forecast(
     """Predict states and observations after the last observation, at draws of the posterior.
 
     For each draw, a state at the last observation is drawn and simulated forward with fresh process
-    and observation noise.
+    and observation noise. Accumulators sum from one predicted step to the next.
 
     Parameters
     ----------
@@ -102,10 +102,11 @@ def forecast(
         at_draws = VariableAtDraws(model, variable, draws)
         last = at_draws.steps[-1:]
         future = _future_steps(n_steps, steps, times, int(last[0]), at_draws)
+        observations = np.concatenate([at_draws.steps, future])
         if inputs is not None:
-            rows = pt.as_tensor(check_inputs(inputs, system, future))
+            rows = pt.as_tensor(check_inputs(inputs, system, observations))
             at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
-        input_rows = at_draws.inputs_until(future)
+        input_rows = at_draws.inputs_until(observations)
         initial = at_draws.states("filtered", last, rng, progressbar=progressbar)
         paths, simulated = _simulate(
             at_draws, initial.drawn[:, 0], int(last[0]), future, input_rows, rng

@@ -54,7 +54,7 @@ def free_run(
         Row k holds during step k; by default those of the model.
     steps : array_like of int, shape (R,), optional
         When to predict an observation, from step 0 of the simulation on; by default the steps of
-        the variable's record.
+        the variable's record. Accumulators sum from one of them to the next.
     times : array_like, shape (R,), optional
         The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
     observed : array_like, shape (R, p) or (R,), optional
@@ -172,7 +172,7 @@ def _record(variable: StateSpaceVariable, observed: Any, steps: NDArray[np.int64
 
 
 def _input_rows(at_draws: VariableAtDraws, inputs: Any, steps: NDArray[np.int64]) -> Array:
-    """The inputs (draws or 1, rows, n_inputs)."""
+    """The inputs (draws or 1, rows, n_input_columns)."""
     if inputs is None:
         rows = at_draws.inputs_until(steps)
     else:

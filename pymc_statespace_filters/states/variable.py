@@ -24,7 +24,11 @@ from pymc_statespace_filters.pymc_model.state_graphs import (
     with_other_filter,
 )
 from pymc_statespace_filters.states.draws import PosteriorDraws
-from pymc_statespace_filters.system.record import n_input_rows
+from pymc_statespace_filters.system.accumulators import (
+    inputs_of_user,
+    n_input_rows,
+    with_resets,
+)
 
 Array = NDArray[np.float64]
 
@@ -82,21 +86,22 @@ class VariableAtDraws:
         return self._interpret(self.variable.theta)
 
     def inputs(self) -> Array:
-        """Input rows at every draw, (draws or 1, rows, n_inputs)."""
+        """Input rows at every draw, (draws or 1, rows, n_input_columns)."""
         graph = self.variable.inputs
         if set(self._replaced) & set(ancestors([graph])):
             return self._interpret(graph)
         return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
 
     def inputs_until(self, steps: NDArray[np.int64]) -> Array:
-        """The same, checked to have the rows that observations at `steps` need."""
-        system, rows = self.variable.system, self.inputs()
+        """The same, for observations at `steps` instead; checked to have the rows they need."""
+        system = self.variable.system
+        rows = inputs_of_user(system, self.inputs())
         if len(rows[0]) < n_input_rows(system, steps) and system.n_inputs:
             raise ModelError(
                 f"the model's inputs end after {len(rows[0])} rows, and step {steps[-1]} needs "
                 f"{n_input_rows(system, steps)}: give inputs= for all steps, from step 0 on"
             )
-        return rows
+        return with_resets(system, rows, steps)
 
     def _interpret(self, graph: Variable) -> Array:
         # Microseconds for each draw: machine code would take longer to compile than it saves.

@@ -1,16 +1,16 @@
 """The system: a user's functions, traced once and checked; immutable."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.graph_digest import describe, digest
-from pymc_statespace_filters.system.integrators import Integrator
+from pymc_statespace_filters.system.integrators.protocol import Integrator, bound_to_states
 from pymc_statespace_filters.system.signature import (
-    carried_names,
     checked_names,
+    names_of_states,
     read_signature,
     size_of,
 )
@@ -59,6 +59,9 @@ class StateSpaceModel:
         Shapes of parameters that are not scalars, ``{"k": (2,)}``.
     carried : sequence of str
         States that no Kalman update touches (discrete memory); copied with their particle.
+    accumulators : sequence of str
+        States that are zero again right after every observation (missing ones too), such as the
+        cases of a week. At an observation a state has its value before that.
 
     Raises
     ------
@@ -90,32 +93,40 @@ class StateSpaceModel:
         observation_dist: Callable | None = None,
         observation_logp: Callable | None = None,
         process_noise: Any = None,
+        process_dist: Callable | None = None,
         dt: float | None = None,
-        initial_mean: Any,
-        initial_cov: Any,
+        initial_mean: Any = None,
+        initial_cov: Any = None,
+        initial_dist: Callable | None = None,
         states: Sequence[str] | None = None,
         observables: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
         shapes: Mapping[str, Sequence[int]] | None = None,
         carried: Sequence[str] = (),
+        accumulators: Sequence[str] = (),
     ) -> None:
         written = {
-            "transition": transition,
+            "transition": bound_to_states(transition, states),
             "observation": observation,
             "observation_noise": observation_noise,
             "observation_dist": observation_dist,
             "observation_logp": observation_logp,
             "process_noise": process_noise,
+            "process_dist": process_dist,
             "dt": dt,
             "initial_mean": initial_mean,
             "initial_cov": initial_cov,
+            "initial_dist": initial_dist,
         }
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs)
-        symbols = size(functions, signature)
-        equations, seen = trace(functions, symbols, observables)
-        p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
+        symbols = size(functions, signature, bool(accumulators))
         state_names = checked_names("states", states, [f"x{i}" for i in range(symbols.n)])
+        totals = names_of_states("accumulators", accumulators, state_names)
+        equations, seen = trace(
+            functions, symbols, observables, [state_names.index(name) for name in totals]
+        )
+        p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
         self._set(
             parameters=signature.parameters,
             defaults=signature.defaults,
@@ -129,15 +140,19 @@ class StateSpaceModel:
             states=state_names,
             observables=checked_names("observables", observables, [f"y{i}" for i in range(p)]),
             inputs=signature.inputs,
-            carried=carried_names(carried, state_names),
+            carried=names_of_states("carried", carried, state_names),
+            accumulators=totals,
             additive_noise=seen.additive,
+            discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
+            keeps_noises=False,
             equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         # For `with_integrator` alone: neither compared nor pickled.
-        self._set(_arguments=written | names | {"shapes": shapes, "carried": carried})
+        others = {"shapes": shapes, "carried": carried, "accumulators": accumulators}
+        self._set(_arguments=written | names | others)
 
     # Equality and hash are those of the fields, which `__init__` sets once.
     parameters: tuple[str, ...]
@@ -153,9 +168,12 @@ class StateSpaceModel:
     observables: tuple[str, ...]
     inputs: tuple[str, ...]
     carried: tuple[str, ...]
+    accumulators: tuple[str, ...]
     additive_noise: bool
+    discrete_noise: bool
     gaussian_observation: bool
     observation_uses_inputs: bool
+    keeps_noises: bool
     equations: Equations
 
     def _set(self, **attributes: Any) -> None:
@@ -194,11 +212,62 @@ class StateSpaceModel:
         transition = self.__dict__.get("_arguments", {}).get("transition")
         return transition if isinstance(transition, Integrator) else None
 
-    def with_integrator(self, integrator: Integrator) -> "StateSpaceModel":
-        """The same system with another integrator."""
+    @property
+    def has_gaussian_steps(self) -> bool:
+        """Whether a step is a function of Gaussian noise: no distribution is another one."""
+        return self.equations.gaussian_transition is None
+
+    @property
+    def has_gaussian_start(self) -> bool:
+        """Whether the state at step 0 is Gaussian."""
+        return self.equations.initial_draw is None
+
+    @cached_property
+    def with_gaussian_steps(self) -> "StateSpaceModel":
+        """The system with normal variables of the same means and variances in ``process_dist``.
+
+        Itself where they are normal. Variances are those given the state and the variables above.
+        """
+        transition = self.equations.gaussian_transition
+        if transition is None:
+            return self
+        steps = {"transition": transition, "gaussian_transition": None}
+        return self._with_equations(steps)._with(discrete_noise=False)
+
+    @cached_property
+    def gaussian(self) -> "StateSpaceModel":
+        """The system `with_gaussian_steps` and with a Gaussian start of the same moments."""
+        system = self.with_gaussian_steps
+        if system.has_gaussian_start:
+            return system
+        return system._with_equations({"initial_draw": None})
+
+    def _with_equations(self, equations: Mapping[str, Any]) -> "StateSpaceModel":
+        return self._with(equations=replace(self.equations, **equations))
+
+    def _with(self, **attributes: Any) -> "StateSpaceModel":
+        system = object.__new__(StateSpaceModel)
+        system._set(**self.__getstate__() | attributes)
+        return system
+
+    def with_integrator(
+        self, integrator: Integrator, *, keeps_noises: bool = False
+    ) -> "StateSpaceModel":
+        """The same system with another integrator.
+
+        If it ``keeps_noises``, a filter draws every noise, where it would draw the sum of several
+        that act on one state. Two such systems with equally many noises then have the same ones.
+        """
         if self.integrator is None:
             raise ModelError(f"{self!r} must have an integrator, got a transition without one")
-        return StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system = StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system._set(keeps_noises=keeps_noises)
+        return system
+
+    @property
+    def n_input_columns(self) -> int:
+        """Number of inputs, and the column of resets of a system with accumulators."""
+        return self.n_inputs + bool(self.accumulators)
 
     @property
     def n_theta(self) -> int:

@@ -9,8 +9,14 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.accumulators import (
+    n_input_rows,
+    with_resets,
+    with_symbolic_resets,
+)
 from pymc_statespace_filters.system.checks import check_finite, check_positive, shortened
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -21,7 +27,7 @@ ROWS_AT = ("observations", "steps")
 
 
 class CheckedRecord(NamedTuple):
-    """A record of numbers: steps (J,), data (J, p), inputs (rows, n_inputs) and t0 ()."""
+    """A record of numbers: steps (J,), data (J, p), inputs (rows, n_input_columns) and t0 ()."""
 
     steps: np.ndarray
     observed: np.ndarray
@@ -62,7 +68,7 @@ def symbolic_record(
         steps if is_symbolic else current,
         current,
         None if observed is None else _symbolic_observed(observed, system, current),
-        _symbolic_inputs(inputs, system, current),
+        _symbolic_inputs(inputs, system, steps if is_symbolic else current, current),
         t0,
     )
 
@@ -81,11 +87,23 @@ def _symbolic_observed(observed: Any, system: StateSpaceModel, steps: np.ndarray
     return observed
 
 
-def _symbolic_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> Any:
-    if not isinstance(inputs, Variable):
+def _symbolic_inputs(
+    inputs: Any, system: StateSpaceModel, steps: Any, current_steps: np.ndarray
+) -> Any:
+    if isinstance(inputs, Variable):
+        inputs = _symbolic_inputs_of_user(inputs, system, current_steps)
+    elif isinstance(steps, Variable):
+        inputs = _check_inputs_of_user(inputs, system, current_steps)
+    else:
         return check_inputs(inputs, system, steps)
+    return with_symbolic_resets(system, inputs, steps) if system.accumulators else inputs
+
+
+def _symbolic_inputs_of_user(
+    inputs: Any, system: StateSpaceModel, steps: np.ndarray
+) -> TensorVariable:
     if isinstance(inputs, SharedVariable):
-        check_inputs(inputs.get_value(), system, steps)
+        _check_inputs_of_user(inputs.get_value(), system, steps)
     if inputs.type.ndim == 1 and system.n_inputs == 1:
         inputs = inputs[:, None]
     if not system.n_inputs or inputs.type.ndim != 2:
@@ -214,16 +232,12 @@ def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) 
     return array
 
 
-def n_input_rows(system: StateSpaceModel, steps: np.ndarray) -> int:
-    """Number of rows of inputs that a record needs.
-
-    One per step, and one more if the observation has the argument u.
-    """
-    return int(steps[-1]) + int(system.observation_uses_inputs) if steps.size else 0
-
-
 def check_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.ndarray:
-    """The inputs as (rows, n_inputs); row k holds during step k."""
+    """The inputs as (rows, n_input_columns); row k holds during step k."""
+    return with_resets(system, _check_inputs_of_user(inputs, system, steps), steps)
+
+
+def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.ndarray:
     if inputs is None:
         if system.n_inputs:
             raise ModelError(

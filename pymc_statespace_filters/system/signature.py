@@ -120,10 +120,10 @@ def checked_names(
     return tuple(names)
 
 
-def carried_names(carried: Sequence[str], states: tuple[str, ...]) -> tuple[str, ...]:
-    """The names of carried states, which must be states."""
-    names = checked_names("carried", carried, None)
+def names_of_states(role: str, names: Sequence[str], states: tuple[str, ...]) -> tuple[str, ...]:
+    """Distinct names, which must be those of states."""
+    names = checked_names(role, names, None)
     unknown = [name for name in names if name not in states]
     if unknown:
-        raise ModelError(f"carried must name states, {list(states)}, got {unknown}")
+        raise ModelError(f"{role} must name states, {list(states)}, got {unknown}")
     return names

@@ -12,7 +12,14 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.lowering import structure
+from pymc_statespace_filters.compiler.lowering import quantiles, structure
+from pymc_statespace_filters.compiler.lowering.constants import (
+    after_extension,
+    between_extensions,
+    extend,
+    lowered,
+    pull_back,
+)
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
@@ -30,6 +37,8 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
+
+quantiles.register()
 
 
 @lru_cache(maxsize=256)
@@ -71,25 +80,32 @@ class CompiledSystem:
     Attributes
     ----------
     model : StateSpaceModel
-        What the user wrote, for filters that work on its graphs.
-    n, m, p, r, n_inputs, n_theta, n_constants : int
-        Numbers of states, of normals that one step of a member takes (see `merged_noise`), of
-        observables, of measurement noises, of inputs, of parameters, and the length of ``c``.
+        What the user wrote, for filters that work on its graphs. Linear algebra of parameters alone
+        is left out of them: its values are read from more parameters, see `at_parameters`.
+    n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
+        Numbers of states, of normals that a member takes at the start and in one step (see
+        `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
+        and the length of ``c``.
     dt : float
         Length of a step.
     free : ndarray of int
         The states that an update may move: all but the carried ones.
     """
 
-    def __init__(self, model: StateSpaceModel) -> None:
-        self.model = model
+    def __init__(self, written: StateSpaceModel) -> None:
+        found = lowered(written)
+        self._written, self.model = written, found.model
+        model = self.model
+        self._extension = found.extension
         self.n, self.p, self.r = model.n, model.p, model.r
-        self.n_inputs, self.n_theta, self.dt = model.n_inputs, model.n_theta, model.dt
+        self.n_inputs, self.n_theta, self.dt = model.n_input_columns, model.n_theta, model.dt
         self.states, self.carried = tuple(model.states), tuple(model.carried)
         self.gaussian_observation = bool(model.gaussian_observation)
         self.additive_noise = bool(model.additive_noise)
         carried = [self.states.index(name) for name in self.carried]
         self.free = np.setdiff1d(np.arange(self.n), carried)
+        draw = model.equations.initial_draw
+        self.n_start = model.n if draw is None else draw.inputs[1].type.shape[0]
         self._merged_noise = structure.merged_noise(model)
         self.m = model.m if self._merged_noise is None else model.n
         self._covariances = covariances(model, self._merged_noise)
@@ -102,6 +118,29 @@ class CompiledSystem:
             self._square_roots[name] = self._c[start : start + size**2].reshape((size, size))
             start += size**2
 
+    # Constants of an evaluation
+
+    @cached_property
+    def _extend(self) -> CompiledFunction | None:
+        return None if self._extension is None else extend(self._extension)
+
+    def at_parameters(
+        self, compiled: CompiledFunction, *, of_many: bool = False
+    ) -> CompiledFunction:
+        """A function of parameters and constants as one of parameters, its first argument.
+
+        That argument has a row for each point if ``of_many``.
+        """
+        if self._extend is None:
+            return compiled
+        return after_extension(self._extend, compiled, of_many=of_many)
+
+    def derivative_at_parameters(self, compiled: CompiledFunction) -> CompiledFunction:
+        """The same for a function that returns the cotangent of its first argument."""
+        if self._extend is None or self._extension is None:
+            return compiled
+        return between_extensions(self._extend, pull_back(self._extension), compiled)
+
     # Functions
 
     @cached_property
@@ -109,13 +148,18 @@ class CompiledSystem:
         """Theta -> c."""
         theta = pt.tensor("theta", shape=(self.n_theta,), dtype="float64")
         mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
-        return followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
+        prepare = followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
+        return self.at_parameters(prepare)
 
     @cached_property
     def initialise(self) -> CompiledFunction:
         """Draw the state at step 0."""
-        z, mean = _normals(self.n), self._c[self.n_theta : self.n_theta + self.n]
-        state = mean + self._square_roots["initial_cov"] @ z
+        z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
+        draw = self.model.equations.initial_draw
+        if draw is None:
+            state = mean + self._square_roots["initial_cov"] @ z
+        else:
+            (state,) = draw.bind([self._symbols["theta"], z])
         return self._member_function("initialise", "c, Z, X", state, "X[{i}, member]", z=z)
 
     @cached_property
@@ -229,6 +273,16 @@ class CompiledSystem:
     def is_deterministic(self) -> bool:
         """Whether the state is a function of the parameters: no noise, and a known start."""
         return structure.is_deterministic(self.model)
+
+    @cached_property
+    def with_gaussian_steps(self) -> "CompiledSystem":
+        """The system with normal variables in place of others in ``process_dist``."""
+        return compile_system(self._written.with_gaussian_steps)
+
+    @cached_property
+    def gaussian(self) -> "CompiledSystem":
+        """The same with a Gaussian start."""
+        return compile_system(self._written.gaussian)
 
     @cached_property
     def is_linear(self) -> bool:

@@ -14,7 +14,7 @@ SYMBOLS = ("theta", "x", "q", "u", "t", "e", "d")
 
 
 def _sizes(system: StateSpaceModel) -> dict[str, int | None]:
-    counts = (system.n_theta, system.n, system.m, system.n_inputs, None, system.r, system.p)
+    counts = (system.n_theta, system.n, system.m, system.n_input_columns, None, system.r, system.p)
     return dict(zip(SYMBOLS, counts, strict=True))
 
 

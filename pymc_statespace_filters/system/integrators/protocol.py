@@ -1,7 +1,7 @@
 """The contract of an integrator: one step of the state from a differential equation."""
 
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,16 @@ class Integrator(Protocol):
     """The contract of an integrator, the ``transition`` of a `StateSpaceModel`.
 
     An integrator is immutable. A class fulfils the contract by having these members; it need not
-    inherit from this one.
+    inherit from this one. Members that an integrator may have besides:
+
+    * ``bound_to(states)``: the integrator with indices in place of names of states. ``states`` are
+      the names that the system was given, or None.
+    * ``noise_cov(values)``: the covariance of ``q``, a function of parameters alone, where ``q``
+      are not standard normals.
+    * ``linear_in_noise()``: an integrator with the same ``q``, linear in it, for filters of means
+      and covariances, where a step is not.
+    * ``examined_step()``: another integrator of one substep, whose eigenvalues `is_stable_at` reads
+      where those of ``substep().step`` do not tell.
     """
 
     @property
@@ -64,3 +73,9 @@ class Integrator(Protocol):
         ndarray of bool, shape (...)
         """
         ...
+
+
+def bound_to_states(transition: Any, states: Sequence[str] | None) -> Any:
+    """The transition of a system whose states have these names; None if it was given no names."""
+    bind = getattr(transition, "bound_to", None)
+    return transition if bind is None else bind(states)
