@@ -6,7 +6,7 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import figures
+from benchmarks import figures, integrators
 from benchmarks.chains import ChainCost
 from benchmarks.cold import Cold
 from benchmarks.demo import Demo
@@ -23,6 +23,7 @@ KINDS = {
     "steps": Curve,
     "states": Curve,
 }
+ODE = "ode"  # has a file of its own
 # Parts that need no other package.
 OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 
@@ -30,9 +31,21 @@ OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 def write(parts: list[str]) -> str:
     """Write all tables and figures whose parts are stored; return the tables as text."""
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
+    if found := kept.pop("integrators", None):
+        write_integrators(found["rows"])
     own = {part: k for part, k in kept.items() if part in OWN}
-    compared = {part: k for part, k in kept.items() if part not in OWN}
-    return (write_comparison(compared) if compared else "") + (write_own(own) if own else "")
+    ode = {part: k for part, k in kept.items() if part == ODE}
+    compared = {part: k for part, k in kept.items() if part not in OWN and part != ODE}
+    writers = ((write_comparison, compared), (write_own, own), (write_ode, ode))
+    return "".join(write(parts) for write, parts in writers if parts)
+
+
+def write_ode(kept: dict[str, dict]) -> str:
+    """Write the table of an ordinary differential equation."""
+    rows = [Row.of_json(row) for row in kept[ODE]["rows"]]
+    text = machine(kept) + likelihood_tables(rows)
+    (TARGET / "benchmarks_ode.inc").write_text(text)
+    return text
 
 
 def write_comparison(kept: dict[str, dict]) -> str:
@@ -77,6 +90,12 @@ def write_own(kept: dict[str, dict]) -> str:
     text = "\n".join(sections)
     (TARGET / "benchmarks_own.inc").write_text(text)
     return text
+
+
+def write_integrators(rows: list[dict]) -> None:
+    """Write the table of the page on integrators."""
+    text = integrators.table([integrators.Trial(**row) for row in rows])
+    (TARGET / "integrators.inc").write_text(text)
 
 
 def table(head: list[str], lines: list[list[str]]) -> str:
