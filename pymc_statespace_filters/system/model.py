@@ -38,7 +38,7 @@ class StateSpaceModel:
     Parameters
     ----------
     transition : EulerMaruyama, another integrator, or callable
-        An integrator (`EulerMaruyama`, `RungeKutta4`, ...), or ``g(x, q, u, t, ...)`` returning the next state.
+        An integrator, or ``g(x, q, u, t, ...)`` returning the next state.
     observation : callable, optional
         ``h(x, u, t, ...)``, with additive noise of covariance ``observation_noise``, shape (p, p).
         With an argument ``e``, noise of covariance (r, r) enters in any form; densities then use
