@@ -28,6 +28,7 @@ from .evidence import (
     estimate_evidence,
     marginal_modes,
     prior_sensitivity,
+    step_error,
 )
 from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
 from .plots import (
@@ -128,5 +129,6 @@ __all__ = [
     "second_order",
     "simulate",
     "smoothed_states",
+    "step_error",
     "suggest_particles",
 ]

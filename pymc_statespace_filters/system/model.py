@@ -45,6 +45,12 @@ class StateSpaceModel:
         ``D Gamma D^T`` at ``e = 0`` (Eq. 4.4), an approximation.
     observation_noise, process_noise : array_like or callable
         Covariances (not standard deviations), or functions of parameters only that return them.
+    process_dist : callable, optional
+        ``f(x, u, t, ...)`` returning a list of PyMC distributions in place of ``process_noise``:
+        the components of ``q``, drawn at every step given the present state. Vectors such as
+        ``pm.Multinomial.dist`` contribute their components, and variables may be parameters of
+        others. `BootstrapPF` draws from them; `EKF`, `UKF`, `IPLF` and `EnKF` have normal variables
+        of the same means and variances.
     observation_dist : callable, optional
         ``f(x, ...)`` returning one PyMC distribution per observable, independent given ``x``.
     observation_logp : callable, optional
@@ -53,6 +59,9 @@ class StateSpaceModel:
         Length of a step where the transition is a function; default 1.
     initial_mean, initial_cov : array_like or callable
         Mean (n,) and covariance (n, n) of the state at step 0; the covariance may be singular.
+    initial_dist : callable, optional
+        ``f(...)`` returning a list in place of both, one entry per state: a PyMC distribution, a
+        number, or an expression of parameters and of other entries.
     states, observables, inputs : sequence of str, optional
         Names; ``inputs`` fixes the length of ``u``.
     shapes : mapping, optional
@@ -146,6 +155,7 @@ class StateSpaceModel:
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
+            keeps_noises=False,
             equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
@@ -172,6 +182,7 @@ class StateSpaceModel:
     discrete_noise: bool
     gaussian_observation: bool
     observation_uses_inputs: bool
+    keeps_noises: bool
     equations: Equations
 
     def _set(self, **attributes: Any) -> None:
@@ -248,11 +259,19 @@ class StateSpaceModel:
         system._set(**self.__getstate__() | attributes)
         return system
 
-    def with_integrator(self, integrator: Integrator) -> "StateSpaceModel":
-        """The same system with another integrator."""
+    def with_integrator(
+        self, integrator: Integrator, *, keeps_noises: bool = False
+    ) -> "StateSpaceModel":
+        """The same system with another integrator.
+
+        If it ``keeps_noises``, a filter draws every noise, where it would draw the sum of several
+        that act on one state. Two such systems with equally many noises then have the same ones.
+        """
         if self.integrator is None:
             raise ModelError(f"{self!r} must have an integrator, got a transition without one")
-        return StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system = StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system._set(keeps_noises=keeps_noises)
+        return system
 
     @property
     def n_input_columns(self) -> int:

@@ -207,10 +207,15 @@ def trace(
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """The next state, and the same linear in normal variables."""
     values, drawn = symbols.values, symbols.drawn
-    noises = (values["q"],) if drawn is None else (drawn.exact, drawn.surrogate)
+    if drawn is None:
+        noises = [values["q"]]
+    else:  # named for messages about an index that is out of range
+        noises = [vector.copy(name="q") for vector in (drawn.exact, drawn.surrogate)]
     steps = [functions.transition.step({**values, "q": q}) for q in noises]
     linear = getattr(functions.transition, "linear_in_noise", None)
-    return steps[0], steps[-1] if linear is None else linear().step(values)
+    surrogate = steps[-1] if linear is None else linear().step(values)
+    exact, gaussian = (as_vector("transition", step, symbols.n) for step in (steps[0], surrogate))
+    return exact, gaussian
 
 
 @dataclass(frozen=True)
