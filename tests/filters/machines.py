@@ -15,6 +15,7 @@ class Machine:
     def __init__(self, functions, **values):
         self.__dict__ |= {f.__name__: CompiledFunction(f) for f in functions} | values
         self.carried, self.states = (), tuple(f"x{i}" for i in range(self.n))
+        self.n_start, self.gaussian, self.with_gaussian_steps = self.n, self, self
         self.gaussian_observation = self.additive_noise = True
         self.has_exact_observation_density = True
 
