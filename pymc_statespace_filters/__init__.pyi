@@ -46,8 +46,9 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama, RungeKutta4, SemiImplicitEuler
+from .system.integrators import EulerMaruyama, Milstein, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
+from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
 from .system.second_order import second_order
 
@@ -70,6 +71,7 @@ __all__ = [
     "GuidedPF",
     "LoweringError",
     "MaximumLikelihoodEstimate",
+    "Milstein",
     "ModelError",
     "PFEnKF",
     "ParallelError",
@@ -85,12 +87,14 @@ __all__ = [
     "compute_log_likelihood",
     "cubic",
     "estimate_evidence",
+    "euler_multinomial",
     "filter_diagnostics",
     "filtered_states",
     "find_starts",
     "forecast",
     "free_run",
     "freeplay",
+    "gamma_white_noise",
     "hysteresis",
     "hysteresis_branch",
     "leave_future_out",

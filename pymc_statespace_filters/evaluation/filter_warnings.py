@@ -1,4 +1,4 @@
-"""Warnings of failed filters, of terms decided by too few particles, and of equations that jump."""
+"""Warnings of filters: failed, decided by too few particles, or chosen against the equations."""
 
 import warnings
 from collections import Counter
@@ -15,6 +15,7 @@ from pymc_statespace_filters.filters.recommendation import (
     collapse_remedy,
     exact_filter,
     jump_problem,
+    repetition_problem,
     short_form,
 )
 from pymc_statespace_filters.ops.base import evaluator
@@ -65,11 +66,12 @@ def warn_about(
         )
 
 
-def warn_of_jumps(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:
-    """Warn if the filter linearises an equation that jumps as the state moves."""
-    problem = jump_problem(compile_system(system), filter)
-    if problem is not None:
-        warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
+def warn_of_choice(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:
+    """Warn if the filter linearises an equation that jumps, or repeats a run without noise."""
+    compiled = compile_system(system)
+    for problem in (jump_problem(compiled, filter), repetition_problem(compiled, filter)):
+        if problem is not None:
+            warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:

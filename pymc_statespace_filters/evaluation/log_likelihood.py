@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_jumps
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
@@ -74,7 +74,7 @@ def log_likelihood(
     -----
     FilterWarning
         Once, on the first rank, if a filter failed or its particles collapsed; and if it
-        linearises an equation that jumps as the state moves.
+        linearises an equation that jumps as the state moves, or has members that are all the same.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def log_likelihood(
     (2,)
     """
     check_system_and_filter(system, filter)
-    warn_of_jumps(system, filter)
+    warn_of_choice(system, filter)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)

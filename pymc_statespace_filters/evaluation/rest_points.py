@@ -45,7 +45,8 @@ def vector_field(system: StateSpaceModel) -> VectorField:
     theta, x = symbols["theta"], symbols["x"]
     drift = _drift(system, theta, x)
     if drift is None:
-        value = call(system.equations.transition, system, {"theta": theta, "x": x}) - x
+        step = system.with_gaussian_steps.equations.transition
+        value = call(step, system, {"theta": theta, "x": x}) - x
     else:
         value = drift
     start = call(system.equations.initial_mean, system, {"theta": theta})

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_jumps
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.states import FilterRun
@@ -64,8 +64,8 @@ def run_filter(
     Warns
     -----
     FilterWarning
-        If the filter failed or its particles collapsed, or if it linearises an equation that jumps
-        as the state moves.
+        If the filter failed or its particles collapsed, if it linearises an equation that jumps
+        as the state moves, or if its members are all the same.
 
     See Also
     --------
@@ -92,7 +92,7 @@ def run_filter(
     Frozen({'time': 2, 'particle': 500, 'state': 1})
     """
     check_system_and_filter(system, filter)
-    warn_of_jumps(system, filter)
+    warn_of_choice(system, filter)
     check_at(at)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)

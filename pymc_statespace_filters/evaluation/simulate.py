@@ -102,11 +102,12 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
 
     Without ``noise`` the initial state is its mean, every noise is zero, and ``rng`` is not used.
     """
-    compiled, sampler = compile_system(system), _sampler(system, noise)
+    sampler = _sampler(system, noise)
+    compiled = compile_system(system if noise else system.gaussian)
     parts = compiled.prepare, compiled.initialise, compiled.propagate, sampler
     prepare, initialise, propagate, observe = (part.function for part in parts)
     normals = _standard_normals if noise else _zeros
-    dt, n, m, p = system.dt, system.n, compiled.m, system.p
+    dt, n, n_start, m, p = system.dt, system.n, compiled.n_start, compiled.m, system.p
 
     def simulate(rng, theta, steps, inputs, t0):
         c = prepare(theta)
@@ -114,7 +115,7 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
         states = np.empty((n_steps + 1, n))
         observations = np.empty((steps.size, p))
         x = np.empty((n, 1))
-        initialise(c, normals(rng, n), x)
+        initialise(c, normals(rng, n_start), x)
         j = 0
         for k in range(n_steps + 1):
             copy_into(states[k], x[:, 0])
@@ -126,7 +127,7 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
         return states, observations
 
     keys = (part.key for part in parts)
-    cached = _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {m} {p}", *keys))
+    cached = _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {n_start} {m} {p}", *keys))
     # At once and not by the first call, which PyMC makes when its bar is on the screen already.
     vector, matrix, steps = np.zeros(1), np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
     arguments = np.random.default_rng(0), vector, steps, matrix, 0.0
@@ -161,8 +162,9 @@ def simulate(
         Time of step 0.
     noise : bool
         Whether to draw the initial state, process noise and measurement noise. If not, the path
-        starts at the initial mean, and ``q`` and ``e`` are zero. Observations of
-        ``observation_dist`` are then the means of its distributions.
+        starts at the initial mean, and ``q`` and ``e`` are zero. What is drawn from
+        ``process_dist`` and ``observation_dist`` is then the mean of the distribution, given the
+        state and the variables above it.
     random_seed : None, int or numpy.random.Generator
 
     Returns

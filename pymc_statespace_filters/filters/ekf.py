@@ -30,8 +30,10 @@ class EKF(GaussianFilterBase):
 
     The state is approximated as Gaussian between observations, and the equations as linear around
     its mean. The filter is deterministic and has a gradient, so gradient samplers such as NUTS
-    work with it. Where the state has several modes between sparse observations, the likelihood can
-    be wrong by tens of nats; compare with a particle filter before trusting it.
+    work with it. A system without process noise and with a known start (``initial_cov`` zero) is
+    an ordinary differential equation or a map: its likelihood is exact, for any observation, and
+    costs one run of the equations. Where the state has several modes between sparse observations,
+    the likelihood can be wrong by tens of nats; compare with a particle filter before trusting it.
 
     Notes
     -----
@@ -59,7 +61,7 @@ class EKF(GaussianFilterBase):
         return Tangent()
 
     def check(self, system: System) -> None:
-        """Raise if the observation is not Gaussian or a state is carried."""
+        """Raise, unless the system is deterministic, if an update would not be a Kalman update."""
         self._check_gaussian(system)
         self._check_not_carried(system)
 

@@ -10,6 +10,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunc
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import NO_LAG, ancestral_smoother
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
@@ -22,7 +23,7 @@ from pymc_statespace_filters.filters.ensemble.kalman_update import (
     moments_workspace,
 )
 from pymc_statespace_filters.filters.ensemble.loop import Outcome, ensemble_filter, failed
-from pymc_statespace_filters.filters.ensemble.noise import observation_normals
+from pymc_statespace_filters.filters.ensemble.noise import NoiseSizes, observation_normals
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -133,6 +134,10 @@ class EnKF(EnsembleFilterBase):
     The posterior that this filter implies is biased where the state is far from Gaussian, however
     large N.
 
+    With ``process_dist`` members move by normal variables of the means and variances that its
+    distributions have given the state: an update leaves fractions and negative numbers, of which
+    there is no binomial draw. Variances below zero count as zero.
+
     A member with a non-finite state or simulated observation is left out of the moments and is not
     updated. In Eq. 4.26 it counts as zero, and the mean still divides by N.
 
@@ -162,8 +167,22 @@ class EnKF(EnsembleFilterBase):
         return (_LIKELIHOODS.index(self.likelihood),)
 
     def check(self, system: System) -> None:
-        """Raise if observations cannot be simulated."""
+        """Raise if observations cannot be simulated, or a memory would be moved like a number."""
         check_simulated_observations(type(self).__name__, system)
+        if system.carried and not system.model.has_gaussian_steps:
+            raise ModelError(
+                f"EnKF moves members by normal variables in place of process_dist, and so cannot "
+                f"treat the carried states {list(system.carried)}, which may be numbers of "
+                f"regimes; use BootstrapPF"
+            )
+
+    def noise_sizes(self, system: System) -> NoiseSizes:
+        """Return how many normals the filter takes where."""
+        return super().noise_sizes(system.with_gaussian_steps)
+
+    def evaluation(self, system: System) -> CompiledFunction:
+        """Bind the filter to one system, with normal variables in place of ``process_dist``."""
+        return super().evaluation(system.with_gaussian_steps)
 
     def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
         """Compile the ensemble Kalman smoother for one system."""

@@ -136,6 +136,12 @@ class GridFilter:
                 f"GridFilter cannot treat the carried states {list(system.carried)}: a memory has "
                 f"no density"
             )
+        if system.gaussian is not system:
+            raise ModelError(
+                "GridFilter integrates over Gaussian noise and a Gaussian start, got other "
+                "distributions in process_dist or initial_dist; use BootstrapPF, whose mean is "
+                "the exact likelihood"
+            )
         if system.m == 0:
             raise ModelError(
                 "GridFilter needs process noise, which makes the density smooth, and this system "

@@ -16,6 +16,7 @@ from numba import carray
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.bootstrap import update
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
@@ -58,6 +59,7 @@ from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.ensemble.resampling import resampler
 from pymc_statespace_filters.filters.outcomes import NONE, is_missing
+from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.filters.system_table import read_system
 
 
@@ -204,6 +206,15 @@ class GuidedPF(ParticleFilter):
         _run, FILTER_ARGUMENTS, "guided_pf", digest("guided_pf"), needs=(FILL_NORMALS,)
     )
     resample_below: float = 0.5
+
+    def check(self, system: System) -> None:
+        """Raise if the noise or the start has no derivative by a normal, or as `ParticleFilter`."""
+        super().check(system)
+        if system.gaussian is not system:
+            raise ModelError(
+                "GuidedPF moves particles by Gaussian noise and from a Gaussian start, got other "
+                "distributions in process_dist or initial_dist; use BootstrapPF"
+            )
 
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""

@@ -17,7 +17,6 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.conditional_moments import (
-    MOMENTS,
     conditional_moments,
     unknown_moments,
 )
@@ -36,6 +35,7 @@ from pymc_statespace_filters.filters.gaussian.sigma_points import (
 )
 from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.system.checks import check_count
+from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -98,7 +98,7 @@ class IPLF(GaussianFilterBase):
             )
         unknown = unknown_moments(system.model)
         if unknown:
-            names = ", ".join(sorted(kind.__name__.removesuffix("RV") for kind in MOMENTS))
+            names = ", ".join(sorted(map(law_name, SCALAR_LAWS)))
             raise ModelError(
                 f"IPLF needs the mean and variance of an observation, which it knows for {names}; "
                 f"got {', '.join(unknown)}"

@@ -7,6 +7,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     copy_members,
@@ -199,6 +200,15 @@ class PFEnKF(ParticleFilter):
         if not system.gaussian_observation or n_free == 0:
             return "none"
         return density_method(n_free, self.n_particles)
+
+    def check(self, system: System) -> None:
+        """Raise if particles would be moved off whole numbers, or as `ParticleFilter`."""
+        super().check(system)
+        if system.model.discrete_noise and self.algorithm(system) is self:
+            raise ModelError(
+                "PFEnKF moves particles by a Kalman gain, off the whole numbers that process_dist "
+                "draws, got discrete distributions; use BootstrapPF"
+            )
 
     def settings(self) -> tuple[float, ...]:
         """Return the settings of the resampling and the number of the likelihood."""

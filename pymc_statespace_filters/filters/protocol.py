@@ -34,15 +34,17 @@ class System(Protocol):
     the step and ``t`` its time, ``Z`` standard normals with a column for each member (more are
     allowed), ``D`` (p, N) observations, ``M`` (2, N) a mean and a variance for each column.
     ``m`` counts the normals of one step, which may be fewer than ``model.m``: noises with constant
-    gains are merged. ``free`` are the states that an update may move.
+    gains are merged. ``n_start`` counts those of a start. ``free`` are the states that an update
+    may move.
     """
 
     model: Any
     n: int
+    n_start: int
     m: int
     p: int
     r: int
-    n_inputs: int
+    n_inputs: int  # columns of `inputs`, with that of resets if the system has accumulators
     n_theta: int
     n_constants: int
     dt: float
@@ -105,6 +107,14 @@ class System(Protocol):
     @property
     def is_deterministic(self) -> bool:
         """Whether the state is known to be a function of the parameters alone."""
+
+    @property
+    def with_gaussian_steps(self) -> "System":
+        """The system with normal variables in place of others in ``process_dist``."""
+
+    @property
+    def gaussian(self) -> "System":
+        """The same with a Gaussian start; the system itself where all noise is Gaussian."""
 
     @property
     def is_linear(self) -> bool:

@@ -45,9 +45,12 @@ def listed(filters: Iterable[Filter]) -> str:
 
 
 def filters_for(system: System, *, without: Any = None) -> list[Filter]:
-    """The filters of the package that take a system, but not the kind of filter ``without``."""
+    """The filters of the package that take a system, but not the kind of filter ``without``.
+
+    Of a deterministic system the others would repeat what the EKF computes.
+    """
     found = []
-    for filter in FILTERS:
+    for filter in (EKF(),) if system.is_deterministic else FILTERS:
         try:
             filter.check(system)
         except ModelError:
@@ -80,6 +83,17 @@ def alternatives(system: System, filter: Any) -> str:
     kinds = (("exact", exact), ("approximate", others))
     texts = [f"{listed(of_kind)} ({name})" for name, of_kind in kinds if of_kind]
     return f"this system can be treated by {' and by '.join(texts)}"
+
+
+def repetition_problem(system: System, filter: Any) -> str | None:
+    """Say that all members of a noisy filter are the same; None if they are not."""
+    if not (filter.noisy and system.is_deterministic):
+        return None
+    return (
+        f"{short_form(filter)}: this system has a known start and no process noise, so that all "
+        f"members are the same. Use {short_form(EKF())}: one run of the equations, the same "
+        f"log-likelihood, and its gradient."
+    )
 
 
 def jump_problem(system: System, filter: Any) -> str | None:

@@ -13,7 +13,7 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_of_jumps
+from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
@@ -72,7 +72,8 @@ class StateSpace(Continuous):
     Warns
     -----
     FilterWarning
-        If the filter linearises an equation that jumps as the state moves.
+        If the filter linearises an equation that jumps as the state moves, or has members that are
+        all the same.
 
     Examples
     --------
@@ -113,7 +114,7 @@ class StateSpace(Continuous):
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
         check_system_and_filter(system, filter)
-        warn_of_jumps(system, filter)
+        warn_of_choice(system, filter)
         given = {} if params is None else params
         check_names(system, given)
         values = dict(system.defaults) | _model_variables(system, model) | dict(given)

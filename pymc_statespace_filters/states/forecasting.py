@@ -39,7 +39,7 @@ def forecast(
     """Predict states and observations after the last observation, at draws of the posterior.
 
     For each draw, a state at the last observation is drawn and simulated forward with fresh process
-    and observation noise.
+    and observation noise. Accumulators sum from one predicted step to the next.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ def free_run(
         Row k holds during step k; by default those of the model.
     steps : array_like of int, shape (R,), optional
         When to predict an observation, from step 0 of the simulation on; by default the steps of
-        the variable's record.
+        the variable's record. Accumulators sum from one of them to the next.
     times : array_like, shape (R,), optional
         The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
     observed : array_like, shape (R, p) or (R,), optional

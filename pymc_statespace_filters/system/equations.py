@@ -176,7 +176,7 @@ def as_matrix(
 
 
 def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]) -> TensorVariable:
-    shape = _static_shape(symbol)
+    shape = static_shape(symbol)
     if None in shape:
         if None in expected:
             raise ModelError(f"{role} must return arrays of static shape, got shape {shape}")
@@ -187,7 +187,7 @@ def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]
     return symbol if symbol.type.shape == shape else pt.specify_shape(symbol, shape)
 
 
-def _static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
+def static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
     """The static shape, which some operations (pt.roll) do not infer by themselves."""
     if None not in symbol.type.shape:
         return symbol.type.shape

@@ -64,13 +64,18 @@ def _drawn_from(generator: Variable, outputs: Sequence[Variable]) -> Variable | 
 
 def _check_made_before(drawn: Variable, inputs: Sequence[Variable], role: str) -> None:
     """Raise if a random variable was made inside the function that was called with ``inputs``."""
-    if _serial_number(drawn) > min(map(_serial_number, inputs)):
+    if is_made_after(drawn, inputs):
         remedy = f": {_NOISE_OF[role]}" if role in _NOISE_OF else ""
         name = getattr(drawn.owner.op, "name", None) or drawn
         raise ModelError(
             f"{role} must be a deterministic function of its arguments, got the random variable "
             f"{name}, made inside it{remedy}"
         )
+
+
+def is_made_after(variable: Variable, inputs: Sequence[Variable]) -> bool:
+    """Whether a variable is younger than the first of the inputs, whose function made it then."""
+    return _serial_number(variable) > min(map(_serial_number, inputs))
 
 
 def _serial_number(variable: Variable) -> int:

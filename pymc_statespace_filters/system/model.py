@@ -1,7 +1,7 @@
 """The system: a user's functions, traced once and checked; immutable."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -93,9 +93,11 @@ class StateSpaceModel:
         observation_dist: Callable | None = None,
         observation_logp: Callable | None = None,
         process_noise: Any = None,
+        process_dist: Callable | None = None,
         dt: float | None = None,
-        initial_mean: Any,
-        initial_cov: Any,
+        initial_mean: Any = None,
+        initial_cov: Any = None,
+        initial_dist: Callable | None = None,
         states: Sequence[str] | None = None,
         observables: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
@@ -110,9 +112,11 @@ class StateSpaceModel:
             "observation_dist": observation_dist,
             "observation_logp": observation_logp,
             "process_noise": process_noise,
+            "process_dist": process_dist,
             "dt": dt,
             "initial_mean": initial_mean,
             "initial_cov": initial_cov,
+            "initial_dist": initial_dist,
         }
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs)
@@ -139,6 +143,7 @@ class StateSpaceModel:
             carried=names_of_states("carried", carried, state_names),
             accumulators=totals,
             additive_noise=seen.additive,
+            discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
             equations=equations,
@@ -164,6 +169,7 @@ class StateSpaceModel:
     carried: tuple[str, ...]
     accumulators: tuple[str, ...]
     additive_noise: bool
+    discrete_noise: bool
     gaussian_observation: bool
     observation_uses_inputs: bool
     equations: Equations
@@ -203,6 +209,44 @@ class StateSpaceModel:
         """
         transition = self.__dict__.get("_arguments", {}).get("transition")
         return transition if isinstance(transition, Integrator) else None
+
+    @property
+    def has_gaussian_steps(self) -> bool:
+        """Whether a step is a function of Gaussian noise: no distribution is another one."""
+        return self.equations.gaussian_transition is None
+
+    @property
+    def has_gaussian_start(self) -> bool:
+        """Whether the state at step 0 is Gaussian."""
+        return self.equations.initial_draw is None
+
+    @cached_property
+    def with_gaussian_steps(self) -> "StateSpaceModel":
+        """The system with normal variables of the same means and variances in ``process_dist``.
+
+        Itself where they are normal. Variances are those given the state and the variables above.
+        """
+        transition = self.equations.gaussian_transition
+        if transition is None:
+            return self
+        steps = {"transition": transition, "gaussian_transition": None}
+        return self._with_equations(steps)._with(discrete_noise=False)
+
+    @cached_property
+    def gaussian(self) -> "StateSpaceModel":
+        """The system `with_gaussian_steps` and with a Gaussian start of the same moments."""
+        system = self.with_gaussian_steps
+        if system.has_gaussian_start:
+            return system
+        return system._with_equations({"initial_draw": None})
+
+    def _with_equations(self, equations: Mapping[str, Any]) -> "StateSpaceModel":
+        return self._with(equations=replace(self.equations, **equations))
+
+    def _with(self, **attributes: Any) -> "StateSpaceModel":
+        system = object.__new__(StateSpaceModel)
+        system._set(**self.__getstate__() | attributes)
+        return system
 
     def with_integrator(self, integrator: Integrator) -> "StateSpaceModel":
         """The same system with another integrator."""

@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
@@ -32,7 +32,9 @@ from pymc_statespace_filters.system.observation import (
     TracedObservation,
     read_observation,
 )
+from pymc_statespace_filters.system.random_variables import Drawn, trace_distributions
 from pymc_statespace_filters.system.signature import Signature, parameter_symbols, size_of
+from pymc_statespace_filters.system.start import Start, check_start, read_initial_mean, trace_start
 
 Values = Mapping[str, TensorVariable]
 
@@ -44,15 +46,20 @@ class Functions:
     transition: "Integrator | FunctionTransition"
     observation: GaussianObservation | DensityObservation
     process_noise: Any
+    process_dist: Equation | None
     initial_mean: Any
     initial_cov: Any
+    initial_dist: Equation | None
 
     @property
     def equations(self) -> list[Equation]:
         """The user's functions, in the order in which their parameters are listed."""
-        others = (self.process_noise, self.initial_mean, self.initial_cov)
-        covariances = [other for other in others if isinstance(other, Equation)]
-        return [*self.transition.equations, *self.observation.equations, *covariances]
+        others = (
+            self.process_noise, self.process_dist, self.initial_mean, self.initial_cov,
+            self.initial_dist,
+        )  # fmt: skip
+        found = [other for other in others if isinstance(other, Equation)]
+        return [*self.transition.equations, *self.observation.equations, *found]
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,8 @@ class Symbols:
     theta: TensorVariable
     values: Values
     input_row: TensorVariable
-    initial_mean: TensorVariable
+    drawn: Drawn | None
+    start: Start
 
     @property
     def n(self) -> int:
@@ -82,10 +90,14 @@ class Symbols:
 class Equations:
     """The traced functions of a system, frozen graphs of theta, x, q, u, t, e and d.
 
-    ``process_noise`` is None for an integrator, whose noises are standard normals.
+    ``process_noise`` is None where ``q`` holds standard normals: for an integrator and for
+    ``process_dist``, whose distributions are part of the transition. If these are not normal,
+    ``gaussian_transition`` is the transition with normal variables of their means and variances.
+    ``initial_draw``, of theta and normals, is that of a start that is not Gaussian.
     """
 
     transition: FrozenFunctionGraph
+    gaussian_transition: FrozenFunctionGraph | None
     process_noise: FrozenFunctionGraph | None
     observation: FrozenFunctionGraph | None
     observation_noise: FrozenFunctionGraph | None
@@ -93,12 +105,14 @@ class Equations:
     observation_draw: FrozenFunctionGraph | None
     initial_mean: FrozenFunctionGraph
     initial_cov: FrozenFunctionGraph
+    initial_draw: FrozenFunctionGraph | None
 
 
 def read(
     *,
     transition: Any,
     process_noise: Any,
+    process_dist: Callable | None,
     dt: float | None,
     observation: Callable | None,
     observation_noise: Any,
@@ -106,14 +120,18 @@ def read(
     observation_logp: Callable | None,
     initial_mean: Any,
     initial_cov: Any,
+    initial_dist: Callable | None,
 ) -> Functions:
     """Check the functions of a system one by one; nothing is called."""
+    check_start(initial_mean, initial_cov, initial_dist)
     return Functions(
-        _read_transition(transition, process_noise, dt),
+        _read_transition(transition, process_noise, process_dist, dt),
         read_observation(observation, observation_noise, observation_dist, observation_logp),
         read_covariance("process_noise", process_noise),
-        _read_initial_mean(initial_mean),
+        None if process_dist is None else read_equation("process_dist", process_dist, "xut"),
+        None if initial_mean is None else read_initial_mean(initial_mean),
         read_covariance("initial_cov", initial_cov),
+        None if initial_dist is None else read_equation("initial_dist", initial_dist, ""),
     )
 
 
@@ -122,11 +140,8 @@ def size(functions: Functions, signature: Signature, has_accumulators: bool = Fa
     n_theta = sum(map(size_of, signature.shapes))
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
     values = parameter_symbols(theta, signature.parameters, signature.shapes)
-    mean = functions.initial_mean
-    m0 = as_vector("initial_mean", mean(values) if isinstance(mean, Equation) else mean)
-    n = m0.type.shape[0]
-    if n == 0:
-        raise ModelError("initial_mean must have an entry for at least one state, got none")
+    start = trace_start(functions.initial_mean, functions.initial_dist, values, theta)
+    n = start.mean.type.shape[0]
     n_inputs = len(signature.inputs)
     u = pt.tensor("u", shape=(n_inputs + has_accumulators,), dtype="float64")
     values |= {
@@ -134,8 +149,13 @@ def size(functions: Functions, signature: Signature, has_accumulators: bool = Fa
         "u": u[:n_inputs] if has_accumulators else u,
         "t": pt.tensor("t", shape=(), dtype="float64"),
     }
-    m = _noise_size(functions, values)
-    return Symbols(theta, values | {"q": pt.tensor("q", shape=(m,), dtype="float64")}, u, m0)
+    drawn = None
+    if functions.process_dist is not None:
+        drawn = trace_distributions(functions.process_dist, values, theta, "q")
+        noise = drawn.normals
+    else:
+        noise = pt.tensor("q", shape=(_noise_size(functions, values),), dtype="float64")
+    return Symbols(theta, values | {"q": noise}, u, drawn, start)
 
 
 def trace(
@@ -153,27 +173,43 @@ def trace(
     seen = functions.observation.trace(values, n_observables)
     noise = functions.process_noise
     process_noise = None if noise is None else trace_covariance("process_noise", noise, m, values)
-    initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
-    begin = {**values, "x": reset(values["x"], symbols.input_row, accumulators)}
-    transition = as_vector("transition", functions.transition.step(begin), n)
+    start, theta = symbols.start, symbols.theta
+    initial_cov = start.cov
+    if functions.initial_dist is None:
+        initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
     x, q, t = (values[name] for name in "xqt")
-    inputs = [symbols.theta, x, q, symbols.input_row, t, seen.noise, seen.datum]
+    inputs = [theta, x, q, symbols.input_row, t, seen.noise, seen.datum]
 
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
 
+    begin = reset(x, symbols.input_row, accumulators)
+    transition, gaussian_transition = (
+        freeze(inputs, graph_replace([step], {x: begin}, strict=False), "transition")
+        for step in _steps(functions, symbols)
+    )
     density = "observation_logp" if seen.draw is None else "observation_dist"
     equations = Equations(
-        transition=freeze(inputs, [transition], "transition"),
+        transition=transition,
+        gaussian_transition=None if gaussian_transition == transition else gaussian_transition,
         process_noise=frozen("process_noise", process_noise),
         observation=frozen("observation", seen.observation),
         observation_noise=frozen("observation_noise", seen.covariance),
         observation_logp=frozen(density, seen.logp),
         observation_draw=seen.freeze_draw(inputs),
-        initial_mean=freeze(inputs, [symbols.initial_mean], "initial_mean"),
+        initial_mean=freeze(inputs, [start.mean], "initial_mean"),
         initial_cov=freeze(inputs, [initial_cov], "initial_cov"),
+        initial_draw=start.freeze_draw(theta),
     )
     return equations, seen
+
+
+def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
+    """The next state, and the same with normal variables."""
+    values, drawn = symbols.values, symbols.drawn
+    noises = (values["q"],) if drawn is None else (drawn.exact, drawn.surrogate)
+    steps = [functions.transition.step({**values, "q": q}) for q in noises]
+    return steps[0], steps[-1]
 
 
 @dataclass(frozen=True)
@@ -192,7 +228,8 @@ class FunctionTransition:
         """Number of process noises without a covariance of them: none."""
         if "q" in self.equation.symbols:
             raise ModelError(
-                "process_noise must be the covariance of q, an argument of transition, got None"
+                "process_noise must be the covariance of q, an argument of transition, or "
+                "process_dist its distributions, got None"
             )
         return 0
 
@@ -202,9 +239,19 @@ class FunctionTransition:
 
 
 def _read_transition(
-    transition: Any, process_noise: Any, dt: float | None
+    transition: Any, process_noise: Any, process_dist: Any, dt: float | None
 ) -> Integrator | FunctionTransition:
+    if process_noise is not None and process_dist is not None:
+        raise ModelError(
+            "give process_noise or process_dist, got both; Gaussian noise beside other noise is "
+            "pm.Normal.dist(0, sd) in the list of process_dist"
+        )
     if isinstance(transition, Integrator):
+        if process_dist is not None:
+            raise ModelError(
+                "process_dist must be None beside an integrator, whose noise is its diffusion; "
+                "write the step as a function, transition=lambda x, q: [x[0] + dt * drift + q[0]]"
+            )
         if process_noise is not None:
             raise ModelError(
                 "process_noise must be None beside an integrator, which has a diffusion, "
@@ -227,21 +274,12 @@ def _read_transition(
             "process_noise must be None where transition does not have the argument q, "
             f"got {process_noise!r}"
         )
-    return FunctionTransition(equation, check_positive("dt", 1.0 if dt is None else dt))
-
-
-def _read_initial_mean(value: Any) -> Any:
-    if callable(value):
-        return read_equation("initial_mean", value, "")
-    try:
-        mean = np.array(value, dtype="float64")
-    except (TypeError, ValueError):
-        raise ModelError(f"initial_mean must be numbers or a function, got {value!r}") from None
-    if mean.ndim > 1 or not np.isfinite(mean).all():
+    if process_dist is not None and "q" not in equation.symbols:
         raise ModelError(
-            f"initial_mean must be a finite vector, one entry per state, got {value!r}"
+            "process_dist must be None where transition does not have the argument q, "
+            f"got {process_dist!r}"
         )
-    return np.atleast_1d(mean)
+    return FunctionTransition(equation, check_positive("dt", 1.0 if dt is None else dt))
 
 
 def _noise_size(functions: Functions, values: Values) -> int:

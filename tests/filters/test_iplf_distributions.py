@@ -11,11 +11,9 @@ from scipy.integrate import quad
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.conditional_moments import (
-    MOMENTS,
-    conditional_moments,
-)
+from pymc_statespace_filters.compiler.lowering.conditional_moments import conditional_moments
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
+from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 
 
 def observed_by(*distributions):
@@ -37,10 +35,13 @@ TABLE = {
     ),
     "Beta": (lambda x: pm.Beta.dist(alpha=x, beta=2.0), stats.beta(0.7, 2.0)),
     "Binomial": (lambda x: pm.Binomial.dist(n=9, p=x), stats.binom(9, 0.7)),
+    "DiscreteUniform": (lambda x: pm.DiscreteUniform.dist(x - 0.7, 8), stats.randint(0, 9)),
     "Exponential": (lambda x: pm.Exponential.dist(lam=x), stats.expon(scale=1 / 0.7)),
     "Gamma": (lambda x: pm.Gamma.dist(alpha=2.0, beta=x), stats.gamma(2.0, scale=1 / 0.7)),
     "Geometric": (lambda x: pm.Geometric.dist(p=x), stats.geom(0.7)),
-    "InvGamma": (
+    "Gumbel": (lambda x: pm.Gumbel.dist(mu=x, beta=2.0), stats.gumbel_r(0.7, 2.0)),
+    "HalfNormal": (lambda x: pm.HalfNormal.dist(sigma=x), stats.halfnorm(scale=0.7)),
+    "InverseGamma": (
         lambda x: pm.InverseGamma.dist(alpha=3.0, beta=x),
         stats.invgamma(3.0, scale=0.7),
     ),
@@ -50,7 +51,7 @@ TABLE = {
         stats.lognorm(0.4, scale=np.exp(0.7)),
     ),
     "Logistic": (lambda x: pm.Logistic.dist(mu=x, s=2.0), stats.logistic(0.7, 2.0)),
-    "NegBinomial": (
+    "NegativeBinomial": (
         lambda x: pm.NegativeBinomial.dist(mu=x, alpha=3.0),
         stats.nbinom(3.0, 3.0 / 3.7),
     ),
@@ -60,11 +61,16 @@ TABLE = {
         lambda x: pm.StudentT.dist(nu=5.0, mu=x, sigma=2.0),
         stats.t(5.0, loc=0.7, scale=2.0),
     ),
+    "Uniform": (lambda x: pm.Uniform.dist(-1.0, x), stats.uniform(-1.0, 1.7)),
+    "Weibull": (
+        lambda x: pm.Weibull.dist(alpha=1.5, beta=x),
+        stats.weibull_min(1.5, scale=0.7),
+    ),
 }
 
 
 def test_every_distribution_of_the_table_is_tested():
-    assert sorted(TABLE) == sorted(kind.__name__.removesuffix("RV") for kind in MOMENTS)
+    assert sorted(TABLE) == sorted(map(law_name, SCALAR_LAWS))
 
 
 def test_means_and_variances_are_those_of_scipy():

@@ -51,7 +51,7 @@ def solve_triangular(arena: Arena, node: Apply, arguments: list[np.ndarray]) -> 
 def _substitute(
     arena: Arena, a: np.ndarray, b: np.ndarray, *, lower: bool, unit_diagonal: bool = False
 ) -> np.ndarray:
-    n, columns = a.shape[0], b.reshape(a.shape[0], -1)
+    n, columns = a.shape[0], b if b.ndim == 2 else b[:, None]
     order = range(n) if lower else range(n - 1, -1, -1)
     out = np.full(columns.shape, 0.0, dtype=object)
     for c in range(columns.shape[1]):

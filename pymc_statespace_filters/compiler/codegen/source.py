@@ -28,17 +28,32 @@ from pymc_statespace_filters.compiler.numerics import (
     intrinsics,
     trigonometric,
 )
+from pymc_statespace_filters.compiler.numerics.quantiles.binomial import (
+    bernoulli_quantile,
+    binomial_quantile,
+)
+from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_quantile
+from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
+from pymc_statespace_filters.compiler.numerics.quantiles.poisson import poisson_quantile
 
 _NUMPY = (
     "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sqrt", "sin", "cos", "tan", "arcsin",
     "arccos", "arctan", "arctan2", "sinh", "cosh", "tanh", "floor", "ceil", "trunc", "rint",
 )  # fmt: skip
 
+QUANTILES = {
+    function.py_func.__name__: function
+    for function in (
+        poisson_quantile, binomial_quantile, bernoulli_quantile, gamma_quantile, normal_probability,
+    )
+}  # fmt: skip
+"""By the names that operations have as ``machine_code``."""
+
 # For single numbers, where the tables of the system's library are faster.
 SCALAR_NAMESPACE = {
     "np": np, "inf": np.inf, "nan": np.nan, "power": operator.pow,
     "floor_divide": operator.floordiv, "modulo": operator.mod,
-    **{name: getattr(np, name) for name in _NUMPY},
+    **{name: getattr(np, name) for name in _NUMPY}, **QUANTILES,
 }  # fmt: skip
 
 _VECTORIZABLE = (
@@ -136,6 +151,8 @@ class Writer:
             return f"{_CALLS[kind]}({', '.join(floats)})"
         if kind in _TEMPLATES:
             return _TEMPLATES[kind].format(*names)
+        if hasattr(op, "machine_code"):
+            return f"{op.machine_code}({', '.join(self.as_float(a) for a in args)})"
         if isinstance(op, ps.Cast):
             return _cast(names[0], kind_of(args[0]), expression.kind)
         if isinstance(op, ps.AND | ps.OR | ps.XOR | ps.Invert):

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.lowering import structure
+from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
@@ -30,6 +30,8 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
 from pymc_statespace_filters.system.model import StateSpaceModel
+
+quantiles.register()
 
 
 @lru_cache(maxsize=256)
@@ -72,10 +74,10 @@ class CompiledSystem:
     ----------
     model : StateSpaceModel
         What the user wrote, for filters that work on its graphs.
-    n, m, p, r, n_inputs, n_theta, n_constants : int
-        Numbers of states, of normals that one step of a member takes (see `merged_noise`), of
-        observables, of measurement noises, of columns
-        of inputs, of parameters, and the length of ``c``.
+    n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
+        Numbers of states, of normals that a member takes at the start and in one step (see
+        `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
+        and the length of ``c``.
     dt : float
         Length of a step.
     free : ndarray of int
@@ -91,6 +93,8 @@ class CompiledSystem:
         self.additive_noise = bool(model.additive_noise)
         carried = [self.states.index(name) for name in self.carried]
         self.free = np.setdiff1d(np.arange(self.n), carried)
+        draw = model.equations.initial_draw
+        self.n_start = model.n if draw is None else draw.inputs[1].type.shape[0]
         self._merged_noise = structure.merged_noise(model)
         self.m = model.m if self._merged_noise is None else model.n
         self._covariances = covariances(model, self._merged_noise)
@@ -115,8 +119,12 @@ class CompiledSystem:
     @cached_property
     def initialise(self) -> CompiledFunction:
         """Draw the state at step 0."""
-        z, mean = _normals(self.n), self._c[self.n_theta : self.n_theta + self.n]
-        state = mean + self._square_roots["initial_cov"] @ z
+        z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
+        draw = self.model.equations.initial_draw
+        if draw is None:
+            state = mean + self._square_roots["initial_cov"] @ z
+        else:
+            (state,) = draw.bind([self._symbols["theta"], z])
         return self._member_function("initialise", "c, Z, X", state, "X[{i}, member]", z=z)
 
     @cached_property
@@ -230,6 +238,16 @@ class CompiledSystem:
     def is_deterministic(self) -> bool:
         """Whether the state is a function of the parameters: no noise, and a known start."""
         return structure.is_deterministic(self.model)
+
+    @cached_property
+    def with_gaussian_steps(self) -> "CompiledSystem":
+        """The system with normal variables in place of others in ``process_dist``."""
+        return compile_system(self.model.with_gaussian_steps)
+
+    @cached_property
+    def gaussian(self) -> "CompiledSystem":
+        """The same with a Gaussian start."""
+        return compile_system(self.model.gaussian)
 
     @cached_property
     def is_linear(self) -> bool:

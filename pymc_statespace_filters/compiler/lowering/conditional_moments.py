@@ -1,11 +1,9 @@
 """Mean and covariance of an observation given the state, of a function or of distributions."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
-import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor as pt
-import pytensor.tensor.random.basic as ptr
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.variable import TensorVariable
 
@@ -14,55 +12,8 @@ from pymc_statespace_filters.compiler.lowering.symbols import (
     observation_moments,
     symbols_of,
 )
+from pymc_statespace_filters.system.distributions import SCALAR_LAWS, parameters_of
 from pymc_statespace_filters.system.model import StateSpaceModel
-
-
-def _negative_binomial(n, p):
-    return n * (1 - p) / p, n * (1 - p) / p**2
-
-
-def _beta_binomial(n, a, b):
-    p, total = a / (a + b), a + b
-    return n * p, n * p * (1 - p) * (total + n) / (total + 1)
-
-
-def _beta(a, b):
-    total = a + b
-    return a / total, a * b / (total**2 * (total + 1))
-
-
-def _student_t(nu, mu, sigma):
-    return mu, pt.switch(nu > 2, sigma**2 * nu / (nu - 2), float("nan"))
-
-
-def _inverse_gamma(a, b):
-    mean = b / (a - 1)
-    return mean, pt.switch(a > 2, mean**2 / (a - 2), float("nan"))
-
-
-def _log_normal(mu, sigma):
-    mean = pt.exp(mu + 0.5 * sigma**2)
-    return mean, mean**2 * pt.expm1(sigma**2)
-
-
-# Mean and variance by the parameters that PyMC's `dist` gives PyTensor's random variables.
-MOMENTS: dict[type, Callable] = {
-    ptr.BernoulliRV: lambda p: (p, p * (1 - p)),
-    ptr.BetaBinomialRV: _beta_binomial,
-    ptr.BetaRV: _beta,
-    ptr.BinomialRV: lambda n, p: (n * p, n * p * (1 - p)),
-    ptr.ExponentialRV: lambda mean: (mean, mean**2),
-    ptr.GammaRV: lambda shape, scale: (shape * scale, shape * scale**2),
-    ptr.GeometricRV: lambda p: (1 / p, (1 - p) / p**2),
-    ptr.InvGammaRV: _inverse_gamma,
-    ptr.LaplaceRV: lambda mu, b: (mu, 2 * b**2),
-    ptr.LogNormalRV: _log_normal,
-    ptr.LogisticRV: lambda mu, s: (mu, np.pi**2 / 3 * s**2),
-    ptr.NegBinomialRV: _negative_binomial,
-    ptr.NormalRV: lambda mu, sigma: (mu, sigma**2),
-    ptr.PoissonRV: lambda mu: (mu, mu),
-    ptr.StudentTRV: _student_t,
-}
 
 
 def conditional_moments(
@@ -78,13 +29,13 @@ def conditional_moments(
 def unknown_moments(system: StateSpaceModel) -> list[str]:
     """Distributions of the observables whose moments are not in the table, by name."""
     variables = _distributions(system, symbols_of(system))
-    return [str(v.owner.op) for v in variables if type(v.owner.op) not in MOMENTS]
+    return [str(v.owner.op) for v in variables if type(v.owner.op) not in SCALAR_LAWS]
 
 
 def _moments_of(variable: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
     op = variable.owner.op
-    parameters = [pt.cast(v, "float64") for v in op.dist_params(variable.owner)]
-    mean, variance = MOMENTS[type(op)](*parameters)
+    parameters = [pt.cast(v, "float64") for v in parameters_of(variable.owner)]
+    mean, variance = SCALAR_LAWS[type(op)].moments(*parameters)
     return pt.as_tensor(mean), pt.as_tensor(variance)
 
 

@@ -26,6 +26,8 @@ def covariances(
 ) -> dict[str, FrozenFunctionGraph]:
     """Covariances whose square roots colour the noise; an integrator's noise is white."""
     graphs = dict(vars(system.equations))
+    if not system.has_gaussian_start:
+        graphs["initial_cov"] = None
     if merged_noise is not None:
         graphs["process_noise"] = merged_noise
     names = ("initial_cov", "process_noise", "observation_noise")
@@ -45,6 +47,7 @@ def followed_by_square_roots(
     length, sizes = graph.outputs[0].type.shape[0], tuple(cov.type.shape[0] for cov in covs)
     moments, first = flat.function, length - sum(size**2 for size in sizes)
     copy = copy_elements("values, c", "c[{i}]", "values", length)
+    roots = np.array(sizes, dtype=np.int64)  # numba cannot loop over an empty tuple
     SQUARE_ROOT.compile()
     take_root = SQUARE_ROOT.external
 
@@ -52,7 +55,7 @@ def followed_by_square_roots(
         c = np.empty(length)
         copy(moments(theta), c)
         start = first
-        for size in sizes:
+        for size in roots:
             take_root(c[start:].ctypes.data, size)
             start += size * size
         return c

@@ -33,7 +33,9 @@ def entry_point(system: Any, name: str) -> EntryPoint:
     """A function of a compiled system by its name, not compiled yet."""
     if name in ("follow", "look_back", "start_back"):
         return _of_guide(system, name)
-    sizes = (system.n, system.m, system.p, system.r, system.n_inputs, system.n_constants)
+    sizes = (
+        system.n, system.n_start, system.m, system.p, system.r, system.n_inputs, system.n_constants
+    )  # fmt: skip
     function = getattr(system, name)
     arguments = PREPARE_ARGUMENTS if name == "prepare" else MEMBER_ARGUMENTS
     key = key_of(repr((name, sizes)), function.key)
@@ -41,7 +43,15 @@ def entry_point(system: Any, name: str) -> EntryPoint:
 
 
 def _with_addresses(
-    function: Any, name: str, n: int, m: int, p: int, r: int, n_inputs: int, n_constants: int
+    function: Any,
+    name: str,
+    n: int,
+    n_start: int,
+    m: int,
+    p: int,
+    r: int,
+    n_inputs: int,
+    n_constants: int,
 ) -> Callable:
     """The function with addresses in place of arrays, whose shapes it knows."""
 
@@ -51,7 +61,7 @@ def _with_addresses(
             out[i] = values[i]
 
     def initialise(c, inputs, k, t, z, width, X, out, n_members):
-        members, Z = carray(X, (n, n_members)), carray(z, (n, width))
+        members, Z = carray(X, (n, n_members)), carray(z, (n_start, width))
         function(carray(c, (n_constants,)), Z, members)
 
     def propagate(c, inputs, k, t, z, width, X, out, n_members):

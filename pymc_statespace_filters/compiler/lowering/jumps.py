@@ -42,8 +42,10 @@ type Evaluate = Callable[[float], tuple[np.ndarray, tuple]]
 def jumping_equations(system: StateSpaceModel) -> tuple[str, ...]:
     """Those of "transition" and "observation" that jump in the state; none where undecided.
 
-    Carried states are left out: they are a memory that jumps, and no filter linearises them.
+    Carried states are left out: they are a memory that jumps, and no filter linearises them. Noise
+    of any distribution counts by its mean and variance, as in the filters that linearise.
     """
+    system = system.gaussian
     symbols = symbols_of(system)
     free = [i for i, name in enumerate(system.states) if name not in system.carried]
     states = frozenset(f"x.{i}" for i in free)

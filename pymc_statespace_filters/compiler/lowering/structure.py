@@ -6,6 +6,8 @@ import numpy as np
 import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
+from pymc.pytensorf import constant_fold
+from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
@@ -37,7 +39,7 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
     The sum of independent noises on one state, ``[[0.6, sigma_m]]``, has the distribution of a
     single noise, and drawing normals is most of the cost of an ensemble.
     """
-    if system.m <= system.n:
+    if system.m <= system.n or not system.has_gaussian_steps:
         return None
     symbols = symbols_of(system)
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])
@@ -52,17 +54,23 @@ def is_deterministic(system: StateSpaceModel) -> bool:
 
     False where that cannot be decided.
     """
-    symbols = symbols_of(system)
+    symbols, noise_cov = symbols_of(system), system.equations.process_noise
+    if not system.has_gaussian_start:
+        return False
     if not _is_zero(call(system.equations.initial_cov, system, symbols), symbols):
         return False
-    return system.m == 0 or _is_zero(transition_moments(system, symbols)[1], symbols)
+    if system.m == 0 or is_free_of(
+        ("q",), call(system.equations.transition, system, symbols), symbols
+    ):
+        return True
+    return noise_cov is not None and _is_zero(call(noise_cov, system, symbols), symbols)
 
 
 def is_linear(system: StateSpaceModel) -> bool:
-    """Whether state and noise enter the transition and the observation linearly."""
+    """Whether state and noise, which is Gaussian, enter transition and observation linearly."""
     symbols = symbols_of(system)
     equations, variables = system.equations, ("x", "q", "e")
-    if equations.observation is None:
+    if equations.observation is None or system.gaussian is not system:
         return False
     jacobians = [
         jacobian_of(call(graph, system, symbols), symbols[name])
@@ -73,7 +81,12 @@ def is_linear(system: StateSpaceModel) -> bool:
 
 
 def has_additive_process_noise(system: StateSpaceModel) -> bool:
-    """Whether g(x, q) = g(x, 0) + G(x) q; False where that cannot be decided."""
+    """Whether g(x, q) = g(x, 0) + G(x) q; False where that cannot be decided.
+
+    False too where ``process_dist`` draws what is not normal.
+    """
+    if not system.has_gaussian_steps:
+        return False
     symbols = symbols_of(system)
     transition = call(system.equations.transition, system, symbols)
     return is_free_of(("q",), jacobian_of(transition, symbols["q"]), symbols)
@@ -81,6 +94,8 @@ def has_additive_process_noise(system: StateSpaceModel) -> bool:
 
 def has_smooth_transition(system: StateSpaceModel) -> bool:
     """Whether no part of the transition has a kink or a jump; False where undecided."""
+    if not system.has_gaussian_steps:
+        return False
     symbols = symbols_of(system)
     return _is_smooth(call(system.equations.transition, system, symbols), symbols)
 
@@ -136,6 +151,9 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
 
 def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
     """Whether every element is zero whatever the symbols; False where that cannot be decided."""
+    (folded,) = constant_fold([matrix], raise_not_constant=False)
+    if not isinstance(folded, Variable):
+        return not np.any(folded)
     try:
         (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
     except NotUnrollableError:

@@ -66,13 +66,16 @@ class _LinkedLibrary(JITCodeLibrary):
         self._finalized = True
 
     def _callees(self) -> dict[Any, None]:
-        """All libraries that the function needs, in the order of linking."""
+        """All libraries that the function needs, in the order of linking.
+
+        A library comes after all that call it: LLVM does not link what nothing refers to yet.
+        """
         found: dict[Any, None] = {}
         for library in self._linking_libraries:
-            if library not in found:
-                found[library] = None
-                if isinstance(library, _LinkedLibrary):
-                    found |= library._callees()
+            below = library._callees() if isinstance(library, _LinkedLibrary) else {}
+            for each in (library, *below):
+                found.pop(each, None)
+                found[each] = None
         return found
 
     def _link(self, module: Any, libraries: Iterable[Any]) -> None:

@@ -107,7 +107,7 @@ class EnsembleFilterBase:
         """Return how many normals the filter takes where."""
         simulated = system.r if self.simulates else 0
         resampling = self.resampling_normals()
-        return NoiseSizes(padded(self.size()), system.n, system.m, simulated, resampling)
+        return NoiseSizes(padded(self.size()), system.n_start, system.m, simulated, resampling)
 
     def n_normals(self, system: System, n_steps: Any, n_observations: Any) -> Any:
         """Return how many normals an evaluation stores: a number, or an expression of symbols."""

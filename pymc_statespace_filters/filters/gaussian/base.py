@@ -84,7 +84,7 @@ class GaussianFilterBase:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
             return deterministic.compile_states(self._functions(system))
-        return compile_states(_forward_pass(self.linearization, system.model), moment)
+        return compile_states(_forward_pass(self.linearization, system.model.gaussian), moment)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
@@ -98,8 +98,8 @@ class GaussianFilterBase:
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         if system.is_deterministic:
-            return deterministic.filter_functions(system.model)
-        return _functions(self.linearization, system.model)
+            return deterministic.filter_functions(system.model.gaussian)
+        return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
         """Raise if the observation of an uncertain state is not Gaussian."""

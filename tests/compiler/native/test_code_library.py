@@ -84,6 +84,33 @@ def test_what_only_compiled_functions_call_has_no_machine_code():
             function(0.3)
 
 
+def test_what_is_inlined_twice_over_is_linked():
+    """`inner` comes by way of `beside` before it comes by way of `middle`, which needs it."""
+
+    @inlined
+    def inner(x):
+        return math.sin(x)
+
+    @njit_internal
+    def beside(x):
+        return inner(x)
+
+    @inlined
+    def middle(x):
+        return inner(x) + 1.0
+
+    @njit_internal
+    def outer(x):
+        return beside(x) + middle(x)
+
+    @njit_internal
+    def outermost(x):
+        return inner(x) + outer(x)
+
+    called = njit(lambda x: outermost(x))
+    assert abs(called(0.3) - 3.0 * math.sin(0.3) - 1.0) < 1e-12
+
+
 def test_a_function_is_optimised_once_however_many_call_it(monkeypatch):
     optimised = []
     optimise = code_library.JITCodeLibrary._optimize_final_module

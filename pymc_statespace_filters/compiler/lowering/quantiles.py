@@ -1,0 +1,30 @@
+"""Quantile operations in graphs that PyTensor compiles itself, to numba."""
+
+from typing import Any
+
+from pytensor.link.numba.dispatch.basic import register_funcify_and_cache_key
+
+from pymc_statespace_filters.compiler.codegen.source import QUANTILES
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.jit import njit_callable
+from pymc_statespace_filters.system.quantiles import NoDerivative, Quantile
+
+
+def register() -> None:
+    """Tell PyTensor's numba backend what the operations are in machine code."""
+    register_funcify_and_cache_key(Quantile)(_machine_code)
+    register_funcify_and_cache_key(NoDerivative)(_refuse)
+
+
+def _machine_code(op: Quantile, node: Any = None, **_: Any) -> tuple:
+    function = QUANTILES[op.machine_code]
+
+    @njit_callable
+    def quantile(*arguments):
+        return function(*arguments)
+
+    return quantile, digest(op.machine_code)
+
+
+def _refuse(op: NoDerivative, node: Any = None, **_: Any) -> tuple:
+    raise NotImplementedError(f"{op}, which jumps. Use a filter without derivatives: BootstrapPF")

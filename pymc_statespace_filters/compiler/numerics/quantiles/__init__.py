@@ -1,0 +1,1 @@
+"""Quantile functions of a standard normal, as machine code."""

@@ -1,0 +1,178 @@
+"""PyMC distributions that a user's function returns, as functions of standard normals.
+
+Each random variable in what ``process_dist`` or ``initial_dist`` returns becomes a function of
+normals at places of their own, so that a step is a deterministic function of state and normals.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytensor.tensor as pt
+from pymc.distributions.distribution import SymbolicRandomVariable
+from pymc.pytensorf import constant_fold
+from pytensor.graph.basic import Apply, Constant, Variable
+from pytensor.graph.traversal import ancestors, io_toposort
+from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.distributions import LAWS, Law, law_name, parameters_of
+from pymc_statespace_filters.system.equations import Equation, as_symbol, static_shape
+from pymc_statespace_filters.system.graph_digest import is_made_after
+
+Values = Mapping[str, TensorVariable]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Components drawn from distributions, as functions of standard normals.
+
+    ``exact`` has the law that the user wrote. In ``surrogate`` each variable is normal, with its
+    mean and variance given the variables above it; it is linear in the normals to first order.
+    ``is_gaussian`` tells whether the components are known to be jointly normal given the state.
+    """
+
+    normals: TensorVariable
+    exact: TensorVariable
+    surrogate: TensorVariable
+    is_discrete: bool
+    is_gaussian: bool
+
+
+def trace_distributions(
+    equation: Equation, values: Values, theta: TensorVariable, name: str
+) -> Drawn:
+    """Call a function that returns distributions; its normals are the vector ``name``.
+
+    Random variables older than ``theta`` are not the function's own, and are refused later.
+    """
+    role, entries = equation.role, _entries(equation, values)
+    nodes = io_toposort([], entries)
+    variables = [n for n in nodes if _is_drawn(n) and is_made_after(n.outputs[-1], [theta])]
+    laws = [_law_of(role, node) for node in variables]
+    sizes = [
+        law.count(_shape(node), parameters_of(node))
+        for law, node in zip(laws, variables, strict=True)
+    ]
+    for node in variables:
+        _check_constants(role, node)
+    normals = pt.tensor(name, shape=(sum(sizes),), dtype="float64")
+    places = {
+        node: normals[int(end) - size : int(end)]
+        for node, size, end in zip(variables, sizes, np.cumsum(sizes, dtype=int), strict=True)
+    }
+    return Drawn(
+        normals,
+        _replaced(role, entries, nodes, places, lambda law: law.draw),
+        _replaced(role, entries, nodes, places, lambda law: law.surrogate),
+        any(law.is_discrete for law in laws),
+        all(law.is_gaussian for law in laws) and _are_separate(entries, variables),
+    )
+
+
+def _entries(equation: Equation, values: Values) -> list[TensorVariable]:
+    """What the function returned, as a list of symbols."""
+    returned = equation(values)
+    entries = list(returned) if isinstance(returned, list | tuple) else [returned]
+    if not entries:
+        raise ModelError(f"{equation.role} must return at least one distribution, got none")
+    symbols = []
+    for entry in entries:
+        symbol = entry if isinstance(entry, TensorVariable) else as_symbol(equation.role, entry)
+        if symbol.type.ndim > 1:
+            raise ModelError(
+                f"{equation.role} must return scalar or vector distributions, got {symbol} of "
+                f"{symbol.type.ndim} dimensions"
+            )
+        symbols.append(symbol)
+    return symbols
+
+
+def _is_drawn(node: Apply) -> bool:
+    return isinstance(node.op, RandomVariable | SymbolicRandomVariable)
+
+
+def _law_of(role: str, node: Apply) -> Law:
+    law = LAWS.get(type(node.op))
+    if law is None:
+        raise ModelError(
+            f"{role} cannot draw {law_name(type(node.op))} as a function of standard normals; it "
+            f"knows {', '.join(sorted(map(law_name, LAWS)))}. Write others by these: a Poisson "
+            "inflated by zeros is pm.Bernoulli.dist(p) * pm.Poisson.dist(mu)"
+        )
+    return law
+
+
+def _output(node: Apply) -> TensorVariable:
+    return node.outputs[1]
+
+
+def _shape(node: Apply) -> tuple[int, ...]:
+    shape = static_shape(_output(node))
+    known = tuple(length for length in shape if length is not None)
+    if len(known) < len(shape):
+        raise ModelError(f"distributions must have a static shape, got {node.op} of shape {shape}")
+    return known
+
+
+def _check_constants(role: str, node: Apply) -> None:
+    """Raise for a parameter that is a number outside its domain."""
+    parameters = parameters_of(node)
+    folded = constant_fold(parameters, raise_not_constant=False)
+    for (name, domain), value in zip(_law_of(role, node).domains.items(), folded, strict=True):
+        if isinstance(value, Variable):
+            if not isinstance(value, Constant):
+                continue
+            value = value.data
+        if not np.all(domain.holds(np.asarray(value, dtype="float64"))):
+            raise ModelError(
+                f"{role}: {name} of {law_name(type(node.op))} must be {domain.text}, got "
+                f"{np.asarray(value).tolist()}"
+            )
+
+
+def _replaced(
+    role: str,
+    entries: Sequence[TensorVariable],
+    nodes: Sequence[Apply],
+    places: Mapping[Apply, TensorVariable],
+    function_of: Callable[[Law], Callable],
+) -> TensorVariable:
+    """The entries in one vector, with these variables replaced by functions of their normals."""
+    known: dict[Variable, Variable] = {}
+    for node in nodes:
+        inputs = [known.get(variable, variable) for variable in node.inputs]
+        if isinstance(node.op, Elemwise) and node.outputs[0].type.dtype == "float32":
+            # Of constants: PyMC's 1 / 3.0 would be a third to seven digits.
+            inputs = [pt.cast(variable, "float64") for variable in inputs]
+        if node in places:
+            parameters = [pt.cast(value, "float64") for value in inputs[2:]]
+            drawn = function_of(_law_of(role, node))(places[node], _shape(node), parameters)
+            known[_output(node)] = pt.specify_shape(drawn, _shape(node))
+        elif inputs != node.inputs:
+            known.update(zip(node.outputs, _rebuilt(role, node, inputs), strict=True))
+    symbols = [as_symbol(role, known.get(entry, entry)) for entry in entries]
+    parts = [symbol.dimshuffle("x") if symbol.type.ndim == 0 else symbol for symbol in symbols]
+    return pt.concatenate(parts)
+
+
+def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variable]:
+    """The outputs of an operation with draws, which are double-precision, among its inputs."""
+    try:
+        return node.clone_with_new_inputs(list(inputs), strict=False).outputs
+    except Exception as error:
+        raise ModelError(
+            f"{role} must use what it draws as a number, got it in {node.op} ({error}); where it "
+            "is an index, write pt.switch(pt.eq(draw, 0), a, b)"
+        ) from error
+
+
+def _are_separate(entries: Sequence[TensorVariable], variables: Sequence[Apply]) -> bool:
+    """Whether every entry is a variable or free of them, and no variable depends on another."""
+    drawn = {_output(node) for node in variables}
+    for entry in entries:
+        if entry not in drawn and drawn & set(ancestors([entry])):
+            return False
+    return not any(drawn & set(ancestors(parameters_of(node))) for node in variables)
