@@ -28,6 +28,7 @@ from .evidence import (
     estimate_evidence,
     marginal_modes,
     prior_sensitivity,
+    step_error,
 )
 from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
 from .plots import (
@@ -46,7 +47,7 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama, Milstein, RungeKutta4, SemiImplicitEuler
+from .system.integrators import EulerMaruyama, ExactLinear, Milstein, RungeKutta4, SemiImplicitEuler
 from .system.model import StateSpaceModel
 from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
@@ -65,6 +66,7 @@ __all__ = [
     "EulerMaruyama",
     "Evidence",
     "EvidenceWarning",
+    "ExactLinear",
     "FilterWarning",
     "GradientUnavailableError",
     "GridFilter",
@@ -119,5 +121,6 @@ __all__ = [
     "second_order",
     "simulate",
     "smoothed_states",
+    "step_error",
     "suggest_particles",
 ]

@@ -13,6 +13,7 @@ from pymc_statespace_filters.evidence.estimation import (
     estimate_evidence,
 )
 from pymc_statespace_filters.evidence.evidence import Evidence
+from pymc_statespace_filters.evidence.shorter_steps import step_error
 
 __all__ = [
     "DimensionCorrection",
@@ -24,4 +25,5 @@ __all__ = [
     "estimate_evidence",
     "marginal_modes",
     "prior_sensitivity",
+    "step_error",
 ]

@@ -172,8 +172,7 @@ class EnKF(EnsembleFilterBase):
         if system.carried and not system.model.has_gaussian_steps:
             raise ModelError(
                 f"EnKF moves members by normal variables in place of process_dist, and so cannot "
-                f"treat the carried states {list(system.carried)}, which may be numbers of "
-                f"regimes; use BootstrapPF"
+                f"treat the carried states {list(system.carried)}, such as the number of a regime"
             )
 
     def noise_sizes(self, system: System) -> NoiseSizes:

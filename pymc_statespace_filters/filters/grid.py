@@ -139,8 +139,7 @@ class GridFilter:
         if system.gaussian is not system:
             raise ModelError(
                 "GridFilter integrates over Gaussian noise and a Gaussian start, got other "
-                "distributions in process_dist or initial_dist; use BootstrapPF, whose mean is "
-                "the exact likelihood"
+                "distributions in process_dist or initial_dist, or steps of Milstein"
             )
         if system.m == 0:
             raise ModelError(

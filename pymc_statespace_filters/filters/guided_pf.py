@@ -213,7 +213,7 @@ class GuidedPF(ParticleFilter):
         if system.gaussian is not system:
             raise ModelError(
                 "GuidedPF moves particles by Gaussian noise and from a Gaussian start, got other "
-                "distributions in process_dist or initial_dist; use BootstrapPF"
+                "distributions in process_dist or initial_dist, or steps of Milstein"
             )
 
     def functions(self) -> Sequence[str]:

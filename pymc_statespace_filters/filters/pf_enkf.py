@@ -207,7 +207,7 @@ class PFEnKF(ParticleFilter):
         if system.model.discrete_noise and self.algorithm(system) is self:
             raise ModelError(
                 "PFEnKF moves particles by a Kalman gain, off the whole numbers that process_dist "
-                "draws, got discrete distributions; use BootstrapPF"
+                "draws, got discrete distributions"
             )
 
     def settings(self) -> tuple[float, ...]:

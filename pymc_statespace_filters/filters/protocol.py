@@ -56,6 +56,16 @@ class System(Protocol):
 
     def __hash__(self) -> int: ...
 
+    def at_parameters(self, compiled: CompiledFunction, *, of_many: bool = False) -> Any:
+        """A function made from the graphs of ``model``, as one of the user's parameters.
+
+        Linear algebra of parameters alone is done once per evaluation: ``model`` reads its values
+        from ``n_theta`` parameters, the user's and these values.
+        """
+
+    def derivative_at_parameters(self, compiled: CompiledFunction) -> Any:
+        """The same for a function that returns the cotangent of its parameters."""
+
     @property
     def prepare(self) -> CompiledFunction:
         """Function (theta) -> c, the constants of one evaluation."""

@@ -21,6 +21,18 @@ from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 Array = NDArray[np.float64]
 
 
+def check_free_variables(model: pm.Model) -> None:
+    """Raise unless a model has free variables, all of them continuous."""
+    if model.discrete_value_vars:
+        names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
+        raise ModelError(
+            f"model must have continuous free variables only, got discrete {names}: "
+            "marginalise them out of the likelihood first"
+        )
+    if not model.free_RVs:
+        raise ModelError("model must have at least one free variable, got none")
+
+
 class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
@@ -68,14 +80,7 @@ class ModelDensity(RowFunction):
     """
 
     def __init__(self, model: pm.Model, *, moved: bool = False) -> None:
-        if model.discrete_value_vars:
-            names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
-            raise ModelError(
-                f"model must have continuous free variables only, got discrete {names}: "
-                "marginalise them out of the likelihood first"
-            )
-        if not model.free_RVs:
-            raise ModelError("model must have at least one free variable, got none")
+        check_free_variables(model)
         self.model = model
         self.moved = moved
         log_density = model.logp()

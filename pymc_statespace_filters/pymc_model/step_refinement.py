@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
@@ -17,10 +18,11 @@ from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of,
 from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_points
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
-from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.system.accumulators import without_resets
+from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 MAX_STEPS = 500
@@ -52,6 +54,86 @@ def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable]
             outputs = LogLikelihood(version, filter)(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     return clone_replace(log_density, coarse), clone_replace(log_density, fine)
+
+
+def densities_by_halvings(model: pm.Model, halvings: int) -> list[TensorVariable]:
+    """A model's log-density with its integration steps, and with these halved 1, 2, ... times.
+
+    Each variable keeps its filter. A noisy filter is replaced by its smooth version, whose estimate
+    has the same mean, and all lengths of the step are driven by the same path of the noise, so that
+    their estimates with one seed differ little.
+    """
+    log_density = model.logp()
+    nodes = likelihood_nodes([log_density])
+    if not any(node.op.system.integrator for node in nodes):
+        raise ModelError(
+            "model must have a StateSpace variable whose system has an integrator, such as "
+            "EulerMaruyama, for its step to be halved, got "
+            f"{[node.op.system for node in nodes] or 'none'}: a transition that is a function has "
+            "no step to halve, and a system that was unpickled knows no integrator"
+        )
+    replaced: list[dict[Variable, Variable]] = [{} for _ in range(halvings + 1)]
+    for node in nodes:
+        if node.op.system.integrator is not None:
+            for into, outputs in zip(replaced, _halved(node, halvings), strict=True):
+                into |= dict(zip(node.outputs, outputs, strict=True))
+    return [clone_replace(log_density, into) for into in replaced]
+
+
+def step_lengths(model: pm.Model) -> list[float]:
+    """The length of the substeps of every integrator of a model."""
+    systems = [node.op.system for node in likelihood_nodes([model.logp()])]
+    return [s.integrator.substep().dt for s in systems if s.integrator is not None]
+
+
+def _halved(node: Any, halvings: int) -> list[list[Variable]]:
+    """The outputs of a likelihood with its steps halved 0, 1, 2, ... times."""
+    system, filter = node.op.system, node.op.filter
+    integrators = [system.integrator]
+    for _ in range(halvings):
+        integrators.append(integrators[-1].refined())
+    systems = [system.with_integrator(integrator) for integrator in integrators]
+    if not filter.noisy:
+        return [_likelihood(node, version) for version in systems]
+    if system.m and [s.m for s in systems] == [system.m * 2**i for i in range(halvings + 1)]:
+        coupled = [
+            CoupledNoise(integrator, 2 ** (halvings - i)) if i < halvings else integrator
+            for i, integrator in enumerate(integrators)
+        ]
+        systems = [system.with_integrator(one, keeps_noises=True) for one in coupled]
+    if isinstance(filter, EnsembleFilter):
+        filter = filter.smooth(compile_system(systems[0]))
+    for version in systems:
+        filter.check(compile_system(version))
+    return [LogLikelihood(version, filter)(*node.inputs) for version in systems]
+
+
+def _likelihood(node: Any, system: StateSpaceModel) -> list[Variable]:
+    """The outputs of a likelihood with other substeps, or with shorter steps in their place.
+
+    A GridFilter takes noise that is added at the end of a step, and no substeps.
+    """
+    filter = node.op.filter
+    try:
+        filter.check(compile_system(system))
+    except ModelError:
+        return _with_shorter_steps(node, system)
+    return LogLikelihood(system, filter)(*node.inputs)
+
+
+def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
+    """The outputs of a likelihood whose record is on the finer grid of the substeps of a system."""
+    assert system.integrator is not None
+    single = system.with_integrator(system.integrator.substep())
+    factor = round(system.dt / single.dt)
+    theta, steps, observed, inputs, *others = node.inputs
+    node.op.filter.check(compile_system(single))
+    rows = pt.repeat(inputs, factor, axis=0)
+    if system.accumulators:
+        begins_step = pt.eq(pt.arange(rows.shape[0]) % factor, 0)
+        rows = pt.set_subtensor(rows[:, -1], rows[:, -1] * begins_step)
+    likelihood = LogLikelihood(single, node.op.filter)
+    return likelihood(theta, steps * factor, observed, rows, *others)
 
 
 def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | None:
@@ -86,13 +168,14 @@ def path_eigenvalues(
 ) -> NDArray[np.complex128]:
     """Eigenvalues (m, K, n) of the Jacobian of a substep at K states of the path without noise.
 
-    The arguments are those of the likelihood at m points. The path starts from the initial mean.
-    Eigenvalues are NaN where the Jacobian is not finite.
+    It is that of the substep which the integrator names for this, if it names one. The arguments
+    are those of the likelihood at m points. The path starts from the initial mean. Eigenvalues are
+    NaN where the Jacobian is not finite.
     """
     assert system.integrator is not None
     single = system.with_integrator(system.integrator.substep())
     length, substeps = single.dt, round(system.dt / single.dt)
-    start, advance, jacobian = _compile_path(single)
+    start, advance, jacobian = _compile_path(single, _examined(system))
     if inputs.shape[1] == 0:  # a system without inputs
         inputs = np.zeros((len(theta), 1, system.n_input_columns))
     inputs = without_resets(system, inputs)  # which belong to a step, not to each substep
@@ -115,14 +198,23 @@ def _eigenvalues(jacobians: Array) -> NDArray[np.complex128]:
     return found
 
 
-def _compile_path(system: StateSpaceModel) -> list[Callable]:
-    """Initial mean, next state and Jacobian of the step, each for many points at once."""
+def _examined(system: StateSpaceModel) -> StateSpaceModel:
+    """The system with the substep whose eigenvalues its integrator reads."""
+    assert system.integrator is not None
+    substep = system.integrator.substep()
+    examined = getattr(substep, "examined_step", substep.substep)
+    return system.with_integrator(examined())
+
+
+def _compile_path(system: StateSpaceModel, examined: StateSpaceModel) -> list[Callable]:
+    """Initial mean, next state, and Jacobian of the examined step, each for many points at once."""
     symbols = symbols_of(system)
     theta, now = symbols["theta"], [symbols[name] for name in ("theta", "x", "u", "t")]
     values = dict(zip(("theta", "x", "u", "t"), now, strict=True))
     advanced = call(system.equations.transition, system, values)
     start = call(system.equations.initial_mean, system, {"theta": theta})
-    graphs = [([theta], start), (now, advanced), (now, jacobian_of(advanced, values["x"]))]
+    seen = call(examined.equations.transition, examined, values)
+    graphs = [([theta], start), (now, advanced), (now, jacobian_of(seen, values["x"]))]
     return [interpreted_at_points(arguments, output) for arguments, output in graphs]
 
 

@@ -146,6 +146,7 @@ class StateSpaceModel:
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
             observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
+            keeps_noises=False,
             equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
@@ -172,6 +173,7 @@ class StateSpaceModel:
     discrete_noise: bool
     gaussian_observation: bool
     observation_uses_inputs: bool
+    keeps_noises: bool
     equations: Equations
 
     def _set(self, **attributes: Any) -> None:
@@ -248,11 +250,19 @@ class StateSpaceModel:
         system._set(**self.__getstate__() | attributes)
         return system
 
-    def with_integrator(self, integrator: Integrator) -> "StateSpaceModel":
-        """The same system with another integrator."""
+    def with_integrator(
+        self, integrator: Integrator, *, keeps_noises: bool = False
+    ) -> "StateSpaceModel":
+        """The same system with another integrator.
+
+        If it ``keeps_noises``, a filter draws every noise, where it would draw the sum of several
+        that act on one state. Two such systems with equally many noises then have the same ones.
+        """
         if self.integrator is None:
             raise ModelError(f"{self!r} must have an integrator, got a transition without one")
-        return StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system = StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system._set(keeps_noises=keeps_noises)
+        return system
 
     @property
     def n_input_columns(self) -> int:

@@ -46,11 +46,12 @@ def trace_distributions(
 ) -> Drawn:
     """Call a function that returns distributions; its normals are the vector ``name``.
 
-    Random variables older than ``theta`` are not the function's own, and are refused later.
+    Random variables older than ``theta`` are not the function's own, and are refused.
     """
     role, entries = equation.role, _entries(equation, values)
     nodes = io_toposort([], entries)
-    variables = [n for n in nodes if _is_drawn(n) and is_made_after(n.outputs[-1], [theta])]
+    variables = [node for node in nodes if _is_drawn(node)]
+    _check_own(role, variables, theta)
     laws = [_law_of(role, node) for node in variables]
     sizes = [
         law.count(_shape(node), parameters_of(node))
@@ -88,6 +89,15 @@ def _entries(equation: Equation, values: Values) -> list[TensorVariable]:
             )
         symbols.append(symbol)
     return symbols
+
+
+def _check_own(role: str, variables: Sequence[Apply], theta: TensorVariable) -> None:
+    for node in variables:
+        if not is_made_after(node.outputs[-1], [theta]):
+            raise ModelError(
+                f"{role} must use its arguments and constants only, got the random variable "
+                f"{node.outputs[-1]}; pass it as a parameter"
+            )
 
 
 def _is_drawn(node: Apply) -> bool:

@@ -19,6 +19,7 @@ from pymc_statespace_filters.system.accumulators import reset
 from pymc_statespace_filters.system.checks import check_positive
 from pymc_statespace_filters.system.equations import (
     Equation,
+    as_matrix,
     as_vector,
     read_covariance,
     read_equation,
@@ -90,7 +91,7 @@ class Symbols:
 class Equations:
     """The traced functions of a system, frozen graphs of theta, x, q, u, t, e and d.
 
-    ``process_noise`` is None where ``q`` holds standard normals: for an integrator and for
+    ``process_noise`` is None where ``q`` holds standard normals: for most integrators and for
     ``process_dist``, whose distributions are part of the transition. If these are not normal,
     ``gaussian_transition`` is the transition with normal variables of their means and variances.
     ``initial_draw``, of theta and normals, is that of a start that is not Gaussian.
@@ -171,8 +172,7 @@ def trace(
     values, n, m = symbols.values, symbols.n, symbols.m
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
-    noise = functions.process_noise
-    process_noise = None if noise is None else trace_covariance("process_noise", noise, m, values)
+    process_noise = _trace_process_noise(functions, values, m)
     start, theta = symbols.start, symbols.theta
     initial_cov = start.cov
     if functions.initial_dist is None:
@@ -205,11 +205,15 @@ def trace(
 
 
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
-    """The next state, and the same with normal variables."""
+    """The next state, and the same linear in normal variables."""
     values, drawn = symbols.values, symbols.drawn
-    noises = (values["q"],) if drawn is None else (drawn.exact, drawn.surrogate)
+    if drawn is None:
+        noises = [values["q"]]
+    else:  # named for messages about an index that is out of range
+        noises = [vector.copy(name="q") for vector in (drawn.exact, drawn.surrogate)]
     steps = [functions.transition.step({**values, "q": q}) for q in noises]
-    return steps[0], steps[-1]
+    linear = getattr(functions.transition, "linear_in_noise", None)
+    return steps[0], steps[-1] if linear is None else linear().step(values)
 
 
 @dataclass(frozen=True)
@@ -280,6 +284,14 @@ def _read_transition(
             f"got {process_dist!r}"
         )
     return FunctionTransition(equation, check_positive("dt", 1.0 if dt is None else dt))
+
+
+def _trace_process_noise(functions: Functions, values: Values, m: int) -> TensorVariable | None:
+    """The covariance of q; None where q are standard normals."""
+    if functions.process_noise is not None:
+        return trace_covariance("process_noise", functions.process_noise, m, values)
+    declared = getattr(functions.transition, "noise_cov", None)
+    return None if declared is None else as_matrix("noise_cov", declared(values), m, m)
 
 
 def _noise_size(functions: Functions, values: Values) -> int:

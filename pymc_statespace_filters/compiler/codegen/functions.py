@@ -19,7 +19,7 @@ from pymc_statespace_filters.compiler.codegen.array_fallback import (
     array_member_function,
     array_vector_function,
 )
-from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value
+from pymc_statespace_filters.compiler.codegen.expressions import Arena, Expression, Value
 from pymc_statespace_filters.compiler.codegen.function_types import (
     MEMBER_INPUTS,
     CompiledFunction,
@@ -34,6 +34,7 @@ from pymc_statespace_filters.compiler.codegen.source import (
     depends_on,
     n_operations,
 )
+from pymc_statespace_filters.compiler.codegen.stages import BLOCK, Stages, is_block
 from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.errors import LoweringError
@@ -56,7 +57,6 @@ LARGE_TUPLE = 400
 # LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
 # 8 rows that are written and as many that are only read need 92.
 MAX_ROWS_COMPARED = 8
-BLOCK = 64
 
 # The code that reads element i of an input, if not that of a vector; members are columns.
 _ELEMENT = {
@@ -155,6 +155,8 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
     common = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
     kept = sorted_by_number({*common, *(v for v in values if v not in dependent)})
     before = writer.statements(kept)
+    if any(map(is_block, dependent)):
+        return _in_stages(name, arguments, writer, (before, kept), values, dependent, target)
     inside, results = writer.statements(values), [writer.as_float(v) for v in values]
     names = [writer.name(v) for v in kept]
     inside = [*(f"{name} = common[{i}]" for i, name in enumerate(names)), *inside]
@@ -169,6 +171,27 @@ def member_function(name: str, arguments: str, graph: Graph, target: str) -> Com
         before=(arguments, before),
         inside=(inputs, inside),
     )
+
+
+def _in_stages(
+    name: str,
+    arguments: str,
+    writer: Writer,
+    before: tuple[list[str], list],
+    values: list[Value],
+    dependent: set[Expression],
+    target: str,
+) -> CompiledFunction:
+    """A member function with functions that have branches, see `stages`."""
+    lines, kept = before
+    names = "".join(f"{writer.name(v)}, " for v in kept)
+    lines.append(f"return ({names})")
+    stages = Stages(writer, values, dependent, kept)
+    inputs = f"{arguments}, member, common, buffer, j"
+    given = f"{arguments}, np.uint64(first + j), common, buffer, np.uint64(j)"
+    body = [f"common = before({arguments})", *stages.body(given, target)]
+    blocks = {f"stage_{i}": (inputs, inside) for i, inside in enumerate(stages.inside)}
+    return build(name, arguments, body, writer, before=(arguments, lines), **blocks)
 
 
 def _loop(

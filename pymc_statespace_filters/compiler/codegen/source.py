@@ -30,11 +30,15 @@ from pymc_statespace_filters.compiler.numerics import (
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.binomial import (
     bernoulli_quantile,
+    binomial_block,
     binomial_quantile,
 )
-from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_quantile
+from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_block, gamma_quantile
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
-from pymc_statespace_filters.compiler.numerics.quantiles.poisson import poisson_quantile
+from pymc_statespace_filters.compiler.numerics.quantiles.poisson import (
+    poisson_block,
+    poisson_quantile,
+)
 
 _NUMPY = (
     "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sqrt", "sin", "cos", "tan", "arcsin",
@@ -48,6 +52,13 @@ QUANTILES = {
     )
 }  # fmt: skip
 """By the names that operations have as ``machine_code``."""
+
+# The same for a block of members, as vector code: functions of rows of a buffer.
+BLOCKS = {
+    "poisson_quantile": poisson_block,
+    "binomial_quantile": binomial_block,
+    "gamma_quantile": gamma_block,
+}
 
 # For single numbers, where the tables of the system's library are faster.
 SCALAR_NAMESPACE = {
@@ -67,7 +78,7 @@ _VECTORIZABLE = (
 VECTOR_NAMESPACE = (
     SCALAR_NAMESPACE
     | {"sqrt": intrinsics.sqrt}
-    | {function.py_func.__name__: function for function in _VECTORIZABLE}
+    | {function.py_func.__name__: function for function in (*_VECTORIZABLE, *BLOCKS.values())}
 )
 _INFIX: dict[type, str] = {
     ps.Add: "+", ps.Sub: "-", ps.Mul: "*", ps.TrueDiv: "/", ps.LT: "<", ps.GT: ">", ps.LE: "<=",
@@ -115,20 +126,33 @@ class Writer:
         self.namespace = namespace
         self._input_code = input_code
         self._names: dict[Value, str] = dict(known or {})
+        self._n_names = len(self._names)
         self.fallbacks: dict[str, tuple[ps.ScalarOp, int]] = {}
 
     def statements(self, values: Iterable[Value]) -> list[str]:
         """Statements for everything that ``values`` depend on and that is not written yet."""
         lines: list[str] = []
         for expression in _in_order(values, self._names):
-            name = f"v{len(self._names)}"
-            self._names[expression] = name
-            lines.append(f"{name} = {self._code(expression)}")
+            code = self._code(expression)
+            lines.append(f"{self._new_name(expression)} = {code}")
         return lines
 
     def name(self, value: Value) -> str:
         """The name in the source of a written expression, or the literal of a constant."""
         return self._names[value] if isinstance(value, Expression) else _literal(value)
+
+    def keep_only(self, expressions: Iterable[Value]) -> None:
+        """Forget what is written, except these: later statements are in another scope."""
+        self._names = {e: self._names[e] for e in expressions}
+
+    def read(self, expression: Value, code: str) -> str:
+        """The statement that reads an expression that another scope has written."""
+        return f"{self._new_name(expression)} = {code}"
+
+    def _new_name(self, expression: Value) -> str:
+        name = self._names[expression] = f"v{self._n_names}"
+        self._n_names += 1
+        return name
 
     def as_float(self, value: Value) -> str:
         """The same, as a double-precision number."""

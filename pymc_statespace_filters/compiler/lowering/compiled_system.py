@@ -13,6 +13,13 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
 from pymc_statespace_filters.compiler.lowering import quantiles, structure
+from pymc_statespace_filters.compiler.lowering.constants import (
+    after_extension,
+    between_extensions,
+    extend,
+    lowered,
+    pull_back,
+)
 from pymc_statespace_filters.compiler.lowering.covariances import (
     covariances,
     followed_by_square_roots,
@@ -73,7 +80,8 @@ class CompiledSystem:
     Attributes
     ----------
     model : StateSpaceModel
-        What the user wrote, for filters that work on its graphs.
+        What the user wrote, for filters that work on its graphs. Linear algebra of parameters alone
+        is left out of them: its values are read from more parameters, see `at_parameters`.
     n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
         Numbers of states, of normals that a member takes at the start and in one step (see
         `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
@@ -84,8 +92,11 @@ class CompiledSystem:
         The states that an update may move: all but the carried ones.
     """
 
-    def __init__(self, model: StateSpaceModel) -> None:
-        self.model = model
+    def __init__(self, written: StateSpaceModel) -> None:
+        found = lowered(written)
+        self._written, self.model = written, found.model
+        model = self.model
+        self._extension = found.extension
         self.n, self.p, self.r = model.n, model.p, model.r
         self.n_inputs, self.n_theta, self.dt = model.n_input_columns, model.n_theta, model.dt
         self.states, self.carried = tuple(model.states), tuple(model.carried)
@@ -107,6 +118,29 @@ class CompiledSystem:
             self._square_roots[name] = self._c[start : start + size**2].reshape((size, size))
             start += size**2
 
+    # Constants of an evaluation
+
+    @cached_property
+    def _extend(self) -> CompiledFunction | None:
+        return None if self._extension is None else extend(self._extension)
+
+    def at_parameters(
+        self, compiled: CompiledFunction, *, of_many: bool = False
+    ) -> CompiledFunction:
+        """A function of parameters and constants as one of parameters, its first argument.
+
+        That argument has a row for each point if ``of_many``.
+        """
+        if self._extend is None:
+            return compiled
+        return after_extension(self._extend, compiled, of_many=of_many)
+
+    def derivative_at_parameters(self, compiled: CompiledFunction) -> CompiledFunction:
+        """The same for a function that returns the cotangent of its first argument."""
+        if self._extend is None or self._extension is None:
+            return compiled
+        return between_extensions(self._extend, pull_back(self._extension), compiled)
+
     # Functions
 
     @cached_property
@@ -114,7 +148,8 @@ class CompiledSystem:
         """Theta -> c."""
         theta = pt.tensor("theta", shape=(self.n_theta,), dtype="float64")
         mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
-        return followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
+        prepare = followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
+        return self.at_parameters(prepare)
 
     @cached_property
     def initialise(self) -> CompiledFunction:
@@ -242,12 +277,12 @@ class CompiledSystem:
     @cached_property
     def with_gaussian_steps(self) -> "CompiledSystem":
         """The system with normal variables in place of others in ``process_dist``."""
-        return compile_system(self.model.with_gaussian_steps)
+        return compile_system(self._written.with_gaussian_steps)
 
     @cached_property
     def gaussian(self) -> "CompiledSystem":
         """The same with a Gaussian start."""
-        return compile_system(self.model.gaussian)
+        return compile_system(self._written.gaussian)
 
     @cached_property
     def is_linear(self) -> bool:

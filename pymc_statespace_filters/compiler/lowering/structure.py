@@ -39,7 +39,7 @@ def merged_noise(system: StateSpaceModel) -> FrozenFunctionGraph | None:
     The sum of independent noises on one state, ``[[0.6, sigma_m]]``, has the distribution of a
     single noise, and drawing normals is most of the cost of an ensemble.
     """
-    if system.m <= system.n or not system.has_gaussian_steps:
+    if system.m <= system.n or system.keeps_noises or not system.has_gaussian_steps:
         return None
     symbols = symbols_of(system)
     gain = jacobian_of(call(system.equations.transition, system, symbols), symbols["q"])

@@ -18,6 +18,7 @@ from pymc_statespace_filters.evidence.comparison.probabilities import (
 )
 from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike, select_evidences
 from pymc_statespace_filters.evidence.comparison.sentences import needs_warning, sentences
+from pymc_statespace_filters.evidence.comparison.step_errors import step_error_columns
 from pymc_statespace_filters.evidence.comparison.table import EvidenceTable
 from pymc_statespace_filters.evidence.evidence import Evidence
 
@@ -76,6 +77,7 @@ def compare_evidence(
     correction: DimensionCorrection | None = None,
     ci_prob: float = 0.95,
     estimator: str | None = None,
+    step_errors: Mapping[str, pd.DataFrame] | None = None,
 ) -> EvidenceTable:
     """Compare models by their evidences: probabilities, Bayes factors and criteria (Eq. 3.3).
 
@@ -95,6 +97,8 @@ def compare_evidence(
         default the estimates of each model must agree. Of the estimators that all models with
         several have, the one with the smallest standard errors is then taken, of those whose
         estimates have no ``doubts`` if there are any.
+    step_errors : mapping of str to pandas.DataFrame, optional
+        Tables of `step_error` by model, for the columns ``step_error`` and ``step_error_se``.
 
     Returns
     -------
@@ -141,6 +145,9 @@ def compare_evidence(
         ``approximate``
             Whether the likelihood is a filter's approximation, neither exact nor unbiased; missing
             where this is unknown, as in files of earlier versions.
+        ``step_error``, ``step_error_se``
+            With `step_errors`: the change of the log-evidence if the integration step is halved,
+            and its standard error; NaN for models that are not named there.
 
         If an evidence has no standard error (``se`` is NaN, as for Laplace's), the probabilities
         are those of the estimates, and all intervals are NaN, because each depends on every
@@ -191,6 +198,8 @@ def compare_evidence(
     _warn_of_improper(found)
     added = [correction.log_prior(one) if correction else 0.0 for one in found.values()]
     table = _columns(found, weights, np.array(added), ci_prob)
+    if step_errors is not None:
+        table = table.join(step_error_columns(step_errors, list(found)))
     in_order = {name: found[name] for name in table.index}
     said = [how_chosen] if how_chosen else []
     return EvidenceTable(table, sentences=[*said, *sentences(table, in_order, ci_prob)])

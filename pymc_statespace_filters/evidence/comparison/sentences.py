@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pandas as pd
 
+from pymc_statespace_filters.evidence.comparison.step_errors import step_error_sentences
 from pymc_statespace_filters.evidence.evidence import Evidence
 
 
@@ -16,6 +17,7 @@ def sentences(
     yield from _criteria(table)
     yield from _warnings(evidences)
     yield from _approximate(evidences)
+    yield from step_error_sentences(table)
 
 
 def needs_warning(evidence: Evidence) -> bool:

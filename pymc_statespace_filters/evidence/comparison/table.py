@@ -8,21 +8,21 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
-MAIN_COLUMNS = ("prob", "prob_low", "prob_high", "log_evidence", "se")
+MAIN_COLUMNS = ("prob", "prob_low", "prob_high", "log_evidence", "se", "step_error")
 WIDTH = 80
 # Decimals of the log-evidences and their errors: two digits of the smallest error, within limits.
 FEWEST_DECIMALS, MOST_DECIMALS = 2, 4
 
 
 class EvidenceTable(pd.DataFrame):
-    """A DataFrame whose display has five columns, and below them sentences about the models.
+    """A DataFrame whose display has few columns, and below them sentences about the models.
 
     Slices, results of operations and of ``table.copy()`` are plain DataFrames.
 
     Parameters
     ----------
     data : pandas.DataFrame
-        With the columns of `MAIN_COLUMNS`, and others.
+        With columns of `MAIN_COLUMNS`, and others.
     sentences : sequence of str
         What the display says below the columns.
     """
@@ -68,7 +68,7 @@ class EvidenceTable(pd.DataFrame):
 
 
 def _texts(name: str, table: pd.DataFrame) -> list[str]:
-    if name in ("log_evidence", "se"):
+    if name in ("log_evidence", "se", "step_error"):
         decimals = _decimals(table["se"]) if "se" in table else FEWEST_DECIMALS
         return [_fixed(value, decimals) for value in table[name]]
     return [_probability(value) for value in table[name]]

@@ -62,35 +62,37 @@ class GaussianFilterBase:
 
     def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
         """Compile the log-likelihood."""
-        return compile_value(self._functions(system))
+        return system.at_parameters(compile_value(self._functions(system)))
 
     def compile_batch(self, system: System) -> CompiledFunction:
         """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
-        return compile_batch(self._functions(system))
+        return system.at_parameters(compile_batch(self._functions(system)), of_many=True)
 
     def compile_taped(self, system: System) -> CompiledFunction:
         """Compile the forward pass, with a third result: the tape."""
-        return compile_taped(self._functions(system))
+        return system.at_parameters(compile_taped(self._functions(system)))
 
     def compile_pullback(self, system: System) -> CompiledFunction:
         """Compile the backward pass along the tape."""
-        return compile_pullback(self._functions(system))
+        return system.derivative_at_parameters(compile_pullback(self._functions(system)))
 
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
         """Compile both passes as one function."""
-        return compile_gradient(self._functions(system))
+        return system.derivative_at_parameters(compile_gradient(self._functions(system)))
 
     def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
-            return deterministic.compile_states(self._functions(system))
-        return compile_states(_forward_pass(self.linearization, system.model.gaussian), moment)
+            states = deterministic.compile_states(self._functions(system))
+        else:
+            forward = _forward_pass(self.linearization, system.model.gaussian)
+            states = compile_states(forward, moment)
+        return system.at_parameters(states)
 
     def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
         """Compile one run with all that it computes."""
-        if system.is_deterministic:
-            return deterministic.compile_run(self._functions(system))
-        return compile_run(self._functions(system))
+        compile = deterministic.compile_run if system.is_deterministic else compile_run
+        return system.at_parameters(compile(self._functions(system)))
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""

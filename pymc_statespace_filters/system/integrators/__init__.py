@@ -4,9 +4,17 @@ Each is one file with its equation, its order and where it is stable. `protocol`
 """
 
 from pymc_statespace_filters.system.integrators.euler_maruyama import EulerMaruyama
+from pymc_statespace_filters.system.integrators.exact_linear import ExactLinear
 from pymc_statespace_filters.system.integrators.milstein import Milstein
 from pymc_statespace_filters.system.integrators.protocol import Integrator
 from pymc_statespace_filters.system.integrators.runge_kutta import RungeKutta4
 from pymc_statespace_filters.system.integrators.semi_implicit_euler import SemiImplicitEuler
 
-__all__ = ["EulerMaruyama", "Integrator", "Milstein", "RungeKutta4", "SemiImplicitEuler"]
+__all__ = [
+    "EulerMaruyama",
+    "ExactLinear",
+    "Integrator",
+    "Milstein",
+    "RungeKutta4",
+    "SemiImplicitEuler",
+]

@@ -54,9 +54,10 @@ class Milstein(SubstepIntegrator):
 
     Notes
     -----
-    ``q`` enters by its square. Filters of means and covariances (`EKF`, `UKF`, `IPLF`) linearise
-    steps in the noise: they take the steps of `EulerMaruyama`, which have the same mean and, to
-    leading order, the same covariance.
+    ``q`` enters by its square. `EKF`, `UKF`, `IPLF` and `EnKF` take noise by its mean and
+    covariance: they use the steps of `EulerMaruyama`, which have the same mean and, to leading
+    order in ``h``, the same covariance. `BootstrapPF` and `PFEnKF` take the steps as they are;
+    `GuidedPF` and `GridFilter`, which need Gaussian noise, refuse them.
 
     References
     ----------
@@ -86,15 +87,15 @@ class Milstein(SubstepIntegrator):
 
     def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The state after a substep."""
-        x = now["x"].copy()  # derivatives are by the state of this substep alone
-        diffusion = self._diffusion({**now, "x": x})
-        euler = x + length * self._drift({**now, "x": x}) + (np.sqrt(length) * diffusion) @ noise
-        columns = [diffusion[:, j] for j in range(diffusion.type.shape[1])]
-        if x not in ancestors(columns):
-            return euler
-        corrections = [pt.stack(_along(column, x, column)) for column in columns]
-        weights = 0.5 * length * (noise**2 - 1.0)
-        return euler + sum(weights[j] * c for j, c in enumerate(corrections))
+        x, diffusion = now["x"], self._diffusion(now)
+        moved = x + length * self._drift(now) + (np.sqrt(length) * diffusion) @ noise
+        if x not in ancestors([diffusion]):
+            return moved
+        for j in range(diffusion.type.shape[1]):
+            column = diffusion[:, j]
+            weight = 0.5 * length * (noise[j] ** 2 - 1.0)
+            moved = moved + weight * _along(column, x, column)
+        return moved
 
     def linear_in_noise(self) -> EulerMaruyama:
         """The integrator for filters that linearise a step in its noise."""
@@ -105,13 +106,13 @@ class Milstein(SubstepIntegrator):
         return eigenvalues.real.min(axis=-1) >= 0
 
 
-def _along(column: TensorVariable, x: TensorVariable, direction: TensorVariable) -> list:
-    """Derivative of every element of a vector along a direction."""
+def _along(column: TensorVariable, x: TensorVariable, direction: TensorVariable) -> TensorVariable:
+    """Derivative of a vector along a direction."""
     gradients = (
         pytensor.grad(column[i], x, disconnected_inputs="ignore", return_disconnected="zero")
         for i in range(column.type.shape[0])
     )
-    return [pt.sum(gradient * direction) for gradient in gradients]
+    return pt.stack([pt.sum(gradient * direction) for gradient in gradients])
 
 
 def _check_no_levy_areas(diffusion: TensorVariable, x: TensorVariable) -> None:

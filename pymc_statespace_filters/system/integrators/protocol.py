@@ -19,6 +19,12 @@ class Integrator(Protocol):
 
     * ``bound_to(states)``: the integrator with indices in place of names of states. ``states`` are
       the names that the system was given, or None.
+    * ``noise_cov(values)``: the covariance of ``q``, a function of parameters alone, where ``q``
+      are not standard normals.
+    * ``linear_in_noise()``: an integrator with the same ``q``, linear in it, for filters of means
+      and covariances, where a step is not.
+    * ``examined_step()``: another integrator of one substep, whose eigenvalues `is_stable_at` reads
+      where those of ``substep().step`` do not tell.
     """
 
     @property

@@ -9,9 +9,10 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp, log1p
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    SMALL,
+    TINY,
     UNDECIDED,
-    count_binomial,
-    limits,
+    bottom_up_binomial,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -22,7 +23,8 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
 
-_SMALL, _LARGE = 8.0, 1e6
+_LARGE = 1e6
+_small_binomial, _tiny_binomial = bottom_up_binomial(SMALL), bottom_up_binomial(TINY)
 
 
 @inlined
@@ -33,27 +35,20 @@ def _rarer(z, p):
 
 
 @inlined
-def fast_binomial(z, n, p):
-    """The quantile, or `UNDECIDED`; NaN for z or parameters that are invalid."""
-    valid = (n >= 0.0) & (n < np.inf) & (np.floor(n) == n) & (p >= 0.0) & (p <= 1.0) & (z == z)
-    z, p, flipped = _rarer(limited(z), p)
-    q = 1.0 - p
-    mean = n * p
-    is_small = mean < _SMALL
-    small_p = p if is_small else 0.0
-    low, high = limits(z, -n * log1p(-small_p))
-    small = count_binomial(n, small_p / (1.0 - small_p), low, high)
+def _valid(z, n, p):
+    return (n >= 0.0) & (n < np.inf) & (np.floor(n) == n) & (p >= 0.0) & (p <= 1.0) & (z == z)
+
+
+@inlined
+def _large_binomial(z, n, p):
+    """The quantile, or `UNDECIDED`, for n p >= 8 and p <= 1/2."""
+    mean, q = n * p, 1.0 - p
     variance = mean * q
-    deviation = sqrt(2.0 if variance < 2.0 else variance)
-    offset, error = short_series(z, deviation, q - p)
+    offset, error = short_series(z, sqrt(4.0 if variance < 4.0 else variance), q - p)
     whole = np.floor(mean)
     x = ((mean - whole) + fma(n, p, -mean)) + offset
-    large = whole + np.floor(x)
-    decided = (abs(x - np.rint(x)) > error) & (large >= 0.0) & (large <= n)
-    large = large if decided else UNDECIDED
-    k = small if is_small else large
-    k = n - k if flipped & (k != UNDECIDED) else k
-    return k if valid else np.nan
+    k = whole + np.floor(x)
+    return k if (abs(x - np.rint(x)) > error) & (k >= 0.0) & (k <= n) else UNDECIDED
 
 
 @njit_internal
@@ -111,8 +106,56 @@ def exact_binomial(z, n, p):
 @njit_internal
 def binomial_quantile(z, n, p):
     """The quantile; NaN for z or parameters that are invalid."""
-    k = fast_binomial(z, n, p)
-    return exact_binomial(z, n, p) if k == UNDECIDED else k
+    if not _valid(z, n, p):
+        return np.nan
+    rarer_z, rarer_p, flipped = _rarer(limited(z), p)
+    if n * rarer_p < SMALL:
+        k = _small_binomial(rarer_z, n, rarer_p)
+    else:
+        k = _large_binomial(rarer_z, n, rarer_p)
+    if k == UNDECIDED:
+        return exact_binomial(z, n, p)
+    return n - k if flipped else k
+
+
+@njit_internal
+def binomial_block(buffer, z, n, p, out, size):
+    """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
+    n_large = n_tiny = 0
+    for j in range(size):
+        i = np.uint64(j)
+        mean = buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i])
+        n_large += mean >= SMALL
+        n_tiny += mean < TINY
+    if n_large > 0:
+        for j in range(size):
+            i = np.uint64(j)
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            k = _large_binomial(rarer_z, buffer[n, i], rarer_p)
+            buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+    if n_tiny == size:
+        for j in range(size):
+            i = np.uint64(j)
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            k = _tiny_binomial(rarer_z, buffer[n, i], rarer_p)
+            buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+    elif n_large < size:
+        for j in range(size):
+            i = np.uint64(j)
+            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
+            is_small, other = buffer[n, i] * rarer_p < SMALL, buffer[out, i]
+            k = _small_binomial(rarer_z, buffer[n, i], rarer_p if is_small else 0.0)
+            k = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
+            buffer[out, i] = k if is_small else other
+    for j in range(size):
+        i = np.uint64(j)
+        buffer[out, i] = (
+            buffer[out, i] if _valid(buffer[z, i], buffer[n, i], buffer[p, i]) else np.nan
+        )
+    for j in range(size):
+        i = np.uint64(j)
+        if buffer[out, i] == UNDECIDED:
+            buffer[out, i] = exact_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
 
 
 @inlined

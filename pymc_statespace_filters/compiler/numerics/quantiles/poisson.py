@@ -12,9 +12,10 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp
 from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    SMALL,
+    TINY,
     UNDECIDED,
-    count_poisson,
-    limits,
+    bottom_up_poisson,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -25,26 +26,23 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
 
-_SMALL, _LARGE = 8.0, 1e6
+_LARGE = 1e6
+_small_poisson, _tiny_poisson = bottom_up_poisson(SMALL), bottom_up_poisson(TINY)
 
 
 @inlined
-def fast_poisson(z, mean):
-    """The quantile, or `UNDECIDED`; NaN for z or a mean that is invalid."""
-    z = limited(z)
-    small_mean = mean if mean < _SMALL else _SMALL
-    low, high = limits(z, small_mean)
-    small = count_poisson(small_mean, low, high)
-    large_mean = mean if mean > _SMALL else _SMALL
-    offset, error = short_series(z, sqrt(large_mean), 1.0)
-    whole = np.floor(large_mean)
-    x = (large_mean - whole) + offset
-    large = whole + np.floor(x)
-    decided = (abs(x - np.rint(x)) > error) & (large >= 0.0)
-    large = large if decided else UNDECIDED
-    result = small if mean < _SMALL else large
-    valid = (mean >= 0.0) & (mean < np.inf) & (z == z)
-    return result if valid else np.nan
+def _valid(z, mean):
+    return (mean >= 0.0) & (mean < np.inf) & (z == z)
+
+
+@inlined
+def _large_poisson(z, mean):
+    """The quantile, or `UNDECIDED`, for a mean from 8 on."""
+    offset, error = short_series(z, sqrt(mean), 1.0)
+    whole = np.floor(mean)
+    x = (mean - whole) + offset
+    k = whole + np.floor(x)
+    return k if (abs(x - np.rint(x)) > error) & (k >= 0.0) else UNDECIDED
 
 
 @njit_internal
@@ -92,5 +90,39 @@ def exact_poisson(z, mean):
 @njit_internal
 def poisson_quantile(z, mean):
     """The quantile; NaN for z or a mean that is invalid."""
-    k = fast_poisson(z, mean)
+    if not _valid(z, mean):
+        return np.nan
+    z = limited(z)
+    k = _small_poisson(z, mean) if mean < SMALL else _large_poisson(z, mean)
     return exact_poisson(z, mean) if k == UNDECIDED else k
+
+
+@njit_internal
+def poisson_block(buffer, z, mean, out, size):
+    """The quantiles of the rows ``z`` and ``mean`` of a buffer, into its row ``out``."""
+    n_large = n_tiny = 0
+    for j in range(size):
+        n_large += buffer[mean, np.uint64(j)] >= SMALL
+        n_tiny += buffer[mean, np.uint64(j)] < TINY
+    if n_large > 0:
+        for j in range(size):
+            i = np.uint64(j)
+            m = buffer[mean, i]
+            buffer[out, i] = _large_poisson(limited(buffer[z, i]), m if m > SMALL else SMALL)
+    if n_tiny == size:
+        for j in range(size):
+            i = np.uint64(j)
+            buffer[out, i] = _tiny_poisson(limited(buffer[z, i]), buffer[mean, i])
+    elif n_large < size:
+        for j in range(size):
+            i = np.uint64(j)
+            m, other = buffer[mean, i], buffer[out, i]
+            k = _small_poisson(limited(buffer[z, i]), m if m < SMALL else SMALL)
+            buffer[out, i] = k if m < SMALL else other
+    for j in range(size):
+        i = np.uint64(j)
+        buffer[out, i] = buffer[out, i] if _valid(buffer[z, i], buffer[mean, i]) else np.nan
+    for j in range(size):
+        i = np.uint64(j)
+        if buffer[out, i] == UNDECIDED:
+            buffer[out, i] = exact_poisson(buffer[z, i], buffer[mean, i])

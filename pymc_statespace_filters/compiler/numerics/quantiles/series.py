@@ -75,17 +75,19 @@ _ODD = (
 )  # fmt: skip
 
 
-def _in_three_variables(table: Sequence) -> Any:
-    """The function of (a, b, c) with the coefficients ``table[i][j][k]`` of a**i b**j c**k."""
+def in_variables(table: Sequence, n: int) -> Any:
+    """The polynomial in n variables with the coefficients ``table[i][j]...`` of a**i b**j ..."""
 
-    @intrinsic
-    def evaluate(typing_context, a, b, c):
-        def code(context, builder, signature, arguments):
-            return _horner(builder, table, arguments)
+    def code(context, builder, signature, arguments):
+        return _horner(builder, table, arguments)
 
-        return types.float64(types.float64, types.float64, types.float64), code
-
-    return evaluate
+    kinds = types.float64(*[types.float64] * n)
+    forms = (
+        lambda typing_context, a: (kinds, code),
+        lambda typing_context, a, b: (kinds, code),
+        lambda typing_context, a, b, c: (kinds, code),
+    )
+    return intrinsic(forms[n - 1])
 
 
 def _horner(builder: Any, coefficients: Any, variables: Sequence) -> Any:
@@ -97,8 +99,8 @@ def _horner(builder: Any, coefficients: Any, variables: Sequence) -> Any:
     return total
 
 
-_even, _odd = _in_three_variables(_EVEN), _in_three_variables(_ODD)
-_short_even, _short_odd = _in_three_variables(_EVEN[:3]), _in_three_variables(_ODD[:2])
+_even, _odd = in_variables(_EVEN, 3), in_variables(_ODD, 3)
+_short_even, _short_odd = in_variables(_EVEN[:3], 3), in_variables(_ODD[:2], 3)
 
 
 @inlined
@@ -115,6 +117,7 @@ def short_series(z, deviation, d):
     inverse = 1.0 / deviation
     a, b, c = inverse * inverse, z * z, d * d
     value = deviation * z + (0.5 + d * _short_even(a, b, c) + z * inverse * _short_odd(a, b, c))
-    x = inverse * (abs(z) + 2.0)
+    x = inverse * (abs(z) + 1.5)
     x3 = x * x * x
-    return value, 1e-4 * (deviation * x3) * (deviation * x3) * x + 1e-15 * deviation * abs(z)
+    error = (deviation * x3) * (deviation * x3) * x * (1.5e-4 + 0.8e-4 * x3 * x)
+    return value, error + 1e-15 * deviation * abs(z)

@@ -1,0 +1,175 @@
+"""Constants of an evaluation: linear algebra of parameters alone, done once and not at every step.
+
+A system whose functions have such parts is lowered to one with a longer vector of parameters: the
+user's, followed by the values of these parts, which its functions read. Whatever is compiled for it
+takes the longer vector, which `extension` makes of the user's.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.op import Op
+from pytensor.graph.replace import graph_replace
+from pytensor.graph.traversal import io_toposort
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.math import Dot
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, staged
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+# Functions that are called at every step; the others, once per evaluation.
+_AT_EVERY_STEP = (
+    "transition", "gaussian_transition", "process_noise", "observation", "observation_noise",
+    "observation_logp",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """A system with constants as more parameters; ``extension`` is theta -> (theta, constants).
+
+    ``extension`` is None where there are none, and ``model`` the user's system.
+    """
+
+    model: StateSpaceModel
+    extension: FrozenFunctionGraph | None
+
+
+@lru_cache(maxsize=256)
+def lowered(model: StateSpaceModel) -> Lowered:
+    """The system as it is compiled."""
+    theta = pt.tensor("theta", shape=(model.n_theta,), dtype="float64")
+    traced = {
+        name: _trace(graph, theta)
+        for name, graph in vars(model.equations).items()
+        if graph is not None
+    }
+    constants = [
+        constant
+        for name in _AT_EVERY_STEP
+        if name in traced
+        for constant in _constants(theta, *traced[name])
+    ]
+    if not constants:
+        return Lowered(model, None)
+    ends = model.n_theta + np.cumsum([_size(constant) for constant in constants])
+    whole = pt.tensor("theta", shape=(int(ends[-1]),), dtype="float64")
+    known = {
+        constant: whole[end - _size(constant) : end].reshape(constant.type.shape)
+        for constant, end in zip(constants, ends.tolist(), strict=True)
+    }
+    known[theta] = whole[: model.n_theta]
+    equations = {
+        name: FrozenFunctionGraph.from_io(
+            [whole, *inputs[1:]], graph_replace([output], known, strict=False)
+        )
+        for name, (inputs, output) in traced.items()
+    }
+    new = copy(model)
+    new.__dict__.update(
+        equations=replace(model.equations, **equations),
+        parameters=(*model.parameters, "constants of an evaluation"),
+        parameter_shapes=(*model.parameter_shapes, (int(ends[-1]) - model.n_theta,)),
+    )
+    extended = pt.concatenate([theta, *(constant.ravel() for constant in constants)])
+    extended = pt.specify_shape(extended, whole.type.shape)
+    return Lowered(new, FrozenFunctionGraph.from_io([theta], [extended], dedup_nodes=True))
+
+
+def _trace(
+    graph: FrozenFunctionGraph, theta: TensorVariable
+) -> tuple[list[Variable], TensorVariable]:
+    """Inputs, theta first, and output of a traced function."""
+    inputs = [theta, *(v.type() for v in graph.inputs[1:])]
+    (output,) = graph.bind(inputs)
+    return inputs, output
+
+
+def _constants(
+    theta: TensorVariable, inputs: Sequence[Variable], output: TensorVariable
+) -> list[TensorVariable]:
+    """The largest parts with linear algebra that depend on theta alone."""
+    varying: set[Variable] = set(inputs[1:])
+    heavy: set[Variable] = set()
+    nodes = io_toposort(inputs, [output])
+    for node in nodes:
+        if varying.intersection(node.inputs):
+            varying.update(node.outputs)
+        elif _is_linear_algebra(node.op) or heavy.intersection(node.inputs):
+            heavy.update(node.outputs)
+    read = [v for node in nodes if varying.intersection(node.outputs) for v in node.inputs]
+    found = dict.fromkeys(v for v in [*read, output] if v in heavy)
+    return [v for v in found if v.type.dtype == "float64" and None not in v.type.shape]
+
+
+def _is_linear_algebra(op: Op) -> bool:
+    core = op.core_op if isinstance(op, Blockwise) else op
+    of_pytensor = type(core).__module__.startswith("pytensor.tensor.linalg")
+    return type(core) in ENTRY_POINTS or (of_pytensor and not isinstance(core, Dot))
+
+
+def _size(variable: TensorVariable) -> int:
+    return int(np.prod(variable.type.shape, dtype=int))
+
+
+def extend(extension: FrozenFunctionGraph) -> CompiledFunction:
+    """theta -> (theta, constants), an array."""
+    theta, extended = _symbols(extension)
+    return staged([theta], extended)
+
+
+def pull_back(extension: FrozenFunctionGraph) -> CompiledFunction:
+    """Cotangent of theta from an array: theta, then the cotangent of (theta, constants)."""
+    theta, extended = _symbols(extension)
+    cotangent = extended.type("c_bar")
+    (bar,) = pytensor.grad(None, [theta], known_grads={extended: cotangent})
+    return staged([theta, cotangent], pt.specify_shape(bar, theta.type.shape))
+
+
+def after_extension(
+    extension: CompiledFunction, compiled: CompiledFunction, *, of_many: bool
+) -> CompiledFunction:
+    """A function whose first argument is (theta, constants), as a function of theta."""
+    extended, function = extension.function, compiled.function
+
+    def at_one(theta, *others):
+        return function(extended(theta), *others)
+
+    def at_many(theta, *others):
+        points = np.empty((theta.shape[0], extended(theta[0].copy()).size))
+        for i in range(theta.shape[0]):
+            points[i] = extended(theta[i].copy())
+        return function(points, *others)
+
+    key = key_of(f"after extension {of_many}", extension.key, compiled.key)
+    made = jit(at_many if of_many else at_one, compiled.large)
+    return CompiledFunction(made, key, compiled.large)
+
+
+def between_extensions(
+    extension: CompiledFunction, pullback: CompiledFunction, compiled: CompiledFunction
+) -> CompiledFunction:
+    """A function that returns the cotangent of its first argument, as a function of theta."""
+    extended, pulled_back, function = extension.function, pullback.function, compiled.function
+
+    def derivative(theta, *others):
+        return pulled_back(np.concatenate((theta, function(extended(theta), *others))))
+
+    key = key_of("between extensions", extension.key, pullback.key, compiled.key)
+    return CompiledFunction(jit(derivative, compiled.large), key, compiled.large)
+
+
+def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVariable]:
+    theta = extension.inputs[0].type("theta")
+    (extended,) = extension.bind([theta])
+    return theta, extended
