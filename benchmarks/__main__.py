@@ -3,7 +3,8 @@
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
 writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are.
+package; these parts have a file of their own, and the tables of the others stay as they are. So has
+``--only ode``.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from importlib.metadata import version
 
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
-from benchmarks import cold, demo, growth, likelihoods, noise, report, sampling
+from benchmarks import cold, demo, growth, likelihoods, noise, ode, report, sampling
 from benchmarks.chains import chains
 from benchmarks.cpp import compiler
 from benchmarks.measure import FOLDER, ROOT, Peers
@@ -31,6 +32,7 @@ PARTS = {
     "bootstrap": likelihoods.bootstrap,
     "pf_enkf": likelihoods.pf_enkf,
     "grid": likelihoods.grid,
+    "ode": ode.ode,
     "sampling": lambda peers: sampling.sampling() + chains(),
     "particles": lambda peers: growth.with_particles(),
     "steps": lambda peers: growth.with_steps(),

@@ -92,3 +92,25 @@ def propagate_mass_spring_damper(theta, steps, inputs, normals, x, v):
             x[i] = s + DT * w
             v[i] = w + DT * (force - spring) + scale * z[i]
     return x[0]
+
+
+@by_hand
+def ode_lynx_hare(theta, steps, observed):
+    """Lotka and Volterra's equation by Runge-Kutta steps, with normal errors of the logs."""
+    alpha, beta, gamma, delta, hare, lynx, s_hare, s_lynx = theta
+    h, total, k = 0.02, 0.0, 0
+    for j in range(steps.size):
+        while k < steps[j]:
+            a, A = (alpha - beta * lynx) * hare, (delta * hare - gamma) * lynx
+            x, y = hare + 0.5 * h * a, lynx + 0.5 * h * A
+            b, B = (alpha - beta * y) * x, (delta * x - gamma) * y
+            x, y = hare + 0.5 * h * b, lynx + 0.5 * h * B
+            c, C = (alpha - beta * y) * x, (delta * x - gamma) * y
+            x, y = hare + h * c, lynx + h * C
+            hare += h / 6.0 * (a + 2.0 * b + 2.0 * c + (alpha - beta * y) * x)
+            lynx += h / 6.0 * (A + 2.0 * B + 2.0 * C + (delta * x - gamma) * y)
+            k += 1
+        u = (observed[j, 0] - math.log(hare)) / s_hare
+        v = (observed[j, 1] - math.log(lynx)) / s_lynx
+        total -= 0.5 * (u * u + v * v) + math.log(2.0 * math.pi * s_hare * s_lynx)
+    return total

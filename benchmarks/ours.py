@@ -18,10 +18,13 @@ from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
 class Likelihood:
     """The log-likelihood of one record by one filter, as a task to time."""
 
-    def __init__(self, system, filter, truth, *, steps=STEPS) -> None:
+    def __init__(self, system, filter, truth, *, steps=STEPS, observed=None) -> None:
         self.system, self.filter, self.steps = system, filter, np.asarray(steps)
         self.at = theta_of(system, truth)
-        self.inputs, self.observed = simulated(system, truth, self.steps)
+        if observed is None:
+            self.inputs, self.observed = simulated(system, truth, self.steps)
+        else:
+            self.inputs, self.observed = np.zeros((0, 0)), observed
 
     def total(self, theta, noise=0, operation=LogLikelihood):
         record = [pytensor.shared(a) for a in (self.steps, self.observed, self.inputs)]

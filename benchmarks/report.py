@@ -23,6 +23,7 @@ KINDS = {
     "steps": Curve,
     "states": Curve,
 }
+ODE = "ode"  # has a file of its own
 # Parts that need no other package.
 OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 
@@ -31,8 +32,18 @@ def write(parts: list[str]) -> str:
     """Write all tables and figures whose parts are stored; return the tables as text."""
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
     own = {part: k for part, k in kept.items() if part in OWN}
-    compared = {part: k for part, k in kept.items() if part not in OWN}
-    return (write_comparison(compared) if compared else "") + (write_own(own) if own else "")
+    ode = {part: k for part, k in kept.items() if part == ODE}
+    compared = {part: k for part, k in kept.items() if part not in OWN and part != ODE}
+    writers = ((write_comparison, compared), (write_own, own), (write_ode, ode))
+    return "".join(write(parts) for write, parts in writers if parts)
+
+
+def write_ode(kept: dict[str, dict]) -> str:
+    """Write the table of an ordinary differential equation."""
+    rows = [Row.of_json(row) for row in kept[ODE]["rows"]]
+    text = machine(kept) + likelihood_tables(rows)
+    (TARGET / "benchmarks_ode.inc").write_text(text)
+    return text
 
 
 def write_comparison(kept: dict[str, dict]) -> str:

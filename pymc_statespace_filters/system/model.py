@@ -45,6 +45,12 @@ class StateSpaceModel:
         ``D Gamma D^T`` at ``e = 0`` (Eq. 4.4), an approximation.
     observation_noise, process_noise : array_like or callable
         Covariances (not standard deviations), or functions of parameters only that return them.
+    process_dist : callable, optional
+        ``f(x, u, t, ...)`` returning a list of PyMC distributions in place of ``process_noise``:
+        the components of ``q``, drawn at every step given the present state. Vectors such as
+        ``pm.Multinomial.dist`` contribute their components, and variables may be parameters of
+        others. `BootstrapPF` draws from them; `EKF`, `UKF`, `IPLF` and `EnKF` have normal variables
+        of the same means and variances.
     observation_dist : callable, optional
         ``f(x, ...)`` returning one PyMC distribution per observable, independent given ``x``.
     observation_logp : callable, optional
@@ -53,6 +59,9 @@ class StateSpaceModel:
         Length of a step where the transition is a function; default 1.
     initial_mean, initial_cov : array_like or callable
         Mean (n,) and covariance (n, n) of the state at step 0; the covariance may be singular.
+    initial_dist : callable, optional
+        ``f(...)`` returning a list in place of both, one entry per state: a PyMC distribution, a
+        number, or an expression of parameters and of other entries.
     states, observables, inputs : sequence of str, optional
         Names; ``inputs`` fixes the length of ``u``.
     shapes : mapping, optional

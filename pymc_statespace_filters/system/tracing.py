@@ -213,7 +213,9 @@ def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, Tens
         noises = [vector.copy(name="q") for vector in (drawn.exact, drawn.surrogate)]
     steps = [functions.transition.step({**values, "q": q}) for q in noises]
     linear = getattr(functions.transition, "linear_in_noise", None)
-    return steps[0], steps[-1] if linear is None else linear().step(values)
+    surrogate = steps[-1] if linear is None else linear().step(values)
+    exact, gaussian = (as_vector("transition", step, symbols.n) for step in (steps[0], surrogate))
+    return exact, gaussian
 
 
 @dataclass(frozen=True)

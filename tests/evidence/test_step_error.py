@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import arviz as az
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
@@ -142,7 +143,13 @@ def test_estimates_with_one_seed_differ_little_and_have_the_models_law():
     "integrator",
     [
         psf.EulerMaruyama(lambda x, a: [-a * x[0], 0.0], [[0.2, 0.1], [0.0, 0.3]], dt=DT),
-        psf.EulerMaruyama(lambda x, a: [-a * x[0], 0.0], [[0.2], [0.3]], dt=DT, substeps=3),
+        # Another gain in each of three substeps, so that noises of the right places are added.
+        psf.EulerMaruyama(
+            lambda x, a: [-a * x[0], 0.0],
+            lambda t: [[0.2], [1.0 + pt.floor(3.0 * t / DT + 1e-6)]],
+            dt=DT,
+            substeps=3,
+        ),
     ],
 )
 def test_coupled_steps_move_by_the_sum_of_the_noise_of_fine_steps(integrator):

@@ -15,6 +15,8 @@ from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER
 from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.pymc_model.prediction_graphs import gaussian_predictions
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])
@@ -237,6 +239,48 @@ def test_the_gradient_is_that_of_the_closed_form():
         theta, steps, DECAY[:, None], np.zeros((251, 0)), 0.0, 0, np.ones(4)
     )
     np.testing.assert_allclose(found, [truth[name] for name in system.parameters], atol=1e-8)
+
+
+def test_boluses_enter_by_input_rows():
+    """One compartment with absorption, doses at 0 and 1.5 hours: the closed form to 1e-8."""
+    between = psf.RungeKutta4(lambda x, ka, k: [-ka * x[0], ka * x[0] - k * x[1]], dt=0.005)
+
+    def step(x, u, t, ka, k):
+        dosed = {"x": x + pt.stack([u[0], 0.0]), "t": t, "q": pt.zeros(0)}
+        return between.step(dosed | {"ka": ka, "k": k})
+
+    system = psf.StateSpaceModel(
+        transition=step, dt=0.005, observation=lambda x: x[1], observation_noise=0.01,
+        initial_mean=[0.0, 0.0], initial_cov=np.zeros((2, 2)), inputs=["dose"],
+    )  # fmt: skip
+    ka, k, times, doses = 1.4, 0.3, np.array([0.5, 1.5, 2.0, 4.0]), np.zeros((800, 1))
+    doses[[0, 300], 0] = 3.0, 2.0
+
+    def after(t, dose):
+        t = np.maximum(t, 0.0)
+        return dose * ka / (ka - k) * (np.exp(-k * t) - np.exp(-ka * t))
+
+    observed = np.array([1.1, 1.8, 2.5, 1.6])
+    truth = stats.norm.logpdf(observed, after(times, 3.0) + after(times - 1.5, 2.0), 0.1)
+    params = {"ka": ka, "k": k}
+    found = psf.log_likelihood(system, psf.EKF(), params, observed, times=times, inputs=doses)
+    np.testing.assert_allclose(found, truth, rtol=0.0, atol=1e-8)
+
+
+def test_predictions_have_the_noise_of_the_sensor_alone():
+    theta = theta_of()
+    record = {"steps": STEPS, "observed": OBSERVED, "inputs": FORCE, "t0": T0, "seed": 0}
+    constants = {name: pt.constant(value) for name, value in record.items()}
+    others = {"name": "d", "dims": ("d_time", "observable"), "score_from": 0}
+    variable = StateSpaceVariable(
+        system=KNOWN, filter=psf.EKF(), theta=pt.dvector(), **constants, **others
+    )
+    graphs = gaussian_predictions(variable)
+    _, mean, cov = (graph.eval({variable.theta: theta}, mode="FAST_COMPILE") for graph in graphs)
+    x = path(theta)[STEPS]
+    seen = np.column_stack([x[:, 0] + THETA["c"] * x[:, 1] ** 2, np.exp(0.3 * x[:, 1])])
+    np.testing.assert_allclose(mean, seen, rtol=1e-12)
+    np.testing.assert_allclose(cov, np.broadcast_to(NOISE, (4, 2, 2)), rtol=1e-12)
 
 
 # Observations of any kind

@@ -304,3 +304,15 @@ def test_a_carried_state_may_be_an_accumulator():
     assert [states[k, 1] for k in (3, 6, 9)] == [ups[k - 3 : k].sum() for k in (3, 6, 9)]
     terms = psf.log_likelihood(system, psf.BootstrapPF(64), {"a": 0.5}, [1.0, 2.0], steps=[3, 6])
     assert np.isfinite(terms).all()
+
+
+def test_counts_that_jump_are_summed_too():
+    system = psf.StateSpaceModel(
+        lambda x, q: [x[0] - q[0], x[1] + q[0]],
+        process_dist=lambda x: [pm.Binomial.dist(x[0], 0.1)],
+        observation_dist=lambda x: [pm.Poisson.dist(x[1] + 0.1)],
+        initial_mean=[1000.0, 0.0], initial_cov=np.zeros((2, 2)), accumulators=["x1"],
+    )  # fmt: skip
+    states = psf.simulate(system, {}, steps=[3, 4, 9], random_seed=1)["states"].values
+    left = -np.diff(states[[0, 3, 4, 9], 0])
+    assert states[[3, 4, 9], 1].tolist() == left.tolist()

@@ -40,6 +40,11 @@ class CoupledNoise:
         """The same with indices in place of names of states."""
         return replace(self, integrator=bound_to_states(self.integrator, states))
 
+    def linear_in_noise(self) -> "CoupledNoise":
+        """The same with the integrator that is linear in its noise, if there is another one."""
+        linear = getattr(self.integrator, "linear_in_noise", None)
+        return self if linear is None else replace(self, integrator=linear())
+
     def noise_size(self, values: Values) -> int:
         """Number of standard normals of one step with finer substeps."""
         return self.factor * self.integrator.noise_size(values)

@@ -58,6 +58,16 @@ from pymc_statespace_filters.compiler.numerics.restricted_domain import log as n
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 _STIRLING_FROM = 17.0  # `stirling_error` reads a table below
 _MOST_STEPS = 100
+# (log Γ(1 + a) + log(1 + a)) / a: 1 - Euler's constant, then (-1)**k (ζ(k) - 1) / k
+_LOG_GAMMA = (
+    2.4836745438024785e-09, -5.183475041970047e-09, 1.0838659214896955e-08,
+    -2.2711094608943164e-08, 4.7698101693639804e-08, -1.0043224823968099e-07,
+    2.1207184805554665e-07, -4.492469198764566e-07, 9.55141213040742e-07, -2.039215753801366e-06,
+    4.374866789907488e-06, -9.439488275268397e-06, 2.050721277567069e-05, -4.492623673813314e-05,
+    9.945751278180853e-05, -0.00022315475845357939, 0.0005096695247430425, -0.001192753911703261,
+    0.0028905103307415234, -0.007385551028673986, 0.020580808427784546, -0.0673523010531981,
+    0.3224670334241132, 0.42278433509846713,
+)  # fmt: skip
 _MEDIUM_FROM, _LARGE_FROM = 2.0, 8.0
 _FARTHEST, _STEEPEST = 4.5, 1.61  # of the fast forms: |z| for shapes below 8, |s| above
 _UNDECIDED = np.inf
@@ -120,6 +130,8 @@ def _valid(z, shape, scale):
 @njit_internal
 def log_gamma_of_one_plus(a):
     """log Γ(1 + a) for a >= 0."""
+    if a < 0.5:
+        return a * polynomial(a, _LOG_GAMMA) - log1p(a)
     product = 1.0
     while a < _STIRLING_FROM:
         a += 1.0
