@@ -19,7 +19,7 @@ from importlib.metadata import version
 
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
-from benchmarks import cold, demo, growth, likelihoods, noise, ode, report, sampling
+from benchmarks import cold, demo, growth, integrators, likelihoods, noise, ode, report, sampling
 from benchmarks.chains import chains
 from benchmarks.cpp import compiler
 from benchmarks.measure import FOLDER, ROOT, Peers
@@ -41,6 +41,7 @@ PARTS = {
     "noise": lambda peers: noise.noise(),
     "cold": lambda peers: cold.cold(),
     "demo": lambda peers: demo.demo(),
+    "integrators": lambda peers: integrators.integrators(),
 }
 
 

@@ -6,7 +6,7 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import figures
+from benchmarks import figures, integrators
 from benchmarks.chains import ChainCost
 from benchmarks.cold import Cold
 from benchmarks.demo import Demo
@@ -31,6 +31,8 @@ OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 def write(parts: list[str]) -> str:
     """Write all tables and figures whose parts are stored; return the tables as text."""
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
+    if found := kept.pop("integrators", None):
+        write_integrators(found["rows"])
     own = {part: k for part, k in kept.items() if part in OWN}
     ode = {part: k for part, k in kept.items() if part == ODE}
     compared = {part: k for part, k in kept.items() if part not in OWN and part != ODE}
@@ -88,6 +90,12 @@ def write_own(kept: dict[str, dict]) -> str:
     text = "\n".join(sections)
     (TARGET / "benchmarks_own.inc").write_text(text)
     return text
+
+
+def write_integrators(rows: list[dict]) -> None:
+    """Write the table of the page on integrators."""
+    text = integrators.table([integrators.Trial(**row) for row in rows])
+    (TARGET / "integrators.inc").write_text(text)
 
 
 def table(head: list[str], lines: list[list[str]]) -> str:

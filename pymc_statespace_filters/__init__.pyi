@@ -47,7 +47,14 @@ from .pymc_model.distribution import StateSpace
 from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
-from .system.integrators import EulerMaruyama, ExactLinear, Milstein, RungeKutta4, SemiImplicitEuler
+from .system.integrators import (
+    EulerMaruyama,
+    ExactLinear,
+    LocalLinearization,
+    Milstein,
+    RungeKutta4,
+    SemiImplicitEuler,
+)
 from .system.model import StateSpaceModel
 from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.record import nearest_steps
@@ -71,6 +78,7 @@ __all__ = [
     "GradientUnavailableError",
     "GridFilter",
     "GuidedPF",
+    "LocalLinearization",
     "LoweringError",
     "MaximumLikelihoodEstimate",
     "Milstein",

@@ -2,10 +2,11 @@
 
 import pickle
 
+import numba
 import numpy as np
 import pytensor.tensor as pt
 import pytest
-from scipy.integrate import quad_vec
+from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import pymc_statespace_filters as psf
@@ -75,8 +76,8 @@ def forced_exactly(start, n_steps, dt, u):
 def of_forced(name, dt, substeps=1):
     if name == "SemiImplicitEuler":
         return psf.SemiImplicitEuler(forced, dt=dt, velocities=[1], substeps=substeps)
-    if name == "RungeKutta4":
-        return psf.RungeKutta4(forced, dt=dt, substeps=substeps)
+    if name in ("RungeKutta4", "LocalLinearization"):
+        return getattr(psf, name)(forced, None, dt=dt, substeps=substeps)
     return getattr(psf, name)(forced, np.zeros((2, 1)), dt=dt, substeps=substeps)
 
 
@@ -84,6 +85,7 @@ def of_forced(name, dt, substeps=1):
     ("name", "order", "numbers"),
     [
         ("RungeKutta4", 4, [8, 12, 16, 24]),
+        ("LocalLinearization", 2, [16, 24, 32, 48]),
         ("SemiImplicitEuler", 1, [64, 128, 192, 256]),
         ("EulerMaruyama", 1, [64, 128, 192, 256]),
     ],
@@ -310,6 +312,40 @@ def test_two_exact_steps_are_one_of_twice_the_length():
     np.testing.assert_allclose(values[1], values[0], rtol=1e-11)
 
 
+def test_local_linearization_is_exact_for_linear_equations():
+    """Mean and covariance of a step, for noise on one state alone and for none."""
+    a, b, offset, dt = OSCILLATOR, np.array([[0.0], [0.3]]), np.array([0.0, -1.0]), 0.7
+
+    def drift(x):
+        return [x[1], -4.0 * x[0] - 0.2 * x[1] - 1.0]
+
+    phi, moved, cov = exact_moments(a, b, offset, dt)
+    for diffusion in (b, None):
+        integrator = psf.LocalLinearization(drift, diffusion, dt=dt)
+        X, Z = np.zeros((2, BLOCK)), np.zeros((1, 2, BLOCK))
+        X[:, :2] = Z[0, :, 2:4] = np.eye(2)
+        found = ends(system_of(integrator), {}, X, 1, None if diffusion is None else Z)
+        np.testing.assert_allclose(found[:, :2], phi + moved[:, None], rtol=1e-9)
+        root = found[:, 2:4] - moved[:, None]
+        expected = 0 * cov if diffusion is None else cov
+        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6, atol=1e-13)
+
+
+def test_local_linearization_follows_a_stiff_decay():
+    """The relaxation oscillator on its slow branch, with steps 7.5 times its time constant."""
+
+    def relaxation(x, mu):
+        return [x[1], mu * (1.0 - x[0] ** 2) * x[1] - x[0]]
+
+    system = system_of(psf.LocalLinearization(relaxation, None, dt=0.05), mean=(2.0, 0.0))
+    X = np.repeat(np.array([[2.0], [0.0]]), BLOCK, axis=1)
+    found = ends(system, {"mu": 50.0}, X, 200)[:, 0]
+    exact = solve_ivp(
+        lambda t, x: relaxation(x, 50.0), (0.0, 10.0), [2.0, 0.0], "Radau", rtol=1e-9, atol=1e-9
+    ).y[:, -1]
+    np.testing.assert_allclose(found, exact, rtol=1e-3)
+
+
 def test_constants_of_an_evaluation_are_not_part_of_a_step():
     """The step reads the matrices of an exact step; filters see a linear system."""
     integrator = psf.ExactLinear(lambda k: [[0.0, 1.0], [-k, 0.0]], np.eye(2), dt=0.5)
@@ -351,6 +387,7 @@ EVERY = {
     "RungeKutta4": psf.RungeKutta4(pull, spread, dt=0.2),
     "SemiImplicitEuler": psf.SemiImplicitEuler(pull, spread, dt=0.2, velocities=["v"]),
     "Milstein": psf.Milstein(pull, lambda x, s: [[0.0], [s * x[0]]], dt=0.2),
+    "LocalLinearization": psf.LocalLinearization(pull, spread, dt=0.2),
     "ExactLinear": psf.ExactLinear(
         lambda k: [[0.0, 1.0], [-k, -0.3]], spread, dt=0.2, offset=lambda k: [0.0, 0.1 * k]
     ),
@@ -386,7 +423,9 @@ def test_the_gradient_of_the_ekf_is_that_of_finite_differences(name):
     inputs = np.array([[0.3], [-1.0], [2.0], [0.5]])[:, : system.n_inputs]
     machine, point = compile_system(system), np.array([4.0, 0.6])
     gradient = psf.EKF().compile_gradient(machine).function
-    found = gradient(point, STEPS, Y, inputs, 0.0, 0, np.array([1.0, -2.0]))
+    found = numba.njit(lambda *arguments: gradient(*arguments))(
+        point, STEPS, Y, inputs, 0.0, 0, np.array([1.0, -2.0])
+    )
 
     def value(theta):
         params = dict(zip(system.parameters, theta, strict=True))
@@ -464,6 +503,10 @@ BAD = {
     "noise of the state": (
         lambda: system_of(psf.RungeKutta4(lambda x: -x, lambda x: [[0.0], [x[0]]], dt=0.1)),
         "diffusion must not depend on the state x in RungeKutta4.*Milstein or EulerMaruyama",
+    ),
+    "noise of the state in a tangent": (
+        lambda: system_of(psf.LocalLinearization(lambda x: -x, lambda x: [[0.0], [x[0]]], dt=0.1)),
+        "diffusion must not depend on the state x in LocalLinearization",
     ),
     "no diffusion": (
         lambda: psf.Milstein(pull, None, dt=0.1),

@@ -5,6 +5,7 @@ Each is one file with its equation, its order and where it is stable. `protocol`
 
 from pymc_statespace_filters.system.integrators.euler_maruyama import EulerMaruyama
 from pymc_statespace_filters.system.integrators.exact_linear import ExactLinear
+from pymc_statespace_filters.system.integrators.local_linearization import LocalLinearization
 from pymc_statespace_filters.system.integrators.milstein import Milstein
 from pymc_statespace_filters.system.integrators.protocol import Integrator
 from pymc_statespace_filters.system.integrators.runge_kutta import RungeKutta4
@@ -14,6 +15,7 @@ __all__ = [
     "EulerMaruyama",
     "ExactLinear",
     "Integrator",
+    "LocalLinearization",
     "Milstein",
     "RungeKutta4",
     "SemiImplicitEuler",
