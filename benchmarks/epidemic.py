@@ -1,7 +1,7 @@
-"""A bootstrap filter on a measles-like epidemic, beside pypomp's on the same equations.
+"""A measles-like epidemic, the same equations as in `benchmarks.peers.pypomp_epidemic`.
 
 Births, infections and the exits of every compartment are counts, and the contact rate has gamma
-white noise (as in He, Ionides and King, 2010). 400 weeks of cases, a step a day, 1000 particles.
+white noise (as in He, Ionides and King, 2010). 400 weeks of cases, a step a day.
 """
 
 import numpy as np
@@ -48,3 +48,9 @@ EPIDEMIC = psf.StateSpaceModel(
     states=["S", "E", "I", "cases"],
     observables=["reports"],
 )
+
+
+def record() -> np.ndarray:
+    """Reports of 400 weeks."""
+    run = psf.simulate(EPIDEMIC, TRUTH, steps=STEPS, random_seed=1)
+    return run["observations"].to_numpy()

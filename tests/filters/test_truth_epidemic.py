@@ -3,7 +3,7 @@
 import numpy as np
 import pymc as pm
 import pytest
-from scipy.stats import norm
+from scipy.stats import chisquare, norm
 
 import pymc_statespace_filters as psf
 from tests.references.epidemic import Epidemic, simulate
@@ -88,3 +88,39 @@ def test_moments_of_cases(population, n_weeks, n_paths):
     # The logarithm of a standard deviation of n normals has the standard error 1 / sqrt(2 n);
     # cases of small numbers are a little wider.
     assert np.abs(spread).max() < 1.5 * bound
+
+
+N_REPLICATIONS, N_RANKS = 100, 20
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.FilterWarning")
+def test_ranks_of_the_posterior_are_uniform():
+    """Simulation-based calibration: the truth has any rank among independent draws.
+
+    Two chi-squared tests, each wrong once in 200 runs of a right sampler.
+    """
+    epidemic = Epidemic(1e3, infection=3.0, susceptible=0.3, exposed=0.01, infectious=0.01)
+    system, steps = epidemic_system(epidemic, 1.0), np.arange(7, 106, 7)
+    with pm.Model() as model:
+        pm.LogNormal("infection", np.log(2.0), 0.3)
+        pm.Beta("reported", 6.0, 6.0)
+        data = pm.Data("data", np.zeros((steps.size, 1)))
+        psf.StateSpace("cases", system, psf.BootstrapPF(300), steps=steps, observed=data)
+    rng = np.random.default_rng(0)
+    ranks = {"infection": [], "reported": []}
+    for replication in range(N_REPLICATIONS):
+        truth = {"infection": rng.lognormal(np.log(2.0), 0.3), "reported": rng.beta(6.0, 6.0)}
+        run = psf.simulate(system, truth, steps=steps, random_seed=replication)
+        pm.set_data({"data": run["observations"].values}, model=model)
+        chains = psf.sample_dram(
+            1000, 500, chains=2, cores=2, model=model, random_seed=replication,
+            progressbar=False, compute_convergence_checks=False,
+        )  # fmt: skip
+        for name, found in ranks.items():
+            draws = chains["posterior"][name].values.ravel()
+            thinned = draws[:: len(draws) // (N_RANKS - 1)][: N_RANKS - 1]
+            found.append(np.sum(thinned < truth[name]))
+    for name, found in ranks.items():
+        counts = np.bincount(np.array(found) // 2, minlength=N_RANKS // 2)
+        assert chisquare(counts).pvalue > 0.005, (name, counts)
