@@ -33,6 +33,7 @@ PARTS = {
     "pf_enkf": likelihoods.pf_enkf,
     "grid": likelihoods.grid,
     "ode": ode.ode,
+    "epidemic": likelihoods.epidemic,
     "sampling": lambda peers: sampling.sampling() + chains(),
     "particles": lambda peers: growth.with_particles(),
     "steps": lambda peers: growth.with_steps(),

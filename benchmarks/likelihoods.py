@@ -3,6 +3,7 @@
 import numpy as np
 
 import pymc_statespace_filters as psf
+from benchmarks import epidemic as seir
 from benchmarks import loops, ours
 from benchmarks.cpp import OPTIONS, Cpp
 from benchmarks.measure import FOLDER, N_SEEDS, Peers, Row, compare
@@ -163,6 +164,22 @@ def grid(peers: Peers) -> list[Row]:
             "GridFilter": ours.of("double_well", psf.GridFilter()).value,
             "EKF": ours.of("double_well", psf.EKF()).value,
         },
+    )
+
+
+def epidemic(peers: Peers) -> list[Row]:
+    """One likelihood of counts, with a resampling at every observation in both."""
+    system, truth, record = seir.EPIDEMIC, seir.TRUTH, seir.record()
+    filter = psf.BootstrapPF(1000, resample_below=1.0)
+    by_filter = ours.Likelihood(system, filter, truth, steps=seir.STEPS, observed=record)
+    return compare(
+        "Bootstrap filter, SEIR epidemic, 1000 particles",
+        {
+            OURS: by_filter.value,
+            "pypomp": lambda: peers.task("pypomp_epidemic", "epidemic/bootstrap/1000"),
+        },
+        n_seeds=N_SEEDS,
+        notes={"pypomp": "single precision, approximate counts"},
     )
 
 

@@ -13,6 +13,7 @@ from benchmarks.systems import STEPS, SYSTEMS, simulated, theta_of
 from benchmarks.timing import Timed
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.system.record import check_inputs
 
 
 class Likelihood:
@@ -24,7 +25,7 @@ class Likelihood:
         if observed is None:
             self.inputs, self.observed = simulated(system, truth, self.steps)
         else:
-            self.inputs, self.observed = np.zeros((0, 0)), observed
+            self.inputs, self.observed = check_inputs(None, system, self.steps), observed
 
     def total(self, theta, noise=0, operation=LogLikelihood):
         record = [pytensor.shared(a) for a in (self.steps, self.observed, self.inputs)]

@@ -23,7 +23,8 @@ KINDS = {
     "steps": Curve,
     "states": Curve,
 }
-ODE = "ode"  # has a file of its own
+# Parts with a file of their own.
+SEPARATE = {"ode": "benchmarks_ode.inc", "epidemic": "benchmarks_epidemic.inc"}
 # Parts that need no other package.
 OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 
@@ -34,18 +35,20 @@ def write(parts: list[str]) -> str:
     if found := kept.pop("integrators", None):
         write_integrators(found["rows"])
     own = {part: k for part, k in kept.items() if part in OWN}
-    ode = {part: k for part, k in kept.items() if part == ODE}
-    compared = {part: k for part, k in kept.items() if part not in OWN and part != ODE}
-    writers = ((write_comparison, compared), (write_own, own), (write_ode, ode))
+    separate = {part: k for part, k in kept.items() if part in SEPARATE}
+    compared = {part: k for part, k in kept.items() if part not in OWN | SEPARATE}
+    writers = ((write_comparison, compared), (write_own, own), (write_separate, separate))
     return "".join(write(parts) for write, parts in writers if parts)
 
 
-def write_ode(kept: dict[str, dict]) -> str:
-    """Write the table of an ordinary differential equation."""
-    rows = [Row.of_json(row) for row in kept[ODE]["rows"]]
-    text = machine(kept) + likelihood_tables(rows)
-    (TARGET / "benchmarks_ode.inc").write_text(text)
-    return text
+def write_separate(kept: dict[str, dict]) -> str:
+    """Write the table of each of these parts to its own file."""
+    texts = []
+    for part, k in kept.items():
+        rows = [Row.of_json(row) for row in k["rows"]]
+        texts.append(machine({part: k}) + likelihood_tables(rows))
+        (TARGET / SEPARATE[part]).write_text(texts[-1])
+    return "".join(texts)
 
 
 def write_comparison(kept: dict[str, dict]) -> str:

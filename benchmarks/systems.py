@@ -6,7 +6,7 @@ import numpy as np
 import pytensor.tensor as pt
 
 import pymc_statespace_filters as psf
-from benchmarks import lynx_hare
+from benchmarks import epidemic, lynx_hare
 
 DT = 0.01
 STEPS = np.arange(0, 2001, 20)
@@ -118,5 +118,7 @@ def write_records(path: Path) -> None:
         arrays[f"{name}_inputs"] = inputs[:, 0] if inputs.size else np.zeros(STEPS[-1] + 1)
     arrays["lynx_hare_theta"], arrays["lynx_hare_times"] = lynx_hare.AT, lynx_hare.TIMES
     arrays["lynx_hare_observed"] = lynx_hare.LOGS
+    arrays["epidemic_theta"] = np.array(list(epidemic.TRUTH.values()))
+    arrays["epidemic_steps"], arrays["epidemic_observed"] = epidemic.STEPS, epidemic.record()
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **arrays)

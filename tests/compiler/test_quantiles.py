@@ -107,14 +107,14 @@ def delicate(law):
         jumps = np.where(lower < 0.5, special.ndtri(lower), -special.ndtri(upper))
     jumps = jumps[abs(jumps) < 8.0]
     jumps = jumps[np.linspace(0, len(jumps) - 1, min(len(jumps), 400)).astype(int)]
-    offsets = 10.0 ** rng.uniform(-6, -1, (4, len(jumps))) * [[1.0], [1.0], [-1.0], [-1.0]]
+    offsets = 10.0 ** rng.uniform(-9, -1, (4, len(jumps))) * [[1.0], [1.0], [-1.0], [-1.0]]
     return np.concatenate([grid, (jumps + offsets * np.minimum(1.0, 1 / law.sd)).ravel()])
 
 
 def agrees(form, name, law, parameters):
     z = delicate(law)
     expected, close = law.quantiles(z)
-    assert close.mean() < 0.02  # normals at which rounding of Φ(z) decides
+    assert close.mean() < 0.05  # normals at which rounding of Φ(z) decides
     got = form(name)(z, *parameters)
     np.testing.assert_array_equal(got[~close], expected[~close])
 
@@ -249,6 +249,7 @@ def test_a_million_gamma_draws(normals, shape):
     has_moments(draws, shape, shape, 3.0 * shape**2 + 6.0 * shape)
     probabilities = np.linspace(0, 1, 101)[1:-1]
     edges = np.unique(special.gammaincinv(shape, probabilities))
+    edges = edges[edges > 1e-300]  # smaller draws are 0
     expected = np.diff([0.0, *special.gammainc(shape, edges), 1.0]) * N
     observed = np.diff([0, *np.searchsorted(np.sort(draws), edges, side="right"), N])
     assert merged_pvalue(observed, expected) > LEAST

@@ -28,7 +28,7 @@ class CountLaw:
         tails = np.where(z <= 0.0, self.lower[index], self.upper[index])
         before = np.where(z <= 0.0, self.lower[index - 1], self.upper[index - 1])
         sought = special.ndtr(-abs(z))
-        close = (abs(tails / sought - 1.0) < 1e-10) | (abs(before / sought - 1.0) < 1e-10)
+        close = (abs(tails / sought - 1.0) < 1e-12) | (abs(before / sought - 1.0) < 1e-12)
         return self.first + index.astype(float), close
 
 

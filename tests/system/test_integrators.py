@@ -85,7 +85,7 @@ def of_forced(name, dt, substeps=1):
     ("name", "order", "numbers"),
     [
         ("RungeKutta4", 4, [8, 12, 16, 24]),
-        ("LocalLinearization", 2, [16, 24, 32, 48]),
+        ("LocalLinearization", 1, [16, 24, 32, 48]),
         ("SemiImplicitEuler", 1, [64, 128, 192, 256]),
         ("EulerMaruyama", 1, [64, 128, 192, 256]),
     ],
@@ -331,6 +331,23 @@ def test_local_linearization_is_exact_for_linear_equations():
         np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6, atol=1e-13)
 
 
+def test_order_of_local_linearization_without_time():
+    def pendulum(x):
+        return [x[1], -4.0 * pt.sin(x[0])]
+
+    exact = solve_ivp(
+        lambda t, x: [x[1], -4.0 * np.sin(x[0])], (0.0, 2.0), [1.0, 0.5], rtol=1e-11, atol=1e-12
+    ).y[:, -1]
+    errors, numbers = [], [16, 32, 64]
+    for number in numbers:
+        system = system_of(psf.LocalLinearization(pendulum, None, dt=2.0 / number))
+        X = np.repeat(np.array([[1.0], [0.5]]), BLOCK, axis=1)
+        errors.append(np.linalg.norm(ends(system, {}, X, number)[:, 0] - exact))
+    slope, error = slope_of(1.0 / np.array(numbers), errors)
+    assert abs(slope - 2) < 0.1
+    assert error < 0.05
+
+
 def test_local_linearization_follows_a_stiff_decay():
     """The relaxation oscillator on its slow branch, with steps 7.5 times its time constant."""
 
@@ -392,10 +409,7 @@ EVERY = {
         lambda k: [[0.0, 1.0], [-k, -0.3]], spread, dt=0.2, offset=lambda k: [0.0, 0.1 * k]
     ),
 }
-FILTERS = [
-    psf.UKF(), psf.IPLF(), psf.EnKF(200), psf.BootstrapPF(200), psf.GuidedPF(100),
-    psf.PFEnKF(200),
-]  # fmt: skip
+FILTERS = [psf.UKF(), psf.EnKF(200), psf.GuidedPF(100)]
 STEPS, Y = np.array([2, 4]), np.array([[0.6], [-0.2]])
 
 
@@ -435,12 +449,12 @@ def test_the_gradient_of_the_ekf_is_that_of_finite_differences(name):
     np.testing.assert_allclose(found, numerical, rtol=1e-6)
 
 
-def test_every_filter_takes_an_exact_step():
+def test_each_kind_of_filter_takes_an_exact_step():
     """The steps read constants of the evaluation, in the machine code of each filter."""
     system, params = every("ExactLinear"), {"k": 4.0, "s": 0.6}
     exact = evaluated(system, psf.EKF(), params).sum()
     found = {type(f).__name__: evaluated(system, f, params).sum() for f in FILTERS}
-    for name in ("UKF", "IPLF", "GuidedPF"):
+    for name in ("UKF", "GuidedPF"):
         assert found.pop(name) == pytest.approx(exact, abs=1e-9)
     # Errors of 200 members: some tenths of a nat at most over 100 seeds.
     assert all(abs(value - exact) < 1.0 for value in found.values())

@@ -27,11 +27,11 @@ class LocalLinearization(SubstepIntegrator):
         q_k \sim N\Bigl(0, \int_0^h e^{J s} G G^T e^{J^T s}\, ds\Bigr), \qquad
         J = \frac{\partial f}{\partial x}(x_k)
 
-    with ``h = dt / substeps``. Linear equations have no error. Without noise the order is 2, with
-    additive noise the strong and the weak order are 1. A decay is followed however fast it is, up
-    to some thousand per step, where explicit rules need steps shorter than its time constant.
-    Each step computes a matrix exponential: about ten times the cost of `RungeKutta4` for two
-    states, and growing as the cube of their number. It is meant for a few states.
+    with ``h = dt / substeps``. Linear equations have no error. Without noise the order is 2, or 1
+    if the drift depends on time; with additive noise the strong and the weak order are 1. A decay
+    is followed up to rates of 200 per step, where explicit rules need steps shorter than its time
+    constant. Each step computes a matrix exponential: up to four times the cost of `RungeKutta4`
+    for two states, and growing as the cube of their number. It is meant for a few states.
 
     Parameters
     ----------

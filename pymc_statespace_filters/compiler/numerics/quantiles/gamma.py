@@ -56,6 +56,14 @@ from pymc_statespace_filters.compiler.numerics.restricted_domain import exp as n
 from pymc_statespace_filters.compiler.numerics.restricted_domain import log as normal_log
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
+# As `normal._RATIO`, in t = (x - 4) / (x + 4), to 1.3e-12
+_RATIO = (
+    2.3603940021200563e-07, 3.0017986947938135e-07, -2.1405260871456545e-06,
+    -3.2101140133399333e-06, 1.3222226897259902e-05, 2.1031487012502963e-05,
+    -8.764901859261692e-05, -9.431188918528127e-05, 0.0006948376139524403,
+    -0.00028565901355743486, -0.005002369297093855, 0.017936103227266523, -0.03219783808499743,
+    0.02860036364176472, 0.013999634738051724, -0.09670347731793671, 0.47205320650984467,
+)  # fmt: skip
 _STIRLING_FROM = 17.0  # `stirling_error` reads a table below
 _MOST_STEPS = 100
 # (log Γ(1 + a) + log(1 + a)) / a: 1 - Euler's constant, then (-1)**k (ζ(k) - 1) / k
@@ -84,6 +92,21 @@ def _large(z, a):
 
 
 @inlined
+def _tail(x):
+    """Φ(-x) for 0 <= x <= 37, to 2e-12."""
+    one, four = x + 1.0, x + 4.0
+    inverse = 1.0 / (one * four)
+    ratio = polynomial((x - 4.0) * one * inverse, _RATIO)
+    return normal_exp(-0.5 * x * x) * ratio * (four * inverse)
+
+
+@inlined
+def _exp(y):
+    """exp(y) for y < 709; 0 where it would not be a normal number."""
+    return normal_exp(y) if y > -708.0 else 0.0
+
+
+@inlined
 def _exponential_quantile(e):
     """-log(1 - e) for 0 < e < 1."""
     bits = bits_of(1.0 - e) + ONE_OVER_SQRT_HALF
@@ -105,7 +128,7 @@ def _fitted(fit: Fit) -> Any:
 
     @inlined
     def log_quantile(z, a):
-        p = tail(abs(z))
+        p = _tail(abs(z))
         more = 1.0 + a + centre
         inverse = 1.0 / (a * more)
         rho = -normal_log(p if z <= 0.0 else 1.0 - p) * (more * inverse)
@@ -232,7 +255,7 @@ def gamma_quantile(z, shape, scale):
         y = _medium(z, shape)
     else:
         y = _large(z, shape)
-    return scale * exp(exact_log_gamma(z, shape) if y == _UNDECIDED else y)
+    return scale * _exp(exact_log_gamma(z, shape) if y == _UNDECIDED else y)
 
 
 @njit_internal
@@ -266,5 +289,5 @@ def gamma_block(buffer, z, shape, scale, out, size):
             buffer[out, i] = exact_log_gamma(buffer[z, i], buffer[shape, i])
     for j in range(size):
         i = np.uint64(j)
-        x = buffer[scale, i] * exp(buffer[out, i])
+        x = buffer[scale, i] * _exp(buffer[out, i])
         buffer[out, i] = x if _valid(buffer[z, i], buffer[shape, i], buffer[scale, i]) else np.nan
