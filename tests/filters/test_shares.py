@@ -4,6 +4,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
+import pymc as pm
 import pytest
 from numba import njit
 
@@ -29,6 +30,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
 from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
 from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
+from pymc_statespace_filters.system.record import checked_record
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
@@ -211,6 +213,39 @@ def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filte
     alone = psf.log_likelihood(
         FORCED, filter_, {"a": 0.9}, FORCED_DATA, steps=STEPS, inputs=FORCE, seed=5
     )
+    assert np.array_equal(terms, alone)
+
+
+def test_counts_are_the_same_on_one_and_several_ranks():
+    """Poisson, binomial and gamma noise, a start of their kind, and weekly totals."""
+
+    def events(x, rate):
+        noise = psf.gamma_white_noise(0.5, 1.0)
+        return [pm.Poisson.dist(30.0 * noise), *psf.euler_multinomial(x[0], [rate], 1.0)]
+
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0] + q[0] - q[1], x[1] + q[1]],
+        process_dist=events,
+        observation_dist=lambda x: [pm.Poisson.dist(x[1] + 0.1)],
+        initial_dist=lambda: [pm.Poisson.dist(300.0), 0],
+        states=["here", "left"],
+        accumulators=["left"],
+    )
+    filter_, steps = BootstrapPF(200, resample_below=1), np.array([2, 4, 6])
+    record = checked_record(
+        system, [60.0, 55.0, 70.0], steps=steps, times=None, inputs=None, t0=0.0
+    )
+    arguments = np.array([0.1]), record.steps, record.observed, record.inputs, 0.0, 5
+    results = [
+        result
+        for size in (1, 2, 3)
+        for result in on_ranks(
+            size, lambda ours: distributed_evaluator(system, filter_, ours)(*arguments)
+        )
+    ]
+    terms, _ = assert_all_the_same(results)
+    alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)
+    assert np.isfinite(alone).all()
     assert np.array_equal(terms, alone)
 
 
