@@ -14,6 +14,7 @@ from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.traversal import ancestors, io_toposort
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.math import Prod, Sum
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -32,13 +33,19 @@ class Drawn:
     ``exact`` has the law that the user wrote. In ``surrogate`` each variable is normal, with its
     mean and variance given the variables above it; it is linear in the normals to first order.
     ``is_gaussian`` tells whether the components are known to be jointly normal given the state.
+    ``is_valid`` tells whether no draw of ``exact`` is NaN, as one of invalid parameters is.
     """
 
     normals: TensorVariable
     exact: TensorVariable
     surrogate: TensorVariable
+    is_valid: TensorVariable
     is_discrete: bool
     is_gaussian: bool
+
+    def where_valid(self, vector: TensorVariable) -> TensorVariable:
+        """What is made of ``exact``, NaN where a draw is: a comparison with NaN is only false."""
+        return vector if self.is_gaussian else pt.switch(self.is_valid, vector, np.nan)
 
 
 def trace_distributions(
@@ -58,16 +65,20 @@ def trace_distributions(
         for law, node in zip(laws, variables, strict=True)
     ]
     for node in variables:
+        _check_one_vector(role, node)
         _check_constants(role, node)
     normals = pt.tensor(name, shape=(sum(sizes),), dtype="float64")
     places = {
         node: normals[int(end) - size : int(end)]
         for node, size, end in zip(variables, sizes, np.cumsum(sizes, dtype=int), strict=True)
     }
+    exact, draws = _replaced(role, entries, nodes, places, lambda law: law.draw)
+    surrogate, _ = _replaced(role, entries, nodes, places, lambda law: law.surrogate)
     return Drawn(
         normals,
-        _replaced(role, entries, nodes, places, lambda law: law.draw),
-        _replaced(role, entries, nodes, places, lambda law: law.surrogate),
+        exact,
+        surrogate,
+        ~pt.any(pt.concatenate([pt.isnan(draw).ravel() for draw in (normals, *draws)])),
         any(law.is_discrete for law in laws),
         all(law.is_gaussian for law in laws) and _are_separate(entries, variables),
     )
@@ -127,6 +138,16 @@ def _shape(node: Apply) -> tuple[int, ...]:
     return known
 
 
+def _check_one_vector(role: str, node: Apply) -> None:
+    """Raise for several vectors in one variable."""
+    shape = _shape(node)
+    if node.op.ndim_supp == 1 and len(shape) != 1:
+        raise ModelError(
+            f"{role} must draw one vector by each {law_name(type(node.op))}, got shape {shape}; "
+            "write one distribution for each vector"
+        )
+
+
 def _check_constants(role: str, node: Apply) -> None:
     """Raise for a parameter that is a number outside its domain."""
     parameters = parameters_of(node)
@@ -149,8 +170,11 @@ def _replaced(
     nodes: Sequence[Apply],
     places: Mapping[Apply, TensorVariable],
     function_of: Callable[[Law], Callable],
-) -> TensorVariable:
-    """The entries in one vector, with these variables replaced by functions of their normals."""
+) -> tuple[TensorVariable, list[Variable]]:
+    """The entries in one vector, with these variables replaced by functions of their normals.
+
+    And these functions.
+    """
     known: dict[Variable, Variable] = {}
     for node in nodes:
         inputs = [known.get(variable, variable) for variable in node.inputs]
@@ -165,17 +189,19 @@ def _replaced(
             known.update(zip(node.outputs, _rebuilt(role, node, inputs), strict=True))
     symbols = [as_symbol(role, known.get(entry, entry)) for entry in entries]
     parts = [symbol.dimshuffle("x") if symbol.type.ndim == 0 else symbol for symbol in symbols]
-    return pt.concatenate(parts)
+    return pt.concatenate(parts), [known[_output(node)] for node in places]
 
 
 def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variable]:
     """The outputs of an operation with draws, which are double-precision, among its inputs."""
+    if isinstance(node.op, Sum | Prod):  # of whole numbers, which accumulate as such
+        return [type(node.op)(axis=node.op.axis)(*inputs)]
     try:
         return node.clone_with_new_inputs(list(inputs), strict=False).outputs
     except Exception as error:
         raise ModelError(
             f"{role} must use what it draws as a number, got it in {node.op} ({error}); where it "
-            "is an index, write pt.switch(pt.eq(draw, 0), a, b)"
+            "is an index or a truth value, write pt.switch(pt.eq(draw, 0), a, b)"
         ) from error
 
 

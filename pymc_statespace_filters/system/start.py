@@ -87,4 +87,4 @@ def trace_start(
         mean, cov = graph_replace([mean, jac @ jac.T], {drawn.normals: pt.zeros((m,))})
     if drawn.is_gaussian:
         return Start(mean, cov)
-    return Start(mean, cov, drawn.normals, drawn.exact)
+    return Start(mean, cov, drawn.normals, drawn.where_valid(drawn.exact))

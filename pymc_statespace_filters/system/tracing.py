@@ -215,7 +215,7 @@ def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, Tens
     linear = getattr(functions.transition, "linear_in_noise", None)
     surrogate = steps[-1] if linear is None else linear().step(values)
     exact, gaussian = (as_vector("transition", step, symbols.n) for step in (steps[0], surrogate))
-    return exact, gaussian
+    return exact if drawn is None else drawn.where_valid(exact), gaussian
 
 
 @dataclass(frozen=True)

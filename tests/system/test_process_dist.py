@@ -214,6 +214,38 @@ def test_a_bad_parameter_on_the_way_is_a_failure():
     assert np.isnan(X[: len(distributions)]).all(), X
 
 
+def test_a_bad_parameter_of_what_is_only_compared_is_a_failure():
+    """A comparison with NaN is false: the step would be that of the other category."""
+
+    def system(initial_dist):
+        return psf.StateSpaceModel(
+            transition=lambda x, q: [x[0] + pt.switch(pt.eq(q[0], 1), 1.0, -1.0)],
+            process_dist=lambda x, p: [pm.Bernoulli.dist(p)],
+            observation=lambda x: x[0],
+            observation_noise=1.0,
+            initial_dist=initial_dist,
+        )
+
+    compiled = compile_system(system(lambda p: [pt.switch(pt.eq(pm.Bernoulli.dist(p), 1), 1, 0)]))
+    for theta, fails in ((0.5, False), (1.5, True)):
+        c, X = compiled.prepare.function(np.array([theta])), np.zeros((1, 3))
+        compiled.propagate.function(c, np.zeros((1, 0)), 0, 0.0, np.zeros((1, 3)), X)
+        assert np.isnan(X).all() == fails
+        compiled.initialise.function(c, np.zeros((1, 3)), X)
+        assert np.isnan(X).all() == fails
+
+
+def test_draws_may_be_summed_and_multiplied():
+    """Counts are whole numbers, whose sums PyTensor accumulates as such."""
+    by_sum = system_of(lambda x: pt.sum(pm.Poisson.dist(x, shape=(2, 3)), axis=0))
+    assert by_sum.m == 6
+    found = one_step(by_sum, 0.7, 20_000)
+    np.testing.assert_array_equal(found, np.round(found))
+    assert abs(found.mean() - 1.4) < 5 * np.sqrt(1.4 / 20_000)
+    product = system_of(lambda x: pt.prod(pm.Bernoulli.dist(x, shape=2)))
+    assert abs(one_step(product, 0.7, 20_000).mean() - 0.49) < 5 * 0.5 / np.sqrt(20_000)
+
+
 def test_a_bad_parameter_fails_in_a_counted_way():
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] + q[0]],
@@ -242,7 +274,18 @@ def test_a_bad_parameter_fails_in_a_counted_way():
         (lambda x: pm.Gamma.dist(0.0, x), "alpha of Gamma must be above 0, got 0"),
         (lambda x: pm.Wald.dist(1.0, x), "cannot draw Wald .* knows Bernoulli, Beta,"),
         (lambda x: pm.ZeroInflatedPoisson.dist(0.5, x), r"is pm.Bernoulli.dist\(p\) \*"),
-        (lambda x: pt.eye(2)[pm.Bernoulli.dist(x)][0], "where it is an index, write pt.switch"),
+        (
+            lambda x: pm.MvNormal.dist(np.zeros((2, 2)), np.eye(2), shape=(2, 2)).sum(axis=0),
+            r"must draw one vector by each MvNormal, got shape \(2, 2\)",
+        ),
+        (
+            lambda x: pm.Multinomial.dist(5, [0.5, 0.5], shape=(3, 2)).sum(axis=0),
+            r"must draw one vector by each Multinomial, got shape \(3, 2\)",
+        ),
+        (
+            lambda x: pt.eye(2)[pm.Bernoulli.dist(x)][0],
+            "or a truth value, write pt.switch",
+        ),
         (lambda x: pm.Normal.dist(x, 1, shape=(2, 2)), "scalar or vector distributions"),
         (lambda x: None, "got None"),
         (lambda x: "a", "must return symbols or numbers, got 'a'"),
