@@ -106,10 +106,10 @@ def _written(
 
     def stage(work):
         earlier(work)
-        copy(evaluate(work), work)
+        copy(evaluate(work[:size]), work)  # array code takes the whole of its argument
 
     return CompiledFunction(
-        jit(stage), key_of(f"written {start} {length}", before.key, compiled.key)
+        jit(stage), key_of(f"written {start} {length} {size}", before.key, compiled.key)
     )
 
 
