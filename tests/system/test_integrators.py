@@ -524,7 +524,7 @@ BAD = {
     ),
     "no diffusion": (
         lambda: psf.Milstein(pull, None, dt=0.1),
-        "diffusion must be .* in Milstein, got None; RungeKutta4 takes",
+        "diffusion must be .* in Milstein, got None; RungeKutta4 and SemiImplicitEuler treat",
     ),
     "no diffusion of Euler": (
         lambda: psf.EulerMaruyama(pull, None, 0.1),
