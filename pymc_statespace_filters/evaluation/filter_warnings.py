@@ -9,7 +9,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning
-from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES, NO_FINITE_MEMBER
 from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.filters.recommendation import (
     collapse_remedy,
@@ -46,6 +46,9 @@ def warn_about(
     if failed.any():
         reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
         listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
+        if NO_FINITE_MEMBER in health[failed, 1] and not system.has_gaussian_steps:
+            listed += "; in process_dist a rate below 0, a probability above 1 or a size that is "
+            listed += "not a whole number is drawn as NaN"
         warnings.warn(
             f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations: "
             f"{listed}",

@@ -17,8 +17,7 @@ OUT_OF_MEMORY = 6
 
 FAILURES: dict[int, str] = {
     NONE: "no failure",
-    NO_FINITE_MEMBER: "every member or particle became infinite or NaN, as from a rate below 0 "
-    "or a probability above 1 in process_dist",
+    NO_FINITE_MEMBER: "every member or particle became infinite or NaN",
     COVARIANCE_NOT_POSITIVE: "a covariance of the system or the forecast is not positive definite",
     ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
     NO_PROCESS_NOISE: "the process noise vanished where the state may be",
