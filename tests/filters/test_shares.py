@@ -199,17 +199,22 @@ def test_failures_of_all_members(filter_, theta, outlier, code):
     assert np.all(terms[int(health[2]) :] == -np.inf)
 
 
-@pytest.mark.parametrize("filter_", [EnKF(200), BootstrapPF(200, resample_below=1)], ids=str)
-def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filter_):
-    record = np.array([0.9]), STEPS, FORCED_DATA[:, None], FORCE[:, None], 0.0, 5
+def terms_on_ranks(system, filter_, arguments):
+    """Terms by the evaluator of one, two and three ranks, which are the same."""
     results = [
         result
         for size in (1, 2, 3)
         for result in on_ranks(
-            size, lambda ours: distributed_evaluator(FORCED, filter_, ours)(*record)
+            size, lambda ours: distributed_evaluator(system, filter_, ours)(*arguments)
         )
     ]
-    terms, _ = assert_all_the_same(results)
+    return assert_all_the_same(results)[0]
+
+
+@pytest.mark.parametrize("filter_", [EnKF(200), BootstrapPF(200, resample_below=1)], ids=str)
+def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filter_):
+    record = np.array([0.9]), STEPS, FORCED_DATA[:, None], FORCE[:, None], 0.0, 5
+    terms = terms_on_ranks(FORCED, filter_, record)
     alone = psf.log_likelihood(
         FORCED, filter_, {"a": 0.9}, FORCED_DATA, steps=STEPS, inputs=FORCE, seed=5
     )
@@ -236,14 +241,7 @@ def test_counts_are_the_same_on_one_and_several_ranks():
         system, [60.0, 55.0, 70.0], steps=steps, times=None, inputs=None, t0=0.0
     )
     arguments = np.array([0.1]), record.steps, record.observed, record.inputs, 0.0, 5
-    results = [
-        result
-        for size in (1, 2, 3)
-        for result in on_ranks(
-            size, lambda ours: distributed_evaluator(system, filter_, ours)(*arguments)
-        )
-    ]
-    terms, _ = assert_all_the_same(results)
+    terms = terms_on_ranks(system, filter_, arguments)
     alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)
     assert np.isfinite(alone).all()
     assert np.array_equal(terms, alone)
