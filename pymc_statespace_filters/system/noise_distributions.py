@@ -19,8 +19,8 @@ def euler_multinomial(size: Any, rates: Sequence[Any], dt: Any) -> list[TensorVa
     With the total rate :math:`R = \sum_i r_i`, each member leaves with probability
     :math:`p = 1 - \exp(-R\,dt)`, by exit i with probability :math:`p_i = p\, r_i / R`, independent
     of the others. So exit i takes a number of mean :math:`n p_i`, variance
-    :math:`n p_i (1 - p_i)` and covariance :math:`-n p_i p_j` with exit j, and never do more members
-    leave than there are.
+    :math:`n p_i (1 - p_i)` and covariance :math:`-n p_i p_j` with exit j. All exits together take
+    at most n members.
 
     Parameters
     ----------

@@ -55,8 +55,6 @@ def is_deterministic(system: StateSpaceModel) -> bool:
     False where that cannot be decided.
     """
     symbols, noise_cov = symbols_of(system), system.equations.process_noise
-    if not system.has_gaussian_start:
-        return False
     if not _is_zero(call(system.equations.initial_cov, system, symbols), symbols):
         return False
     if system.m == 0 or is_free_of(
