@@ -10,11 +10,12 @@ from arviz_base import rcParams
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from pymc_statespace_filters.plots.axes import label_rows
+from pymc_statespace_filters.plots.axes import STEPS, label_rows
 from pymc_statespace_filters.plots.legend import DOTS_PER_INCH
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
+N_TICKS = 8  # at most, between which labels of years have room
 
 
 def canvas(
@@ -65,6 +66,8 @@ def canvas(
     if backend == "matplotlib":  # the others write numbers in full
         for axes in collection.viz["figure"].item().axes:
             axes.ticklabel_format(useOffset=False)
+            # Its own ticks, such as 1902.5, touch each other.
+            axes.locator_params(axis="x", nbins=N_TICKS, steps=STEPS)
     return collection
 
 

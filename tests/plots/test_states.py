@@ -185,6 +185,15 @@ def test_numbers_at_the_axes_are_written_in_full():
     assert axes.get_yticklabels()[1].get_text().startswith("4499.")
 
 
+def test_years_at_the_time_axis_are_whole_numbers():
+    years = np.linspace(1900, 1920, 81)
+    group = states_group(np.zeros((1, 10, 81, 1)), ["hare"], years, at="steps")
+    figure = plot_states(xr.DataTree.from_dict({"smoothed_states": group})).viz["figure"].item()
+    figure.canvas.draw()
+    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
+    assert {"1900", "1905", "1910", "1915", "1920"} <= set(labels)
+
+
 @pytest.mark.parametrize(
     ("transform", "data"),
     [
