@@ -188,8 +188,8 @@ def _integers_or_texts(labels: np.ndarray) -> np.ndarray:
     if not (is_label := is_number if is_number.any() else is_text).all():
         row = int(np.argmin(is_label))
         raise ModelError(
-            f"panel must hold integers or texts, got {labels.tolist()[row]!r} in row {row}: every row needs "
-            "the label of its record"
+            f"panel must hold integers or texts, got {labels.tolist()[row]!r} in row {row}: every "
+            "row needs the label of its record"
         )
     return labels.astype("int64" if is_number.any() else object)
 
