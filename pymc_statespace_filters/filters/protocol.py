@@ -63,7 +63,7 @@ class System(Protocol):
         from ``n_theta`` parameters, the user's and these values.
         """
 
-    def derivative_at_parameters(self, compiled: CompiledFunction) -> Any:
+    def derivative_at_parameters(self, compiled: CompiledFunction, *, of_many: bool = False) -> Any:
         """The same for a function that returns the cotangent of its parameters."""
 
     @property

@@ -3,8 +3,8 @@
 The numbers of all lanes are in flat arrays of rows of `LANES`, a row for each element of a vector.
 ``W`` has the parameters, the other vectors, and below these expressions of parameters alone, which
 are computed once. ``states`` has the states of successive steps, and ``forces`` the inputs. Row
-offsets are constants of the source, so LLVM knows that rows do not overlap. The number of lanes is a
-variable, because LLVM would unroll a short loop of known length instead of vectorising it.
+offsets are constants of the source, so LLVM knows that rows do not overlap. The number of lanes is
+a variable, because LLVM would unroll a short loop of known length instead of vectorising it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -70,9 +70,9 @@ def lane_functions(
 ) -> LaneFunctions:
     """Write functions out for lanes; raises NotUnrollableError where there is no scalar form.
 
-    ``rows`` has the first row in ``W`` of each vector, and ``n_rows`` is the first that is free. The
-    first function is to be called whenever parameters are written to their rows: it also computes
-    what the others need of parameters alone.
+    ``rows`` has the first row in ``W`` of each vector, and ``n_rows`` is the first that is free.
+    The first function is to be called whenever parameters are written to their rows: it also
+    computes what the others need of parameters alone.
     """
     first, *others = functions
     values = {

@@ -135,11 +135,14 @@ class CompiledSystem:
             return compiled
         return after_extension(self._extend, compiled, of_many=of_many)
 
-    def derivative_at_parameters(self, compiled: CompiledFunction) -> CompiledFunction:
+    def derivative_at_parameters(
+        self, compiled: CompiledFunction, *, of_many: bool = False
+    ) -> CompiledFunction:
         """The same for a function that returns the cotangent of its first argument."""
         if self._extend is None or self._extension is None:
             return compiled
-        return between_extensions(self._extend, pull_back(self._extension), compiled)
+        pullback = pull_back(self._extension)
+        return between_extensions(self._extend, pullback, compiled, of_many=of_many)
 
     # Functions
 

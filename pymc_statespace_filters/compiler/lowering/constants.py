@@ -157,16 +157,30 @@ def after_extension(
 
 
 def between_extensions(
-    extension: CompiledFunction, pullback: CompiledFunction, compiled: CompiledFunction
+    extension: CompiledFunction,
+    pullback: CompiledFunction,
+    compiled: CompiledFunction,
+    *,
+    of_many: bool,
 ) -> CompiledFunction:
     """A function that returns the cotangent of its first argument, as a function of theta."""
     extended, pulled_back, function = extension.function, pullback.function, compiled.function
 
-    def derivative(theta, *others):
+    def at_one(theta, *others):
         return pulled_back(np.concatenate((theta, function(extended(theta), *others))))
 
-    key = key_of("between extensions", extension.key, pullback.key, compiled.key)
-    return CompiledFunction(jit(derivative, compiled.large), key, compiled.large)
+    def at_many(theta, *others):
+        points = np.empty((theta.shape[0], extended(theta[0].copy()).size))
+        for i in range(theta.shape[0]):
+            points[i] = extended(theta[i].copy())
+        bars, theta_bars = function(points, *others), np.empty(theta.shape)
+        for i in range(theta.shape[0]):
+            theta_bars[i] = pulled_back(np.concatenate((theta[i], bars[i])))
+        return theta_bars
+
+    key = key_of(f"between extensions {of_many}", extension.key, pullback.key, compiled.key)
+    made = jit(at_many if of_many else at_one, compiled.large)
+    return CompiledFunction(made, key, compiled.large)
 
 
 def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVariable]:

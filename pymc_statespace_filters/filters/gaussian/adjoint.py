@@ -75,14 +75,14 @@ def compile_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
 def vjps(recursion: GaussianFilterFunctions, *, explicit: bool) -> dict[str, VectorFunction]:
     """Vector-Jacobian products of the three parts; each adds to ``c_bar``, theta's cotangent.
 
-    They are linear in the cotangent, which is their only input from the later step. If ``explicit``,
-    the rows of the Jacobian for the first elements of the cotangent are computed explicitly: the
-    processor does so ahead of time, and the cotangent then takes one multiplication. The other
-    elements are propagated through the equations, with fewer operations in all. The numbers of
-    explicit elements were chosen by measurement: with ten states rows no longer pay, and twenty
-    would take 15 s to write out. A linearisation that evaluates the equations at many points has
-    none, because each row is as long as a propagation, and records side by side have none, because
-    they fill the time in which a single one waits.
+    They are linear in the cotangent, which is their only input from the later step. If
+    ``explicit``, the row of the Jacobian for each of the first elements of the cotangent is
+    computed explicitly: the processor does so ahead of time, and the cotangent then takes one
+    multiplication. The other elements are propagated through the equations, with fewer operations
+    in all. The numbers of explicit elements were chosen by measurement: with ten states rows no
+    longer pay, and twenty would take 15 s to write out. A linearisation that evaluates the
+    equations at many points has none, because each row is as long as a propagation; records side by
+    side have none, because they fill the time in which a single one waits.
     """
     theta, s = (recursion.predict.graph.inputs[name] for name in ("theta", "s"))
     s_bar, c_bar = s.type("s_bar"), theta.type("c_bar")

@@ -22,6 +22,12 @@ from pymc_statespace_filters.filters.gaussian.linearization import (
     state_size,
     update,
 )
+from pymc_statespace_filters.filters.gaussian.panel import (
+    compile_panel,
+    compile_panel_gradient,
+    compile_panel_pullback,
+    compile_panel_taped,
+)
 from pymc_statespace_filters.filters.gaussian.recursion import (
     GaussianFilterFunctions,
     compile_taped,
@@ -79,6 +85,24 @@ class GaussianFilterBase:
     def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
         """Compile both passes as one function."""
         return system.derivative_at_parameters(compile_gradient(self._functions(system)))
+
+    def compile_panel(self, system: System) -> CompiledFunction:
+        """Compile the likelihood of a panel: theta (G, k), rows (J, 3) -> terms (J,), health."""
+        return system.at_parameters(compile_panel(self._functions(system)), of_many=True)
+
+    def compile_panel_taped(self, system: System) -> CompiledFunction:
+        """Compile the forward pass of a panel, with a third result: the tape."""
+        return system.at_parameters(compile_panel_taped(self._functions(system)), of_many=True)
+
+    def compile_panel_pullback(self, system: System) -> CompiledFunction:
+        """Compile the backward pass of a panel along the tape."""
+        reverse = compile_panel_pullback(self._functions(system))
+        return system.derivative_at_parameters(reverse, of_many=True)
+
+    def compile_panel_gradient(self, system: System) -> CompiledFunction:
+        """Compile both passes of a panel as one function."""
+        gradient = compile_panel_gradient(self._functions(system))
+        return system.derivative_at_parameters(gradient, of_many=True)
 
     def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""

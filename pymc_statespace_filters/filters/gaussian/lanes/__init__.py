@@ -1,0 +1,1 @@
+"""A deterministic filter on several records side by side, one SIMD lane each."""
