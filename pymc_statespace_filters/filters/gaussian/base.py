@@ -124,7 +124,7 @@ class GaussianFilterBase:
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         if system.is_deterministic:
-            return deterministic.filter_functions(system.model.gaussian)
+            return _of_deterministic(system.model.gaussian)
         return _functions(self.linearization, system.model.gaussian)
 
     def _check_gaussian(self, system: System) -> None:
@@ -144,6 +144,10 @@ class GaussianFilterBase:
             )
 
 
+_of_deterministic = lru_cache(maxsize=256)(deterministic.filter_functions)
+
+
+@lru_cache(maxsize=256)
 def _functions(linearization: Linearization, system: StateSpaceModel) -> GaussianFilterFunctions:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
     s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")

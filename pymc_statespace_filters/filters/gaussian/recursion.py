@@ -32,7 +32,7 @@ from pymc_statespace_filters.filters.outcomes import (
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GaussianFilterFunctions:
     """A filter's functions for one system; the first ``system.n`` entries of s are the mean.
 

@@ -6,6 +6,7 @@ records; it is compiled once for all systems, which it is given as tables.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ class CompiledTable(NamedTuple):
     n_rows: int
 
 
+@lru_cache(maxsize=256)
 def forward_table(recursion: GaussianFilterFunctions) -> CompiledTable:
     """The forward pass; raises NotUnrollableError where it cannot be written out in scalars."""
     start, predict, update = recursion.start, recursion.predict, recursion.update
