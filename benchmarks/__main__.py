@@ -3,8 +3,8 @@
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
 writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are. So has
-``--only ode``.
+package; these parts have a file of their own, and the tables of the others stay as they are. So have
+``--only ode``, ``epidemic`` and ``panel``.
 """
 
 import argparse
@@ -19,7 +19,18 @@ from importlib.metadata import version
 
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
-from benchmarks import cold, demo, growth, integrators, likelihoods, noise, ode, report, sampling
+from benchmarks import (
+    cold,
+    demo,
+    growth,
+    integrators,
+    likelihoods,
+    noise,
+    ode,
+    panel,
+    report,
+    sampling,
+)
 from benchmarks.chains import chains
 from benchmarks.cpp import compiler
 from benchmarks.measure import FOLDER, ROOT, Peers
@@ -34,6 +45,7 @@ PARTS = {
     "grid": likelihoods.grid,
     "ode": ode.ode,
     "epidemic": likelihoods.epidemic,
+    "panel": panel.panel,
     "sampling": lambda peers: sampling.sampling() + chains(),
     "particles": lambda peers: growth.with_particles(),
     "steps": lambda peers: growth.with_steps(),

@@ -24,7 +24,11 @@ KINDS = {
     "states": Curve,
 }
 # Parts with a file of their own.
-SEPARATE = {"ode": "benchmarks_ode.inc", "epidemic": "benchmarks_epidemic.inc"}
+SEPARATE = {
+    "ode": "benchmarks_ode.inc",
+    "epidemic": "benchmarks_epidemic.inc",
+    "panel": "benchmarks_panel.inc",
+}
 # Parts that need no other package.
 OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
 
