@@ -3,8 +3,8 @@
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
 writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are. So have
-``--only ode``, ``epidemic`` and ``panel``.
+package; these parts have a file of their own, and the tables of the others stay as they are. So
+have ``--only ode``, ``epidemic`` and ``panel``.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Many records of one system: a panel, and the single likelihood record by record.
 
 100 records of 50 observations, 20 steps apart, each with parameters of its own. The panel is the
-operation that a PyMC model has; the single kernels are called in a compiled loop. Times are for each
-record.
+operation that a PyMC model has; the single kernels are called in a compiled loop. Times are for
+each record.
 """
 
 import numba

@@ -27,7 +27,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     arguments_class,
 )
 
-LANES = 16  # at most
+LANES = 32  # at most
 LANES_AT_ONCE = 8  # the number of lanes is a multiple of this
 
 LANE_ARGUMENTS = {

@@ -26,7 +26,7 @@ def compile_panel(recursion: GaussianFilterFunctions) -> CompiledFunction:
     FIND_RECORDS.compile()
 
     def panel(theta, rows, observed, inputs, t0, seed):
-        records, _ = records_of(rows, theta.shape[0])
+        records, _ = records_of(rows, theta.shape[0], False)
         terms, of_records, _ = run(theta, records, rows, observed, inputs, t0, rows.shape[0], 0)
         return terms, _first_failure(of_records)
 
@@ -43,7 +43,7 @@ def compile_panel_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
     FIND_RECORDS.compile()
 
     def panel(theta, rows, observed, inputs, t0, seed):
-        records, n_states = records_of(rows, theta.shape[0])
+        records, n_states = records_of(rows, theta.shape[0], True)
         terms, of_records, tape = run(
             theta, records, rows, observed, inputs, t0, rows.shape[0], n_states
         )
@@ -74,7 +74,7 @@ def compile_panel_pullback(recursion: GaussianFilterFunctions) -> CompiledFuncti
     def reverse(theta, rows, observed, inputs, t0, seed, tape, terms_bar):
         if tape.shape[0] == 0:
             return np.zeros(theta.shape)
-        records, _ = records_of(rows, theta.shape[0])
+        records, _ = records_of(rows, theta.shape[0], False)
         return run(theta, records, rows, observed, inputs, t0, tape, terms_bar)
 
     return CompiledFunction(jit(reverse), key_of("reverse panel", backward.key, FIND_RECORDS.key))

@@ -17,8 +17,12 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.gaussian.lanes.forward import PASS_ARGUMENTS
 from pymc_statespace_filters.filters.gaussian.lanes.group import (
+    END,
+    N_OF_LANE,
     N_OF_RECORD,
+    NEXT_STEP,
     POINT,
+    ROW,
     STRETCH,
     call,
     copy,
@@ -28,7 +32,6 @@ from pymc_statespace_filters.filters.gaussian.lanes.group import (
     load_parameters,
     n_lanes_of,
     n_stretches,
-    new_lanes,
     retreat,
     rows_of,
     workspace,
@@ -51,7 +54,7 @@ _Arguments = arguments_class("_Arguments", _ARGUMENTS, __name__)
 
 def _backward(
     forward, table, theta, records, n_records, rows, n_rows, observed, inputs, n_input_rows, t0, dt,
-    tape, n_taped, terms_bar, theta_bar,
+    tape, n_taped, numbers, places, terms_bar, theta_bar,
 ):  # fmt: skip
     """Write the cotangents of all parameters."""
     f, b = read_table(forward), read_table(table)
@@ -61,10 +64,10 @@ def _backward(
     bars, out = carray(terms_bar, (n_rows,)), carray(theta_bar, (n_records, f.n_theta))
     saved, place = carray(tape, (n_taped * LANES,)), n_taped * LANES
     size, force_size = f.size * LANES, f.n_inputs * LANES
-    W, states, forces = workspace(b.n_rows, f.size, f.n_inputs)
+    W, states, forces = workspace(numbers, b.n_rows, f.size, f.n_inputs)
     d, seen, term_bar = rows_of(W, b.d, b.p), rows_of(W, b.seen, 1), rows_of(W, b.term, 1)
     s_bar, c_bar = rows_of(W, b.s_bar, b.size), rows_of(W, b.c_bar, b.n_theta)
-    s, lanes = states[:size], new_lanes()
+    s, lanes = states[:size], carray(places, (N_OF_LANE, LANES))
     for first in range(LANES * ((n_records - 1) // LANES), -1, -LANES):
         group = order[first : min(first + LANES, n_records)]
         n_lanes = n_lanes_of(group)
@@ -82,7 +85,7 @@ def _backward(
                 n_steps = k - start
                 place -= size
                 copy(saved[place:], s)
-                load_inputs(pushes, lanes.first_input, start, n_steps + 1, forces)
+                load_inputs(pushes, lanes, start, n_steps + 1, forces)
                 call(f.predict, W, n_lanes, states, forces, t0, dt, start, n_steps)
                 if any_seen and k == row:
                     last, push = states[n_steps * size :], forces[n_steps * force_size :]
@@ -105,11 +108,11 @@ def _observe(
     for lane in range(LANES):
         seen[lane] = 0.0
     for lane in range(records.shape[0]):
-        if lanes.next_step[lane] != k:
+        if lanes[NEXT_STEP, lane] != k:
             continue
-        j = lanes.row[lane]
+        j = lanes[ROW, lane]
         retreat(lanes, lane, records, rows)
-        if j + 1 == lanes.end[lane]:
+        if j + 1 == lanes[END, lane]:
             for i in range(lane, s_bar.size, LANES):
                 s_bar[i] = 0.0
             for i in range(lane, c_bar.size, LANES):
@@ -134,16 +137,19 @@ def backward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
     forward, dt = forward_table(recursion), recursion.system.dt
     backward = backward_table(recursion, forward)
     make_forward, make_backward = forward.make, backward.make
+    n_numbers = backward.n_numbers
     _BACKWARD.compile()
     reverse = _BACKWARD.symbol
 
     def run(theta, records, rows, observed, inputs, t0, tape, terms_bar):
-        theta_bar = np.empty(theta.shape)
+        theta_bar, numbers = np.empty(theta.shape), np.empty(n_numbers)
+        places = np.empty((N_OF_LANE, LANES), np.int64)
         arguments = _Arguments(
             forward=make_forward(), table=make_backward(), theta=theta, records=records,
             n_records=theta.shape[0], rows=rows, n_rows=rows.shape[0], observed=observed,
             inputs=inputs, n_input_rows=inputs.shape[0], t0=t0, dt=dt, tape=tape,
-            n_taped=tape.shape[0], terms_bar=terms_bar, theta_bar=theta_bar,
+            n_taped=tape.shape[0], numbers=numbers, places=places, terms_bar=terms_bar,
+            theta_bar=theta_bar,
         )  # fmt: skip
         call_address(address_of(reverse), arguments)
         return theta_bar

@@ -21,11 +21,15 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 )
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.gaussian.lanes.group import (
+    ALIVE,
     BEGIN,
+    N_OF_LANE,
     N_OF_RECORD,
     N_ROWS,
     NEVER,
+    NEXT_STEP,
     POINT,
+    ROW,
     SHIFT,
     STRETCH,
     advance,
@@ -37,7 +41,6 @@ from pymc_statespace_filters.filters.gaussian.lanes.group import (
     load_parameters,
     n_lanes_of,
     n_stretches,
-    new_lanes,
     rows_of,
     workspace,
 )
@@ -55,9 +58,10 @@ PASS_ARGUMENTS = {
     "table": I64_PTR, "theta": F64_PTR, "records": I64_PTR, "n_records": types.intp,
     "rows": I64_PTR, "n_rows": types.intp, "observed": F64_PTR, "inputs": F64_PTR,
     "n_input_rows": types.intp, "t0": types.float64, "dt": types.float64, "tape": F64_PTR,
-    "n_taped": types.intp,
+    "n_taped": types.intp, "numbers": F64_PTR, "places": I64_PTR,
 }  # fmt: skip
-"""``records`` are those of `records`, in their order; the tape has the shape (n_taped, LANES)."""
+"""``records`` are those of `records`, in their order; the tape has the shape (n_taped, LANES).
+``numbers`` and ``places`` are for `group.workspace` and the integers of all lanes."""
 
 _ARGUMENTS = PASS_ARGUMENTS | {"terms": F64_PTR, "health": F64_PTR}
 
@@ -66,7 +70,7 @@ _Arguments = arguments_class("_Arguments", _ARGUMENTS, __name__)
 
 def _forward(
     table, theta, records, n_records, rows, n_rows, observed, inputs, n_input_rows, t0, dt, tape,
-    n_taped, terms, health,
+    n_taped, numbers, places, terms, health,
 ):  # fmt: skip
     """Write all terms, and the health (G, 3) of each record; no tape is written if it has no rows.
 
@@ -79,19 +83,19 @@ def _forward(
     out, of_records = carray(terms, (n_records * n_rows,)), carray(health, (n_records, 3))
     saved, place = carray(tape, (n_taped * LANES,)), 0
     size, force_size = f.size * LANES, f.n_inputs * LANES
-    W, states, forces = workspace(f.n_rows, f.size, f.n_inputs)
+    W, states, forces = workspace(numbers, f.n_rows, f.size, f.n_inputs)
     d, seen, term = rows_of(W, f.d, f.p), rows_of(W, f.seen, 1), rows_of(W, f.term, 1)
-    s, lanes, alive = states[:size], new_lanes(), np.empty(LANES, np.bool_)
+    s, lanes = states[:size], carray(places, (N_OF_LANE, LANES))
     for first in range(0, n_records, LANES):
         group = order[first : min(first + LANES, n_records)]
         n_lanes = n_lanes_of(group)
         load_parameters(f.n_theta, points, group, W)
         begin(lanes, group, panel)
-        _set_out(group, out, of_records, alive)
+        n_alive = _set_out(lanes, group, out, of_records)
         call(f.prepare, W, n_lanes, states, forces, t0, dt, 0, 1)
         copy(states[size:], s)
         k = 0
-        while alive[: group.shape[0]].any():
+        while n_alive:
             step = earliest(lanes)
             if step == NEVER:
                 break
@@ -102,41 +106,44 @@ def _forward(
                     copy(s, saved[place : place + size])
                     place += size
                 n_steps = min(STRETCH, step - k)
-                load_inputs(pushes, lanes.first_input, k, n_steps + 1, forces)
+                load_inputs(pushes, lanes, k, n_steps + 1, forces)
                 call(f.predict, W, n_lanes, states, forces, t0, dt, k, n_steps)
                 k += n_steps
             last = states[n_steps * size :]
-            if _observe(lanes, group, panel, data, k, alive, d, seen, out):
+            if _observe(lanes, group, panel, data, k, d, seen, out):
                 call(f.update, W, n_lanes, last, forces[n_steps * force_size :], t0, dt, k, 1)
-                _store_terms(f.n, lanes, group, last, seen, term, alive, out, of_records)
+                n_alive -= _store_terms(f.n, lanes, group, last, seen, term, out, of_records)
                 last = last[size:]
             copy(last, s)
 
 
 @njit_internal
-def _set_out(records, terms, health, alive):
-    """Set all terms to minus infinity; mark the records that fail before their first row."""
+def _set_out(lanes, records, terms, health):
+    """Set all terms to minus infinity; return how many records do not fail before the first row."""
+    n_alive = 0
     for lane in range(records.shape[0]):
-        point, begin = records[lane, POINT], records[lane, BEGIN]
-        alive[lane] = health[point, 1] == NONE
-        if not alive[lane]:
-            health[point, 2] = begin
-        for j in range(begin, begin + records[lane, N_ROWS]):
+        point, first = records[lane, POINT], records[lane, BEGIN]
+        lanes[ALIVE, lane] = health[point, 1] == NONE
+        n_alive += lanes[ALIVE, lane]
+        if not lanes[ALIVE, lane]:
+            health[point, 2] = first
+        for j in range(first, first + records[lane, N_ROWS]):
             terms[records[lane, SHIFT] + j] = -np.inf
+    return n_alive
 
 
 @njit_internal
-def _observe(lanes, records, rows, observed, k, alive, d, seen, terms):
+def _observe(lanes, records, rows, observed, k, d, seen, terms):
     """Load the rows of step k; return whether a lane observes. A missing row has the term 0."""
     any_seen = False
     for lane in range(LANES):
         seen[lane] = 0.0
     for lane in range(records.shape[0]):
-        if lanes.next_step[lane] != k:
+        if lanes[NEXT_STEP, lane] != k:
             continue
-        j = lanes.row[lane]
+        j = lanes[ROW, lane]
         advance(lanes, lane, rows)
-        if not alive[lane]:
+        if not lanes[ALIVE, lane]:
             continue
         if is_missing(observed, j):
             terms[records[lane, SHIFT] + j] = 0.0
@@ -148,21 +155,24 @@ def _observe(lanes, records, rows, observed, k, alive, d, seen, terms):
 
 
 @njit_internal
-def _store_terms(n, lanes, records, s, seen, term, alive, terms, health):
-    """Store the finite terms of an update; a record without one fails there."""
+def _store_terms(n, lanes, records, s, seen, term, terms, health):
+    """Store the finite terms of an update; return how many records have none and fail there."""
+    n_failed = 0
     for lane in range(records.shape[0]):
         if seen[lane] == 0.0:
             continue
-        point, j = records[lane, POINT], lanes.row[lane] - 1
+        point, j = records[lane, POINT], lanes[ROW, lane] - 1
         if np.isfinite(term[lane]):
             terms[records[lane, SHIFT] + j] = term[lane]
             continue
-        alive[lane] = False
+        lanes[ALIVE, lane] = 0
+        n_failed += 1
         finite = True
         for i in range(n):  # such an update leaves the state as it is
             finite &= np.isfinite(s[i * LANES + lane])
         health[point, 1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
         health[point, 2] = j
+    return n_failed
 
 
 _FORWARD = EntryPoint(_forward, _ARGUMENTS, "lanes_forward", digest("lanes_forward"))
@@ -176,7 +186,7 @@ def forward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """
     table, valid = forward_table(recursion), covariance_check(recursion.system)
     make_table, has_valid_covariances = table.make, valid.function
-    dt, size = recursion.system.dt, recursion.size
+    dt, size, n_numbers = recursion.system.dt, recursion.size, table.n_numbers
     _FORWARD.compile()
     forward = _FORWARD.symbol
 
@@ -188,10 +198,12 @@ def forward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
             is_valid = has_valid_covariances(theta[record])
             health[record, 0], health[record, 2] = np.inf, -1.0
             health[record, 1] = NONE if is_valid else COVARIANCE_NOT_POSITIVE
+        numbers, places = np.empty(n_numbers), np.empty((N_OF_LANE, LANES), np.int64)
         arguments = _Arguments(
             table=make_table(), theta=theta, records=records, n_records=n_records, rows=rows,
             n_rows=rows.shape[0], observed=observed, inputs=inputs, n_input_rows=inputs.shape[0],
-            t0=t0, dt=dt, tape=tape, n_taped=tape.shape[0], terms=terms, health=health,
+            t0=t0, dt=dt, tape=tape, n_taped=tape.shape[0], numbers=numbers, places=places,
+            terms=terms, health=health,
         )  # fmt: skip
         call_address(address_of(forward), arguments)
         return terms, health, tape

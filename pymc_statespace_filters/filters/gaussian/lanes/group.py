@@ -1,12 +1,12 @@
 """The records of one group in lanes: their rows, parameters and inputs, and calls for all of them.
 
 All lanes go through the same steps. A lane observes where its own record has a row; one whose
-record has ended goes on without effect.
+record has ended goes on without effect. All arrays are at addresses that the caller keeps, so that
+no references to them are counted.
 """
 
-from typing import NamedTuple
-
 import numpy as np
+from numba import carray
 
 from pymc_statespace_filters.compiler.codegen.simd import LANES, LANES_AT_ONCE, LaneArguments
 from pymc_statespace_filters.compiler.native.entry_point import call_address
@@ -24,17 +24,11 @@ NEVER = np.int64(2**62)
 """Later than any step."""
 
 
-class Lanes(NamedTuple):
-    """Where the records of a group are, lane by lane.
-
-    ``row`` is the next row of a record, ``end`` the row behind its last, ``next_step`` the step of
-    its next row, `NEVER` behind the last. ``first_input`` is the row of the inputs at step 0.
-    """
-
-    row: np.ndarray
-    end: np.ndarray
-    next_step: np.ndarray
-    first_input: np.ndarray
+# Rows of integers of all lanes: the next row of the record in the table, the row behind its last,
+# the step of its next row (`NEVER` behind the last), the row of the inputs at step 0, and whether
+# the record has not failed.
+ROW, END, NEXT_STEP, FIRST_INPUT_ROW, ALIVE = range(5)
+N_OF_LANE = 5
 
 
 @inline_always
@@ -44,29 +38,22 @@ def n_stretches(n_steps):
 
 
 @njit_internal
-def new_lanes():
-    """Lanes without records."""
-    empty = np.empty(LANES, np.int64)
-    return Lanes(empty, empty.copy(), empty.copy(), empty.copy())
-
-
-@njit_internal
 def begin(lanes, records, rows):
     """Put every lane before the first row of its record; spare lanes have none."""
     for lane in range(LANES):
         record = min(lane, records.shape[0] - 1)
         row, n_rows = records[record, BEGIN], records[record, N_ROWS]
-        lanes.row[lane], lanes.end[lane] = row, row + n_rows
-        lanes.next_step[lane] = rows[row, STEP] if lane == record and n_rows else NEVER
-        lanes.first_input[lane] = rows[row, FIRST_INPUT] if n_rows else 0
+        lanes[ROW, lane], lanes[END, lane] = row, row + n_rows
+        lanes[NEXT_STEP, lane] = rows[row, STEP] if lane == record and n_rows else NEVER
+        lanes[FIRST_INPUT_ROW, lane] = rows[row, FIRST_INPUT] if n_rows else 0
 
 
 @inline_always
 def advance(lanes, lane, rows):
     """Go to the next row of a record."""
-    row = lanes.row[lane] + 1
-    lanes.row[lane] = row
-    lanes.next_step[lane] = rows[row, STEP] if row < lanes.end[lane] else NEVER
+    row = lanes[ROW, lane] + 1
+    lanes[ROW, lane] = row
+    lanes[NEXT_STEP, lane] = rows[row, STEP] if row < lanes[END, lane] else NEVER
 
 
 @njit_internal
@@ -74,7 +61,7 @@ def earliest(lanes):
     """The next step at which a record has a row, `NEVER` if none has."""
     step = NEVER
     for lane in range(LANES):
-        step = min(step, lanes.next_step[lane])
+        step = min(step, lanes[NEXT_STEP, lane])
     return step
 
 
@@ -83,17 +70,17 @@ def end(lanes, records, rows):
     """Put every lane at the last row of its record, to go back from there: see `retreat`."""
     begin(lanes, records, rows)
     for lane in range(LANES):
-        row = lanes.end[lane] - 1
-        lanes.row[lane] = row
-        lanes.next_step[lane] = rows[row, STEP] if lane < records.shape[0] else -1
+        row = lanes[END, lane] - 1
+        lanes[ROW, lane] = row
+        lanes[NEXT_STEP, lane] = rows[row, STEP] if lane < records.shape[0] else -1
 
 
 @inline_always
 def retreat(lanes, lane, records, rows):
     """Go back to the row before; ``next_step`` is then its step, -1 before the first."""
-    row = lanes.row[lane] - 1
-    lanes.row[lane] = row
-    lanes.next_step[lane] = rows[row, STEP] if row >= records[lane, BEGIN] else -1
+    row = lanes[ROW, lane] - 1
+    lanes[ROW, lane] = row
+    lanes[NEXT_STEP, lane] = rows[row, STEP] if row >= records[lane, BEGIN] else -1
 
 
 @njit_internal
@@ -101,7 +88,7 @@ def latest(lanes):
     """The step of the last row that is left, -1 if none is."""
     step = np.int64(-1)
     for lane in range(LANES):
-        step = max(step, lanes.next_step[lane])
+        step = max(step, lanes[NEXT_STEP, lane])
     return step
 
 
@@ -115,22 +102,24 @@ def load_parameters(n_theta, theta, records, W):
 
 
 @njit_internal
-def load_inputs(inputs, first_input, k, n_steps, forces):
+def load_inputs(inputs, lanes, k, n_steps, forces):
     """Write the inputs of some steps; a record that has ended may have none left."""
     last, n = inputs.shape[0] - 1, inputs.shape[1]
+    if n == 0:
+        return
     shared = True
     for lane in range(LANES):
-        shared &= first_input[lane] == first_input[0]
+        shared &= lanes[FIRST_INPUT_ROW, lane] == lanes[FIRST_INPUT_ROW, 0]
     for step in range(n_steps):
         for i in range(n):
             row = forces[(step * n + i) * LANES :]
             if shared:
-                value = inputs[min(first_input[0] + k + step, last), i]
+                value = inputs[min(lanes[FIRST_INPUT_ROW, 0] + k + step, last), i]
                 for lane in range(LANES):
                     row[lane] = value
             else:
                 for lane in range(LANES):
-                    row[lane] = inputs[min(first_input[lane] + k + step, last), i]
+                    row[lane] = inputs[min(lanes[FIRST_INPUT_ROW, lane] + k + step, last), i]
 
 
 @njit_internal
@@ -140,26 +129,30 @@ def copy(source, target):
         target[i] = source[i]
 
 
-@njit_internal
-def _new_rows(n_rows):
-    """Rows of zeros at a multiple of 64 bytes, which a vector instruction reads at once."""
-    numbers = np.empty(n_rows * LANES + 8)
-    skipped = (-numbers.ctypes.data % 64) // 8
-    numbers[:] = 0.0
-    return numbers[skipped : skipped + n_rows * LANES]
-
-
 @inline_always
 def rows_of(W, first, n):
     """Some rows of lanes, without a copy."""
     return W[first * LANES : (first + n) * LANES]
 
 
+@inline_always
+def n_numbers(n_rows, state_size, n_inputs):
+    """The length of what `workspace` divides."""
+    return (n_rows + (STRETCH + 2) * state_size + (STRETCH + 1) * n_inputs) * LANES + 8
+
+
 @njit_internal
-def workspace(n_rows, state_size, n_inputs):
-    """Rows of vectors, states of a stretch and of an update at its end, and their inputs."""
-    states = _new_rows((STRETCH + 2) * state_size)
-    return _new_rows(n_rows), states, _new_rows((STRETCH + 1) * n_inputs)
+def workspace(address, n_rows, state_size, n_inputs):
+    """Rows of vectors, states of a stretch and of an update at its end, and their inputs.
+
+    They begin at a multiple of 64 bytes, which a vector instruction reads at once.
+    """
+    whole = carray(address, (n_numbers(n_rows, state_size, n_inputs),))
+    whole[:] = 0.0
+    first = (-whole.ctypes.data % 64) // 8
+    second = first + n_rows * LANES
+    third = second + (STRETCH + 2) * state_size * LANES
+    return whole[first:second], whole[second:third], whole[third:]
 
 
 @njit_internal

@@ -19,29 +19,30 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.gaussian.lanes.group import (
     BEGIN,
+    N_OF_LANE,
     N_OF_RECORD,
     N_ROWS,
     NEVER,
+    NEXT_STEP,
     POINT,
     SHIFT,
     advance,
     begin,
     earliest,
     n_stretches,
-    new_lanes,
 )
 from pymc_statespace_filters.system.panel import N_COLUMNS, RECORD, STEP
 
 _ARGUMENTS = {
     "rows": I64_PTR, "n_rows": types.intp, "records": I64_PTR, "n_records": types.intp,
-    "n_states": I64_PTR,
+    "places": I64_PTR, "n_states": I64_PTR,
 }  # fmt: skip
 
 _Arguments = arguments_class("_Arguments", _ARGUMENTS, __name__)
 
 
-def _find(rows, n_rows, records, n_records, n_states):
-    """Find the records, and count the states on the tape of their evaluation."""
+def _find(rows, n_rows, records, n_records, places, n_states):
+    """Find the records, and count the states on the tape of their evaluation if there is one."""
     table, found = carray(rows, (n_rows, N_COLUMNS)), np.empty((n_records, N_OF_RECORD), np.int64)
     last = np.empty(n_records, np.int64)
     record = -1
@@ -57,12 +58,14 @@ def _find(rows, n_rows, records, n_records, n_states):
     for i in range(n_records):
         for column in range(N_OF_RECORD):
             sorted[i, column] = found[order[i], column]
-    carray(n_states, (1,))[0] = _count_states(table, sorted)
+    lanes, counted = carray(places, (N_OF_LANE, LANES)), carray(n_states, (1,))
+    if counted[0]:
+        counted[0] = _count_states(table, sorted, lanes)
 
 
 @njit_internal
-def _count_states(rows, records):
-    lanes, total = new_lanes(), 0
+def _count_states(rows, records, lanes):
+    total = 0
     for first in range(0, records.shape[0], LANES):
         group = records[first : min(first + LANES, records.shape[0])]
         begin(lanes, group, rows)
@@ -71,7 +74,7 @@ def _count_states(rows, records):
             total += n_stretches(step - last)
             last = step
             for lane in range(group.shape[0]):
-                if lanes.next_step[lane] == step:
+                if lanes[NEXT_STEP, lane] == step:
                     advance(lanes, lane, rows)
             step = earliest(lanes)
     return total
@@ -84,11 +87,13 @@ _FIND = FIND_RECORDS.symbol
 
 
 @njit_internal
-def records_of(rows, n_records):
-    """The records of a panel, the longest first, and the number of states on a tape."""
+def records_of(rows, n_records, taped):
+    """The records of a panel, the longest first, and the number of states on a tape if taped."""
     records, n_states = np.empty((n_records, N_OF_RECORD), np.int64), np.empty(1, np.int64)
+    places, n_states[0] = np.empty((N_OF_LANE, LANES), np.int64), taped
     arguments = _Arguments(
-        rows=rows, n_rows=rows.shape[0], records=records, n_records=n_records, n_states=n_states
-    )
+        rows=rows, n_rows=rows.shape[0], records=records, n_records=n_records, places=places,
+        n_states=n_states,
+    )  # fmt: skip
     call_address(address_of(_FIND), arguments)
     return records, n_states[0]

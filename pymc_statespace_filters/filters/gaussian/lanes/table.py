@@ -23,6 +23,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import address_of
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.filters.gaussian.adjoint import vjps
+from pymc_statespace_filters.filters.gaussian.lanes.group import n_numbers
 from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
 
 
@@ -55,11 +56,15 @@ SLOTS = LaneTable(*range(len(LaneTable._fields)))
 
 
 class CompiledTable(NamedTuple):
-    """The compiled function () -> table (an array), the key of the functions, and all rows."""
+    """The compiled function () -> table (an array), the key of the functions, and its sizes.
+
+    Calls need ``n_rows`` rows of vectors, and a workspace of ``n_numbers``.
+    """
 
     make: Any
     key: str | None
     n_rows: int
+    n_numbers: int
 
 
 @lru_cache(maxsize=256)
@@ -154,7 +159,8 @@ def _table(
         return np.array(table)
 
     keys = [entry.key for entry in lanes.entries.values()]
-    return CompiledTable(make, key_of(repr((n, lengths, n_rows)), *keys), n_rows)
+    key = key_of(repr((n, lengths, n_rows)), *keys)
+    return CompiledTable(make, key, n_rows, n_numbers(n_rows, size, n_inputs))
 
 
 @njit_internal
