@@ -17,10 +17,11 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
+from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_finite, shortened
+from pymc_statespace_filters.system.checks import check_finite, is_integer, shortened
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.parameters import check_complete, check_names, numbers
 from pymc_statespace_filters.system.record import (
@@ -35,6 +36,10 @@ from pymc_statespace_filters.system.record import (
 RECORD, STEP, FIRST_INPUT = range(3)
 N_COLUMNS = 3
 
+_OTHER_NUMBER = (
+    "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
+    "records, change the parameter's dimension too"
+)
 # What comes before the messages of a single record's checks.
 _IN = "record {label!r}, whose first row is {first}: "
 
@@ -154,19 +159,10 @@ def records_of(panel: Any) -> Records:
         raise ModelError(
             f"panel must be a vector, the label of the record of each row, got {shortened(panel)}"
         )
-    if labels.dtype.kind == "f" and np.isfinite(labels).all() and (labels % 1 == 0).all():
-        labels = labels.astype("int64")  # a column of integers, as pandas reads one with gaps
-    if labels.dtype.kind in "iu":
-        codes = labels.astype("int64")
-    else:
-        labels = labels.astype(object)
-        for row, label in enumerate(labels):
-            if not isinstance(label, str) or not label:
-                raise ModelError(
-                    f"panel must hold integers or texts, got {label!r} in row {row}: every row "
-                    "needs the label of its record"
-                )
-        codes = np.array([_hash(label) for label in labels], dtype=np.int64)
+    if labels.dtype.kind not in "iu":
+        labels = _integers_or_texts(labels)
+    has_texts = labels.dtype.kind == "O"
+    codes = np.array([_hash(text) for text in labels] if has_texts else labels, dtype=np.int64)
     starts = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1], [True]]))
     seen: dict[Any, int] = {}
     for first in starts[:-1].tolist():
@@ -180,6 +176,22 @@ def records_of(panel: Any) -> Records:
         seen[label] = first
     found = [label.item() if isinstance(label, np.generic) else label for label in seen]
     return Records(found, starts, codes[starts[:-1]])
+
+
+def _integers_or_texts(labels: np.ndarray) -> np.ndarray:
+    """Labels of one kind, integers or objects; tables hold integers also as floats and objects."""
+    if labels.dtype.kind == "f":
+        is_number = np.isfinite(labels) & (labels == np.round(labels))
+    else:
+        is_number = np.array([is_integer(label) for label in labels])
+    is_text = np.array([isinstance(label, str) and label != "" for label in labels])
+    if not (is_label := is_number if is_number.any() else is_text).all():
+        row = int(np.argmin(is_label))
+        raise ModelError(
+            f"panel must hold integers or texts, got {labels.tolist()[row]!r} in row {row}: every "
+            "row needs the label of its record"
+        )
+    return labels.astype("int64" if is_number.any() else object)
 
 
 def _hash(label: str) -> int:
@@ -355,6 +367,9 @@ def symbolic_panel_parameters(
             part = pt.broadcast_to(symbol.reshape((1, size)), (panel.n_records, size))
         else:
             part = symbol.reshape((symbol.shape[0], size))
+            if isinstance(panel.n_records, Variable):
+                fits = pt.eq(symbol.shape[0], panel.n_records)
+                part = CheckAndRaise(ModelError, _OTHER_NUMBER.format(name=name))(part, fits)
         parts.append(pt.cast(part, "float64"))
     return pt.specify_shape(pt.concatenate(parts, axis=1), (None, system.n_theta))
 
