@@ -59,8 +59,7 @@ class PanelStructure(NamedTuple):
 def panel_structure(model: pm.Model) -> PanelStructure | None:
     """Divide the log-density of a model by the records of its panel.
 
-    None without a panel, without variables that are own, or if the value of a term at one record is
-    not known to depend on that record alone. With several panels, the records are those of the one
+    None without a panel of at least two records, or without variables that are own. With several panels, the records are those of the one
     that has most of them.
     """
     sizes = {name: _n_records(model, name) for name in panel_variables(model)}
@@ -68,6 +67,8 @@ def panel_structure(model: pm.Model) -> PanelStructure | None:
         return None
     name = max(sizes, key=lambda name: sizes[name])
     n_records, point = sizes[name], model.initial_point(random_seed=0)
+    if n_records == 1:
+        return None
     own = [
         value
         for value in map(model.rvs_to_values.get, model.free_RVs)

@@ -75,9 +75,7 @@ def forward_table(recursion: GaussianFilterFunctions) -> CompiledTable:
     )
 
 
-def backward_table(
-    recursion: GaussianFilterFunctions, forward: CompiledTable
-) -> CompiledTable:
+def backward_table(recursion: GaussianFilterFunctions, forward: CompiledTable) -> CompiledTable:
     """The backward pass, which calls functions of the forward pass on the same rows."""
     graphs = {name: _of_lanes(part.graph) for name, part in vjps(recursion, explicit=False).items()}
     theta = graphs["predict_vjp"].inputs["theta"]
@@ -141,7 +139,13 @@ def _table(
         entry.compile()
     symbols = [entry.symbol for entry in lanes.entries.values()]
     prepare, predict, update, finish = [*symbols, ""][:4]
-    n, n_rows, d, seen, term = recursion.system.n, lanes.n_rows, rows["d"], rows["seen"], rows["term"]
+    n, n_rows, d, seen, term = (
+        recursion.system.n,
+        lanes.n_rows,
+        rows["d"],
+        rows["seen"],
+        rows["term"],
+    )
     s_bar, c_bar = rows["s_bar"], rows["c_bar"]
 
     @njit_internal
