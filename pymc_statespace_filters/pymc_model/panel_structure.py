@@ -59,8 +59,8 @@ class PanelStructure(NamedTuple):
 def panel_structure(model: pm.Model) -> PanelStructure | None:
     """Divide the log-density of a model by the records of its panel.
 
-    None without a panel of at least two records, or without variables that are own. With several panels, the records are those of the one
-    that has most of them.
+    None without a panel of at least two records, or without variables that are own. With several
+    panels, the records are those of the one that has most of them.
     """
     sizes = {name: _n_records(model, name) for name in panel_variables(model)}
     if not sizes:

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 
 def cached_with(*names: str) -> Callable[[Callable], Any]:
     """A decorator; the machine code depends on the files of this folder with these names."""
-    source = "".join(Path(__file__).with_name(name).read_text() for name in names)
+    source = "".join(Path(__file__).parent.joinpath(name).read_text() for name in names)
 
     def decorate(function: Callable) -> Any:
         key = digest(function.__name__, source)

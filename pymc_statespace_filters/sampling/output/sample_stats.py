@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
-from pymc_statespace_filters.sampling.kernel.record_arrays import N_POPULATION_MOVES
+from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
     FAILURE,

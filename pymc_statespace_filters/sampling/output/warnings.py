@@ -11,7 +11,7 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.lower_chains import LowerChain, lower_chains
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
-from pymc_statespace_filters.sampling.kernel.record_arrays import N_POPULATION_MOVES
+from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
     LOG_DENSITY,

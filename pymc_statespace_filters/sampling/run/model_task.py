@@ -1,10 +1,10 @@
 """All chains of one model: their starts, their results, and the DataTree made of them."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from pymc.model import Model
@@ -16,13 +16,10 @@ from pymc.stats.convergence import (
 )
 from xarray import DataTree
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import filters_used
-from pymc_statespace_filters.pymc_model.panel_structure import panel_structure
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
-from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
 from pymc_statespace_filters.sampling.output.datatree import to_datatree
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
@@ -46,7 +43,7 @@ from pymc_statespace_filters.sampling.run.record_chain import chain_of
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.run.warm_up import WarmUp, stops_of
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
+from pymc_statespace_filters.sampling.target.record_target import RecordTarget, target_of
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
@@ -105,7 +102,9 @@ class ModelTask:
         """Compile the model and find candidates for the starts, once."""
         if self._target is None:
             request = self.request
-            target = self._given or self._make_target()
+            target = self._given or target_of(
+                self.model, request.settings, request.proposal_cov, self._group
+            )
             self._target = target
             target.prepare()
             self._seeds = np.random.SeedSequence(request.entropy).spawn(request.chains)
@@ -119,20 +118,6 @@ class ModelTask:
             )
             self._measures_noise = is_measured(target, request.n_iterations)
         return self._target
-
-    def _make_target(self) -> Target | RecordTarget:
-        """The target of a panel whose records have parameters of their own, or of any model."""
-        request, structure = self.request, panel_structure(self.model)
-        if structure is None:
-            return Target(
-                self.model, None, request.settings, request.proposal_cov, group=self._group
-            )
-        if self.is_distributed:
-            raise ModelError(
-                f"ranks_per_chain must be 1 for the panel {structure.name!r}: every rank evaluates "
-                "all records of its chains"
-            )
-        return RecordTarget(self.model, request.settings, structure, request.proposal_cov)
 
     def chain_task(self, index: int) -> ChainTask:
         """Make the task of a chain, from its start or from its checkpoint."""
@@ -182,18 +167,11 @@ class ModelTask:
 
     def cost(self) -> float:
         """Estimate the seconds that a chain takes: as many evaluations as iterations."""
-        target = self.prepare()
-        if isinstance(target, RecordTarget):
-            densities = target.densities.bind()
-            start, seeds = densities.native.position.copy(), densities.native.seeds.copy()
-            evaluation: Callable[[], object] = partial(densities.estimate, start, seeds)
-        else:
-            density = target.density.bind()
-            evaluation = partial(evaluate, density.native)
+        evaluation = self.prepare().evaluation()
         seconds = []
         for _ in range(3):
             began = time.perf_counter()
-            evaluation()  # reads arrays that live as long as the bound density
+            evaluation()
             seconds.append(time.perf_counter() - began)
         return min(seconds) * self.request.n_iterations
 

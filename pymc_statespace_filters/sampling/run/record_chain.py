@@ -8,12 +8,13 @@ import numpy as np
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.independence import no_mixture
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.kernel.record_arrays import (
+from pymc_statespace_filters.sampling.kernel.records.arrays import (
     FIRST_ACCEPTED,
     FIRST_ESTIMATE,
     RecordRandomBlock,
 )
-from pymc_statespace_filters.sampling.kernel.record_moves import RecordEvaluation, advance_records
+from pymc_statespace_filters.sampling.kernel.records.evaluation import RecordEvaluation
+from pymc_statespace_filters.sampling.kernel.records.moves import advance_records
 from pymc_statespace_filters.sampling.kernel.state import (
     LOG_DENSITY,
     N_COMMON_BLOCKS,
@@ -34,7 +35,7 @@ N_TRIED = 50
 
 
 class _Terms(NamedTuple):
-    """Terms by record (G + 1,) at a position, as `kernel.record_moves` has them."""
+    """Terms by record (G + 1,) at a position, as `kernel.records` has them."""
 
     position: np.ndarray
     seeds: np.ndarray  # of the evaluation

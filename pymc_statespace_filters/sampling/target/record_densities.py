@@ -18,8 +18,8 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
-from pymc_statespace_filters.sampling.kernel.record_arrays import NativeRecordDensities
-from pymc_statespace_filters.sampling.kernel.record_moves import (
+from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
+from pymc_statespace_filters.sampling.kernel.records.evaluation import (
     RecordEvaluation,
     evaluate_likelihoods,
     evaluate_priors,

@@ -1,13 +1,16 @@
 """A model with a panel as the sampler sees it, if it moves every record by itself."""
 
+from collections.abc import Callable
+
 import numpy as np
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import panel_variables
-from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
-from pymc_statespace_filters.sampling.kernel.record_arrays import (
+from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure, panel_structure
+from pymc_statespace_filters.sampling.kernel.records.arrays import (
     RecordLayout,
     RecordRandomBlock,
     record_random_block,
@@ -16,6 +19,7 @@ from pymc_statespace_filters.sampling.kernel.state import ChainState
 from pymc_statespace_filters.sampling.target.record_densities import RecordDensities
 from pymc_statespace_filters.sampling.target.sampled_model import Growth, SampledModel
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
+from pymc_statespace_filters.sampling.target.target import Target
 
 
 class RecordTarget(SampledModel):
@@ -91,6 +95,12 @@ class RecordTarget(SampledModel):
         """Seeds of an evaluation, one for each noisy variable."""
         return len(self._seeds)
 
+    def evaluation(self) -> Callable[[], object]:
+        """A function that evaluates all records once, to measure what they cost."""
+        bound = self.densities.bind()
+        start, seeds = bound.native.position.copy(), bound.native.seeds.copy()
+        return lambda: bound.estimate(start, seeds)
+
     def variable_name(self, value: TensorVariable) -> str:
         """The name of the free variable of a value."""
         return self._model.values_to_rvs[value].name
@@ -118,6 +128,27 @@ class RecordTarget(SampledModel):
         for block in self.layout.blocks():
             variances[block] /= max(1, len(block))
         return variances
+
+
+def target_of(
+    model: Model,
+    settings: DRAMSettings,
+    proposal_cov: np.ndarray | None,
+    group: Communicator | None,
+) -> Target | RecordTarget:
+    """The target of a panel whose records have parameters of their own, or of any other model.
+
+    Arguments as of `Target`.
+    """
+    structure = panel_structure(model)
+    if structure is None:
+        return Target(model, None, settings, proposal_cov, group=group)
+    if group is not None and group.size > 1:
+        raise ModelError(
+            f"ranks_per_chain must be 1 for the panel {structure.name!r}, got {group.size}: every "
+            "rank evaluates all records of its chains"
+        )
+    return RecordTarget(model, settings, structure, proposal_cov)
 
 
 def _joined(places: list[np.ndarray]) -> np.ndarray:

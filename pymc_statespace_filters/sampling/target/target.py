@@ -5,7 +5,7 @@ the compiled graph; its ``bind`` gives a `BoundLogDensity`, callable from one th
 ``native`` is what machine code calls.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variable
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import ChainState, RandomBlock
+from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.target.leader_follower import check_group
 from pymc_statespace_filters.sampling.target.log_density import (
     LogDensity,
@@ -106,6 +107,11 @@ class Target(SampledModel):
     def carries_noise(self) -> bool:
         """Whether proposals have noise correlated with that of the current point."""
         return self.settings.correlation is not None and bool(self.seed_names)
+
+    def evaluation(self) -> Callable[[], object]:
+        """A function that evaluates the log-density once, to measure what it costs."""
+        bound = self.density.bind()
+        return lambda: evaluate(bound.native)
 
     def prepare(self) -> None:
         """Load the machine code, and read data and fixed seeds as they are now."""

@@ -1,4 +1,4 @@
-"""Arrays of a chain that moves the records of a panel one by one, see `record_moves`.
+"""Arrays of a chain that moves the records of a panel one by one, see `moves`.
 
 A position has three blocks: the own parameters of every record, the shared ones, and those of the
 population. `ChainState` and `Draws` have the same arrays as for other chains, with more columns:

@@ -27,27 +27,26 @@ C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient 
 computations. Annals of Statistics 37, 697-725.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import copy_into, linked
-from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import packed_size, unpack
 from pymc_statespace_filters.sampling.kernel.cached_code import cached_with
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_ratio_to_one
-from pymc_statespace_filters.sampling.kernel.record_arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
+from pymc_statespace_filters.sampling.kernel.records.arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
+from pymc_statespace_filters.sampling.kernel.records.evaluation import (
+    evaluate_likelihoods,
+    evaluate_priors,
+)
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
     FAILURE,
-    HEALTH_SIZE,
     LOG_DENSITY,
     N_DONE,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
-    NOT_A_NUMBER,
     PAUSE_REQUESTED,
     RAISED,
     SCALING,
@@ -55,21 +54,15 @@ from pymc_statespace_filters.sampling.kernel.state import (
 )
 
 _cached = cached_with(
-    "record_moves.py",
-    "record_arrays.py",
+    "records/moves.py",
+    "records/arrays.py",
+    "records/evaluation.py",
     "state.py",
     "adaptation.py",
     "adaptation_state.py",
     "delayed_rejection.py",
 )
 _internal = linked()
-
-
-class RecordEvaluation(NamedTuple):
-    """What went wrong in one evaluation of all records."""
-
-    failure: int  # 0, or the first failure code
-    n_failed: int  # likelihoods that are minus infinity
 
 
 @_internal
@@ -121,46 +114,6 @@ def _total(estimates, priors):
     for i in range(estimates.size):
         total += estimates[i] + priors[i]
     return total
-
-
-@_internal
-def _take_numbers(target, out):
-    """Results of a call, with minus infinity for NaN and plus infinity; the number of these."""
-    n_failed = 0
-    for i in range(target.size):
-        value = out[1 + i]
-        target[i] = value if value < np.inf else -np.inf
-        n_failed += 0 if target[i] > -np.inf else 1
-    return n_failed
-
-
-@_cached
-def evaluate_likelihoods(density, estimates):
-    """Estimate the likelihoods of all records at the position and seeds in the arrays.
-
-    An estimate is never NaN or plus infinity: where the evaluation of a record failed it is minus
-    infinity, and the others keep theirs.
-    """
-    if not make_call(density.likelihood):
-        return RecordEvaluation(RAISED, 0)
-    out = density.likelihood.out
-    n_failed = _take_numbers(estimates, out)
-    if n_failed == 0:
-        return RecordEvaluation(0, 0)
-    for i in range(density.n_healths):
-        code = out[1 + estimates.size + HEALTH_SIZE * i + 1]
-        if code != 0.0:
-            return RecordEvaluation(int(code), n_failed)
-    return RecordEvaluation(NOT_A_NUMBER, n_failed)
-
-
-@_cached
-def evaluate_priors(density, priors):
-    """All other terms at the position in the arrays; whether the model did not raise."""
-    if not make_call(density.prior):
-        return False
-    _take_numbers(priors, density.prior.out)
-    return True
 
 
 @_internal
