@@ -2,9 +2,9 @@
 
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
-writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are. So has
-``--only ode``.
+writes the documentation from the stored parts. ``--only normals noise cold demo panel_sampling``
+needs no other package; these parts have a file of their own, and the tables of the others stay as
+they are. So has ``--only ode``.
 """
 
 import argparse
@@ -19,7 +19,18 @@ from importlib.metadata import version
 
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
-from benchmarks import cold, demo, growth, integrators, likelihoods, noise, ode, report, sampling
+from benchmarks import (
+    cold,
+    demo,
+    growth,
+    integrators,
+    likelihoods,
+    noise,
+    ode,
+    panel_sampling,
+    report,
+    sampling,
+)
 from benchmarks.chains import chains
 from benchmarks.cpp import compiler
 from benchmarks.measure import FOLDER, ROOT, Peers
@@ -42,6 +53,7 @@ PARTS = {
     "noise": lambda peers: noise.noise(),
     "cold": lambda peers: cold.cold(),
     "demo": lambda peers: demo.demo(),
+    "panel_sampling": lambda peers: panel_sampling.panel_sampling(),
     "integrators": lambda peers: integrators.integrators(),
 }
 
