@@ -242,3 +242,19 @@ def test_a_start_without_density_names_its_record():
 def test_the_covariance_of_the_user_is_that_of_the_blocks():
     idata = chains(panel_model(psf.EKF()), 4, 4, proposal_cov=np.eye(4) * 0.09, chains=1)
     np.testing.assert_allclose(idata["sample_stats"]["scaling"], 0.3)
+
+
+def test_the_evidence_of_draws_by_record_is_exact():
+    """Bridge sampling of the kept estimates, at four standard errors of its own."""
+    model = panel_model(psf.BootstrapPF(256))
+    idata = chains(model, 2000, 500)
+    found = psf.estimate_evidence(idata, model, estimators=["bridge"], random_seed=2)["bridge"]
+    n = len(LABELS) * N_ROWS
+    of_record = np.kron(np.eye(len(LABELS)), np.full((N_ROWS, N_ROWS), SPREAD**2))
+    cov = PRIOR_SD**2 + of_record + (PROCESS_VAR + MEASUREMENT_VAR) * np.eye(n)
+    data = data_of(len(LABELS))
+    expected = -0.5 * (
+        data @ np.linalg.solve(cov, data) + np.linalg.slogdet(cov)[1] + n * np.log(2 * np.pi)
+    )
+    assert abs(found.log_evidence - expected) < 4.0 * found.se
+    assert found.se < 0.2
