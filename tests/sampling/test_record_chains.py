@@ -258,3 +258,12 @@ def test_the_evidence_of_draws_by_record_is_exact():
     )
     assert abs(found.log_evidence - expected) < 4.0 * found.se
     assert found.se < 0.2
+
+
+def test_a_pilot_gives_each_block_proposals_of_its_own_size():
+    """Those of all parameters together would be shorter, and no adaptation would lengthen them."""
+    model = panel_model(psf.EKF())
+    pilot = chains(model, 1000, 500, chains=2)
+    idata = chains(model, 500, 1, chains=2, pilot=pilot)
+    of_pilot = pilot["sample_stats"]["accepted"].values.mean()
+    assert idata["sample_stats"]["accepted"].values.mean() == pytest.approx(of_pilot, abs=0.12)

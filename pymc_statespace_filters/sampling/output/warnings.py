@@ -199,7 +199,7 @@ def _record_warning(target: RecordTarget, statistics: PhaseStatistics) -> Sample
     """Warn of the record that moved least, or of the parameters that all records decide on."""
     n, rates = statistics.iterations, statistics.by_record
     slow = sorted((rate, g) for g, rate in enumerate(rates) if rate < MIN_ACCEPT_RATE)
-    others = f" and {len(slow) - 1} others" if len(slow) > 1 else ""
+    others = f" and {len(slow) - 1} more" if len(slow) > 1 else ""
     if slow:
         rate, g = slow[0]
         return sampler_warning(

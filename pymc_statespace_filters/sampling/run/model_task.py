@@ -103,7 +103,11 @@ class ModelTask:
         if self._target is None:
             request = self.request
             target = self._given or target_of(
-                self.model, request.settings, request.proposal_cov, self._group
+                self.model,
+                request.settings,
+                request.proposal_cov,
+                self._group,
+                has_pilot=request.pilot is not None,
             )
             self._target = target
             target.prepare()

@@ -32,6 +32,9 @@ class RecordTarget(SampledModel):
     structure : PanelStructure
     proposal_cov : array_like, shape (d, d), optional
         Of the first proposals; each block takes its own part.
+    of_all : bool
+        Whether that covariance is one of proposals of all parameters together, as of a pilot. It
+        has the factor 2.38^2 / d of their number, and each block that of its own.
 
     Attributes
     ----------
@@ -55,6 +58,8 @@ class RecordTarget(SampledModel):
         settings: DRAMSettings,
         structure: PanelStructure,
         proposal_cov: np.ndarray | None = None,
+        *,
+        of_all: bool = False,
     ):
         _check_settings(settings, structure.name)
         super().__init__(model, None, settings)
@@ -64,6 +69,8 @@ class RecordTarget(SampledModel):
         first = self._first_variances()
         if proposal_cov is not None:
             first = checked_proposal_cov(proposal_cov, self.raveled.dim)
+            if of_all:
+                first *= self.raveled.dim / self._block_sizes()
         self.first_adaptation = self.layout.first_adaptation(first)
         self.densities = RecordDensities(
             model, structure, self.raveled.variables, self._default, self._seeds
@@ -124,10 +131,14 @@ class RecordTarget(SampledModel):
 
     def _first_variances(self) -> np.ndarray:
         """Variances of the prior's draws times 2.38^2 over the dimension of the block."""
-        variances = self.prior_draws.variances() * 2.38**2
+        return self.prior_draws.variances() * 2.38**2 / self._block_sizes()
+
+    def _block_sizes(self) -> np.ndarray:
+        """The number of parameters in the block of each, (d,)."""
+        sizes = np.empty(self.raveled.dim)
         for block in self.layout.blocks():
-            variances[block] /= max(1, len(block))
-        return variances
+            sizes[block] = len(block)
+        return sizes
 
 
 def target_of(
@@ -135,10 +146,12 @@ def target_of(
     settings: DRAMSettings,
     proposal_cov: np.ndarray | None,
     group: Communicator | None,
+    *,
+    has_pilot: bool,
 ) -> Target | RecordTarget:
     """The target of a panel whose records have parameters of their own, or of any other model.
 
-    Arguments as of `Target`.
+    Arguments as of `Target`; ``has_pilot`` is whether the covariance comes from one.
     """
     structure = panel_structure(model)
     if structure is None:
@@ -148,7 +161,7 @@ def target_of(
             f"ranks_per_chain must be 1 for the panel {structure.name!r}, got {group.size}: every "
             "rank evaluates all records of its chains"
         )
-    return RecordTarget(model, settings, structure, proposal_cov)
+    return RecordTarget(model, settings, structure, proposal_cov, of_all=has_pilot)
 
 
 def _joined(places: list[np.ndarray]) -> np.ndarray:
