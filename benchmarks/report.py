@@ -13,6 +13,7 @@ from benchmarks.demo import Demo
 from benchmarks.growth import Curve
 from benchmarks.measure import FOLDER, ROOT, Row
 from benchmarks.noise import Noise, Normals
+from benchmarks.panel_sampling import PanelChain
 from benchmarks.ratios import ratios
 from benchmarks.sampling import Chains
 
@@ -30,7 +31,7 @@ SEPARATE = {
     "panel": "benchmarks_panel.inc",
 }
 # Parts that need no other package.
-OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo}
+OWN = {"normals": Normals, "noise": Noise, "cold": Cold, "demo": Demo, "panel_sampling": PanelChain}
 
 
 def write(parts: list[str]) -> str:
@@ -87,6 +88,7 @@ def write_own(kept: dict[str, dict]) -> str:
         "noise": noise_table,
         "cold": cold_table,
         "demo": demo_table,
+        "panel_sampling": panel_table,
     }
     sections = [machine(kept)]
     sections += [
@@ -229,6 +231,14 @@ def cold_table(rows: list[Cold]) -> str:
 def demo_table(rows: list[Demo]) -> str:
     lines = [[r.command, f"{r.first:.0f} s", f"{r.second:.0f} s"] for r in rows]
     return "\n## The demo\n\n" + table(["CPU time", "first run", "second run"], lines)
+
+
+def panel_table(rows: list[PanelChain]) -> str:
+    lines = [
+        [str(r.n_records), r.moves, f"{100 * r.accepted:.1f} %", seconds(r.seconds)] for r in rows
+    ]
+    head = ["records", "moved", "iterations that move the first record", "1000 iterations"]
+    return "\n## Panels with particles\n\n" + table(head, lines)
 
 
 def write_csv(rows: list[Row], target: Path) -> None:

@@ -59,6 +59,14 @@ def sample_dram(
     between the draws: one costs as much as its likelihood. Chains run in threads, and with MPI on
     several machines.
 
+    If a model has a panel of several records (``StateSpace(panel=)``) and parameters that belong to
+    single ones, the records are moved one by one: each makes a random walk in its own parameters,
+    accepted by its own estimate of its likelihood, which it then keeps. Parameters of the
+    population make random walks without a likelihood, shared ones are accepted by the likelihoods
+    of all records. This too is exact. There is no delayed rejection and no mixture, each record
+    starts at the likeliest of fifty draws of its prior, and ``sample_stats`` has the acceptance
+    (``record_accepted``) and the noise seed of each record.
+
     Parameters
     ----------
     draws, tune : int
@@ -126,7 +134,10 @@ def sample_dram(
         Ranks that get the result.
     **dram_settings
         Settings of `DRAM`: ``stages``, ``stage_scale``, ``adaptation``, ``adapt_every``,
-        ``proposal_cov``, ``refresh_noise``, ``screen``, ``screen_power``, ``correlation``.
+        ``proposal_cov``, ``refresh_noise``, ``screen``, ``screen_power``, ``correlation``. Where
+        records are moved one by one, ``stages`` must be 1 or the default, ``screen`` and
+        ``correlation`` None, ``ranks_per_chain`` 1, and of ``proposal_cov`` each block takes its
+        own part.
 
     Returns
     -------
@@ -138,7 +149,7 @@ def sample_dram(
         ``'{"d": "BootstrapPF(200)"}'``.
         ``log_likelihood_variance``, for runs of at least 600 iterations with a noisy likelihood, is
         the variance of the estimated log-likelihood over 12 noise seeds at the draw of highest
-        density.
+        density; of the record whose variance is largest, if records are moved one by one.
 
     Raises
     ------

@@ -244,7 +244,7 @@ class DRAM(BlockedStep):
 
     def _closing_warning(self) -> SamplerWarning | None:
         # Without the number of the chain, which PyMC does not pass to a step method.
-        growth = self._target.growth(self._prepared_chain.state.proposal_cov)
+        growth = self._target.growth(self._prepared_chain.state)
         return closing_warning(self._statistics, growth, self._target.collapse_remedy)
 
     def _reset(self, tune: int, draws: int) -> None:

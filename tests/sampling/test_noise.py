@@ -18,7 +18,8 @@ def toy(monkeypatch):
     def make(noise_sd, *, records=False):
         model, seed = noisy_model(noise_sd, records=records)
         monkeypatch.setattr(
-            "pymc_statespace_filters.sampling.target.target.noise_seeds", lambda model: {"d": seed}
+            "pymc_statespace_filters.sampling.target.sampled_model.noise_seeds",
+            lambda model: {"d": seed},
         )
         return model
 
@@ -101,7 +102,7 @@ def test_held_noise_is_the_models(toy):
     with toy(noise_sd=1.3):
         step = DRAM(refresh_noise=False)
         idata = sample(step, draws=8000)
-        step._target._seed_variables[0].set_value(np.array(21))
+        step._target._seeds["d"].set_value(np.array(21))
         again = sample(step, draws=10)
     assert np.all(idata["sample_stats"]["d_seed"] == 20)
     assert np.all(again["sample_stats"]["d_seed"] == 21)

@@ -163,13 +163,35 @@ def _stored_seeds(
 ) -> NDArray[np.int64]:
     """Noise seeds of the draws, (chain, draw, n_seeds); the model's where none are stored."""
     columns = [
-        stats[f"{name}_seed"].transpose("chain", "draw").values
+        _one_seed(stats[f"{name}_seed"].transpose("chain", "draw", ...).values)
         if f"{name}_seed" in stats
         else np.full(shape, seed)
         for name, seed in zip(density.seed_names, density.model_seeds, strict=True)
     ]
     return (
         np.stack(columns, axis=-1).astype(np.int64) if columns else np.empty((*shape, 0), np.int64)
+    )
+
+
+def _one_seed(seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The seed of each draw, (chain, draw).
+
+    The records of a panel that were moved one by one have seeds of their own. Where these differ
+    the result is their sum, which tells whether any has changed.
+    """
+    if seeds.ndim == 2:
+        return seeds
+    is_one = (seeds == seeds[..., :1]).all(axis=-1)
+    return np.where(is_one, seeds[..., 0], seeds.sum(axis=-1))
+
+
+def _has_seeds_of_records(stats: xr.Dataset, density: ModelDensity) -> bool:
+    """Whether the estimates of a draw have several seeds, which no one evaluation repeats."""
+    names = [f"{name}_seed" for name in density.seed_names if f"{name}_seed" in stats]
+    return any(
+        (stats[name] != stats[name].isel({dim: 0})).any()
+        for name in names
+        for dim in set(stats[name].dims) - {"chain", "draw"}
     )
 
 
@@ -202,7 +224,7 @@ def _stored_log_density(
         return log_density.reshape(draws.shape[:2])
 
     stored = stats[name].transpose("chain", "draw").values.astype(np.float64)
-    if density.moved:  # cannot be recomputed for comparison
+    if density.moved or _has_seeds_of_records(stats, density):  # cannot be recomputed
         return stored
     checked = np.linspace(0, len(flat_draws) - 1, N_CHECKED).astype(int)
     recomputed = density.evaluate(flat_draws[checked], flat_seeds[checked])

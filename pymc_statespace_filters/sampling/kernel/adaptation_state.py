@@ -60,6 +60,7 @@ def start_adaptation(cov: np.ndarray) -> AdaptationState:
     return state
 
 
+@register_jitable
 def packed_size(dim: int) -> int:
     """Length of a packed state of dimension d."""
     return 3 + 4 * dim**2 + 3 * (N_PIECE + dim + dim**2)

@@ -84,8 +84,8 @@ def log_acceptance(log_pi: np.ndarray, log_q: np.ndarray, stage: int) -> float:
         for start in range(n_points - length):
             end = start + length
             there, back = log_path[start, end], log_path[end, start]
-            log_alpha[start, end] = _log_ratio_to_one(back, there)
-            log_alpha[end, start] = _log_ratio_to_one(there, back)
+            log_alpha[start, end] = log_ratio_to_one(back, there)
+            log_alpha[end, start] = log_ratio_to_one(there, back)
     return log_alpha[0, stage]
 
 
@@ -130,12 +130,12 @@ def gaussian_log_acceptance(
 ) -> float:
     """``log_acceptance`` with the proposals of ``gaussian_log_proposals``."""
     if stage == 1:  # most calls: the symmetric proposal cancels
-        return _log_ratio_to_one(log_pi[1], log_pi[0])
+        return log_ratio_to_one(log_pi[1], log_pi[0])
     return log_acceptance(log_pi, gaussian_log_proposals(offsets, stage_scale, stage), stage)
 
 
 @linked()
-def _log_ratio_to_one(log_numerator: float, log_denominator: float) -> float:
+def log_ratio_to_one(log_numerator: float, log_denominator: float) -> float:
     """Log of min(1, N/D), with 0/0 = 0 and N/0 = 1."""
     if log_numerator == -np.inf:
         return -np.inf

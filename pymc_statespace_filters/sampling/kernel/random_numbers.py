@@ -15,8 +15,7 @@ BLOCK = 256
 
 def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:
     """Draw a chain's random numbers for iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``."""
-    # Consecutive indices start 2^128 numbers apart.
-    rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
+    rng = generator_of_block(key, index)
     return RandomBlock(
         rng.standard_normal((BLOCK, n_stages, dim)),
         -rng.standard_exponential((BLOCK, n_stages + 1)),
@@ -24,6 +23,11 @@ def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: 
         rng.random((BLOCK, 2)),
         np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, BLOCK)),
     )
+
+
+def generator_of_block(key: np.ndarray, index: int) -> np.random.Generator:
+    """Make the generator of a block; consecutive ones start 2^128 numbers apart."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
 
 
 def draw_key(rng: np.random.Generator) -> np.ndarray:

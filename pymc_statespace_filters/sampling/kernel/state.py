@@ -21,6 +21,9 @@ ACCEPTANCE, SCALING = 2, 3
 N_NUMBERS = 4
 STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED, INDEPENDENT = range(7)
 N_COUNTS = 7
+# If records are moved one by one, the counts of a draw have more columns: what each record has
+# accepted, then what the blocks of the shared parameters and of the population have.
+N_COMMON_BLOCKS = 2
 # Cells of the control block that a running chain shares with the main thread.
 PAUSE_REQUESTED, N_DONE = range(2)
 
@@ -97,6 +100,16 @@ class Evaluation(NamedTuple):
     log_density: float  # never NaN or plus infinity; minus infinity after a failure
     failure: int  # 0, or the failure code: a key of `outcomes.FAILURES`, or `NOT_A_NUMBER`
     n_effective: float  # smallest number of particles in any filter, infinity without noisy filters
+
+
+def has_moved(counts: np.ndarray) -> np.ndarray:
+    """Whether an iteration accepted a proposal, of each record if it moves them one by one.
+
+    From counts (n, columns), shape (n, records) or (n, 1).
+    """
+    if counts.shape[1] == N_COUNTS:
+        return counts[:, STAGE : STAGE + 1] > 0
+    return counts[:, N_COUNTS:-N_COMMON_BLOCKS] > 0
 
 
 def failure_reason(code: int) -> str:

@@ -16,18 +16,15 @@ C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient 
 computations. Annals of Statistics 37, 697-725.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into, linked
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
+from pymc_statespace_filters.sampling.kernel.cached_code import cached_with
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.kernel.independence import (
     SHARE,
@@ -80,7 +77,7 @@ class _Laws(NamedTuple):
 _internal = linked()
 
 
-_SOURCES = (
+_cached = cached_with(
     "transition.py",
     "state.py",
     "adaptation.py",
@@ -89,13 +86,6 @@ _SOURCES = (
     "independence.py",
     "surrogate.py",
 )
-_SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in _SOURCES)
-
-
-def _cached(function):
-    """Compile for Python and cache on disk for all processes."""
-    key = digest(function.__name__, _SOURCE)
-    return cached_on_disk(njit(function, error_model="numpy", nogil=True), key)
 
 
 @_cached

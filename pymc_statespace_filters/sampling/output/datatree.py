@@ -37,6 +37,7 @@ def to_datatree(
     tune: int,
     keep_warmup: bool,
     sampling_time: float,
+    stat_dims: Mapping[str, tuple[str, Sequence]] | None = None,
     attrs: Mapping[str, Any] | None = None,
 ) -> DataTree:
     """Convert whole chains to the DataTree that ``pm.sample`` returns.
@@ -58,6 +59,8 @@ def to_datatree(
         Whether the warm-up is kept, in separate groups.
     sampling_time : float
         In seconds.
+    stat_dims : mapping of str to (str, sequence), optional
+        Name and coordinates of the dimension of statistics that are vectors.
     attrs : mapping of str to any, optional
         Attributes of the groups with draws and statistics, in addition to PyMC's.
 
@@ -93,6 +96,7 @@ def to_datatree(
     tree = _concatenated([convert(*kept.pop(0)) for _ in longest], attrs or {})
     for name, values in fixed_stats.items():
         _add_fixed(tree, name, values)
+    _name_dims(tree, stat_dims or {})
     return tree
 
 
@@ -167,3 +171,17 @@ def _add_fixed(tree: DataTree, name: str, values: np.ndarray) -> None:
         shape = (len(values), n_draws, *values.shape[1:])
         repeated = np.broadcast_to(values[:, None], shape)
         tree[group].update(dict_to_dataset({name: repeated}))
+
+
+def _name_dims(tree: DataTree, stat_dims: Mapping[str, tuple[str, Sequence]]) -> None:
+    """Name the dimensions of statistics, which PyMC's converter numbers."""
+    for group in SAMPLE_STATS.intersection(tree.children):
+        stats = tree[group].to_dataset()
+        for name, (dim, labels) in stat_dims.items():
+            numbered = str(stats[name].dims[-1])
+            named = stats[name].drop_vars(numbered).rename({numbered: dim})
+            stats = stats.drop_vars([name, numbered]).assign({name: named})
+            stats = stats.assign_coords({dim: list(labels)})
+        attrs = tree[group].attrs
+        tree[group] = DataTree(stats)
+        tree[group].attrs.update(attrs)

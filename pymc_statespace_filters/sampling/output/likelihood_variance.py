@@ -28,7 +28,7 @@ from scipy.stats import t as student_t
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds, side_generator
 from pymc_statespace_filters.sampling.kernel.state import LOG_DENSITY, Draws, Evaluation
 from pymc_statespace_filters.sampling.output.warnings import sampler_warning
-from pymc_statespace_filters.sampling.target.target import Target
+from pymc_statespace_filters.sampling.target.sampled_model import SampledModel
 
 # The variances between which a chain gains most per unit of time, and their geometric mean.
 TARGET = (1.0, 3.3)
@@ -67,6 +67,7 @@ class SeedSpread(NamedTuple):
     variance_low: float  # ends of a 95 % interval for the variance
     variance_high: float
     n_failed: int  # estimates that are minus infinity
+    of: str = ""  # what was estimated, if not the likelihood of all data: " of record 'a'"
 
 
 def seed_spread(
@@ -121,7 +122,7 @@ def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
     None between variances of 0.05 and 10, and without noise. ``where`` says where it was measured,
     such as "at the start".
     """
-    found = f"Chain {chain}, {where}: the estimated log-likelihood"
+    found = f"Chain {chain}, {where}: the estimated log-likelihood{spread.of}"
     if spread.n_failed > spread.n or spread.variance == np.inf:
         return (
             f"{found} failed for {spread.n_failed} of {spread.n + spread.n_failed} noise seeds. "
@@ -153,7 +154,7 @@ def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
     return None
 
 
-def is_measured(target: Target, n_iterations: int) -> bool:
+def is_measured(target: SampledModel, n_iterations: int) -> bool:
     """Whether a run measures the variance: with fresh noise, and unless it is short."""
     noisy = target.seed_names and target.settings.refresh_noise
     return bool(noisy) and n_iterations >= LEAST_ITERATIONS
@@ -164,7 +165,7 @@ def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
     if not HOPELESS < spread.variance < np.inf:
         return None
     return sampler_warning(
-        f"Chain {chain}, at the start: the estimated log-likelihood has a variance of "
+        f"Chain {chain}, at the start: the estimated log-likelihood{spread.of} has a variance of "
         f"{spread.variance:.3g} over {spread.n} noise seeds. The chain accepts about "
         f"{acceptance_share(spread.variance):.1g} of the moves that it would accept with an exact "
         "likelihood: it has not left the start yet and may never do so. Start elsewhere "
@@ -178,6 +179,7 @@ def spread_at_highest_draw(
     tune: int,
     measure: Callable[[np.ndarray, np.ndarray], SeedSpread],
     keys: Sequence[np.ndarray],
+    n_noisy: int,
 ) -> tuple[SeedSpread, SamplerWarning | None]:
     """Measure the variance at the draw of highest density of all chains, after the warm-up.
 
@@ -187,9 +189,8 @@ def spread_at_highest_draw(
     densities = [of_chain.numbers[tune:, LOG_DENSITY] for of_chain in draws]
     chain = int(np.argmax([of_chain.max() for of_chain in densities]))
     row = tune + int(densities[chain].argmax())
-    shape = N_SEEDS, draws[chain].seeds.shape[1]
     # From the chain's key, which a checkpoint stores: a resumed run measures the same.
-    seeds = draw_seeds(side_generator(keys[chain]), shape)
+    seeds = draw_seeds(side_generator(keys[chain]), (N_SEEDS, n_noisy))
     spread = measure(draws[chain].positions[row], seeds)
     message = variance_advice(spread, "at its highest draw", chain)
     return spread, None if message is None else sampler_warning(message)

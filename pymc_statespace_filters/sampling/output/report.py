@@ -88,7 +88,24 @@ def _acceptance(statistics: Mapping[int, PhaseStatistics]) -> str:
         if rate < MIN_ACCEPT_RATE
     ]
     text = f"The chains accepted a proposal in {' to '.join(ends)} % of their iterations."
+    if by_record := [rate for chain in statistics.values() for rate in chain.by_record]:
+        text = _acceptance_of_blocks(list(statistics.values()), by_record)
     return text + "".join(few)
+
+
+def _acceptance_of_blocks(statistics: Sequence[PhaseStatistics], by_record: Sequence[float]) -> str:
+    """Acceptance of records that are moved one by one, and of what they share."""
+    parts = {
+        "the records": by_record,
+        "the shared parameters": [chain.shared_rate for chain in statistics],
+        "the population": [chain.population_rate for chain in statistics],
+    }
+    ranges = [
+        f"{name} {' to '.join(dict.fromkeys((_percent(min(rates)), _percent(max(rates)))))} %"
+        for name, rates in parts.items()
+        if max(rates) > 0.0
+    ]
+    return f"Of their proposals were accepted: {', '.join(ranges)}."
 
 
 def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:

@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
+from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
     FAILURE,
     INDEPENDENT,
     LOG_DENSITY,
+    N_COMMON_BLOCKS,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
@@ -19,7 +21,9 @@ from pymc_statespace_filters.sampling.kernel.state import (
     STAGE,
     ChainState,
     Draws,
+    has_moved,
 )
+from pymc_statespace_filters.sampling.target.record_target import RecordTarget
 from pymc_statespace_filters.sampling.target.target import Target
 
 # PyMC's names: it renames the first to "lp", and logs and removes the second.
@@ -33,6 +37,9 @@ _COUNTS = {
     "n_evaluations": N_EVALUATIONS,
     "n_failed": N_FAILED,
     "failure": FAILURE,
+}
+_RECORD_COUNTS = {
+    name: column for name, column in _COUNTS.items() if name not in ("stage", "independent")
 }
 _SCREEN_COUNTS = {"n_screened": N_SCREENED, "n_screen_failed": N_SCREEN_FAILED}
 
@@ -92,12 +99,14 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
 
 
 def whole_chain(
-    target: Target, draws: Draws, state: ChainState, tune: int
+    target: Target | RecordTarget, draws: Draws, state: ChainState, tune: int
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Positions and statistics of a whole chain, as copies.
 
     ``proposal_cov`` is a view without a stride if the covariances of the warm-up were not kept.
     """
+    if isinstance(target, RecordTarget):
+        return draws.positions.copy(), _of_records(target, draws, tune)
     n = len(draws.positions)
     stats = {name: values.copy() for name, values in of_draws(target, draws, slice(0, n)).items()}
     moved = draws.counts[:, STAGE] > 0
@@ -108,3 +117,39 @@ def whole_chain(
     if len(draws.covs):
         covs = np.concatenate([draws.covs[:n], covs[tune:]])
     return draws.positions.copy(), stats | {"proposal_cov": covs}
+
+
+def _of_records(target: RecordTarget, draws: Draws, tune: int) -> dict[str, np.ndarray]:
+    """Statistics of a whole chain that moves records one by one."""
+    counts, n = draws.counts, len(draws.counts)
+    moved = has_moved(counts)
+    accepted = moved.mean(axis=1)
+    stats = {name: draws.numbers[:, column].copy() for name, column in _NUMBERS.items()}
+    stats |= {name: counts[:, column].copy() for name, column in _RECORD_COUNTS.items()}
+    stats |= {
+        "accepted": accepted,
+        "accept_rate": np.concatenate(
+            [np.cumsum(of) / np.arange(1, of.size + 1) for of in np.split(accepted, [tune])]
+        ),
+        "record_accepted": moved,
+        "exact": np.full(n, target.exact),
+    }
+    if target.structure.shared:
+        stats["shared_accepted"] = counts[:, -N_COMMON_BLOCKS] * 1.0
+    if target.structure.population:
+        stats["population_accepted"] = counts[:, -1] / N_POPULATION_MOVES
+    for column, name in enumerate(target.seed_names):
+        seeds = draws.seeds[:, target.layout.columns == column]
+        is_of_records = name in stat_dims(target)
+        stats[name] = seeds.copy() if is_of_records else seeds[:, 0].copy()
+    return stats
+
+
+def stat_dims(target: Target | RecordTarget) -> dict[str, tuple[str, tuple]]:
+    """Name and coordinates of the dimension of statistics that have a value for each record."""
+    if isinstance(target, Target):
+        return {}
+    dim = f"{target.structure.name}_record"
+    of_records = target.layout.columns[target.layout.seeds[0]].tolist()
+    names = ["record_accepted", *(target.seed_names[column] for column in of_records)]
+    return dict.fromkeys(names, (dim, target.labels))

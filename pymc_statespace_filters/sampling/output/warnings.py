@@ -1,5 +1,6 @@
 """Statistics of a phase of a chain, and the warnings about chains when they have ended."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -10,9 +11,12 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.lower_chains import LowerChain, lower_chains
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
+from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
 from pymc_statespace_filters.sampling.kernel.state import (
     FAILURE,
     LOG_DENSITY,
+    N_COMMON_BLOCKS,
+    N_COUNTS,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
@@ -22,8 +26,11 @@ from pymc_statespace_filters.sampling.kernel.state import (
     ChainState,
     Draws,
     failure_reason,
+    has_moved,
 )
-from pymc_statespace_filters.sampling.target.target import Growth, Target
+from pymc_statespace_filters.sampling.target.record_target import RecordTarget
+from pymc_statespace_filters.sampling.target.sampled_model import Growth
+from pymc_statespace_filters.sampling.target.target import Target
 
 # Fraction of evaluations after warm-up that may fail without a warning: a chain that touches the
 # edge of the region where its filter works is normal.
@@ -45,7 +52,7 @@ class PhaseStatistics(NamedTuple):
     """Counts of a chain in one phase, warm-up or sampling."""
 
     iterations: int = 0
-    moved: int = 0  # iterations that accepted a proposal
+    moved: float = 0  # iterations that accepted a proposal; the mean of all records
     evaluations: int = 0  # of the model
     failures: tuple[tuple[int, int], ...] = ()  # failure codes and their counts
     collapsed: int = 0  # iterations at an estimate with an effective number of particles near one
@@ -53,6 +60,12 @@ class PhaseStatistics(NamedTuple):
     screen_failed: int = 0
     dwell: int = 0  # iterations at the current point
     longest_dwell: int = 0  # at any point
+    slowest: int | None = None  # number of the record of the longest dwell
+    # If records are moved one by one: acceptance rates of each, of the shared parameters and of the
+    # moves of the population, NaN without these.
+    by_record: tuple[float, ...] = ()
+    shared_rate: float = math.nan
+    population_rate: float = math.nan
 
     def include(self, draws: Draws, row: int) -> "PhaseStatistics":
         """Add an iteration."""
@@ -85,18 +98,31 @@ class PhaseStatistics(NamedTuple):
             (int(code), int(counts[codes == code, N_FAILED].sum()))
             for code in np.unique(codes[counts[:, N_FAILED] > 0])
         )
-        arrivals = np.flatnonzero(counts[:, STAGE])
-        dwells = np.diff(arrivals, prepend=0, append=len(counts))
-        return cls(
+        moved = has_moved(counts)
+        rates = moved.mean(axis=0) if len(counts) else np.zeros(moved.shape[1])
+        dwells = [
+            np.diff(np.flatnonzero(of_part), prepend=0, append=len(counts)) for of_part in moved.T
+        ]
+        slowest = int(np.argmax([of_part.max() for of_part in dwells]))
+        statistics = cls(
             len(counts),
-            int(np.count_nonzero(counts[:, STAGE])),
+            float(rates.mean() * len(counts)),
             int(counts[:, N_EVALUATIONS].sum()),
             failures,
             int(np.count_nonzero(draws.numbers[begin:end, N_EFFECTIVE] < COLLAPSED)),
             int(counts[:, N_SCREENED].sum()),
             int(counts[:, N_SCREEN_FAILED].sum()),
-            int(dwells[-1]),
-            int(dwells.max()),
+            int(dwells[slowest][-1]),
+            int(dwells[slowest].max()),
+        )
+        if counts.shape[1] == N_COUNTS:
+            return statistics
+        shared, population = counts[:, -N_COMMON_BLOCKS:].mean(axis=0).tolist()
+        return statistics._replace(
+            slowest=slowest,
+            by_record=tuple(rates.tolist()),
+            shared_rate=shared,
+            population_rate=population / N_POPULATION_MOVES,
         )
 
     @property
@@ -148,8 +174,8 @@ def _mobility_problem(statistics: PhaseStatistics) -> str | None:
     if statistics.accept_rate < MIN_ACCEPT_RATE:
         screen = " or, with a screen, lower screen_power" if screened else ""
         return (
-            f"DRAM accepted {statistics.moved} of {n} proposals after warm-up: the chain hardly "
-            "moves. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
+            f"DRAM accepted {statistics.moved:.0f} of {n} proposals after warm-up: the chain "
+            "hardly moves. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
             f"likelihood is noisy, give its filter more particles{screen}."
         )
     if statistics.screen_failed > TOLERATED_FAILURES * screened:
@@ -165,6 +191,37 @@ def _mobility_problem(statistics: PhaseStatistics) -> str | None:
             "likelihood is noisy, its estimate there is an overestimate: give its filter more "
             "particles (psf.suggest_particles). Otherwise its proposals do not lead away from "
             "there: tune longer, start elsewhere (initvals), or give proposal_cov."
+        )
+    return None
+
+
+def _record_warning(target: RecordTarget, statistics: PhaseStatistics) -> SamplerWarning | None:
+    """Warn of the record that moved least, or of the parameters that all records decide on."""
+    n, rates = statistics.iterations, statistics.by_record
+    slow = sorted((rate, g) for g, rate in enumerate(rates) if rate < MIN_ACCEPT_RATE)
+    others = f" and {len(slow) - 1} more" if len(slow) > 1 else ""
+    if slow:
+        rate, g = slow[0]
+        return sampler_warning(
+            f"Record {target.labels[g]!r}{others} hardly moved: it accepted {rate * n:.0f} of {n} "
+            "proposals after warm-up. Tune longer, start elsewhere (initvals), or, if the "
+            "likelihood is noisy, give its filter more particles."
+        )
+    shared = target.structure.shared
+    if shared and statistics.shared_rate < MIN_ACCEPT_RATE:
+        names = ", ".join(target.variable_name(value) for value in shared)
+        return sampler_warning(
+            f"The parameters that all records share ({names}) accepted "
+            f"{statistics.shared_rate * n:.0f} of {n} proposals after warm-up: the noise of all "
+            "records decides on each. Give every record its own, with a distribution of the "
+            "population (the centred form), or the filter more particles."
+        )
+    if statistics.longest_dwell > max(LEAST_DWELL, LONG_DWELL * n):
+        return sampler_warning(
+            f"Record {target.labels[statistics.slowest or 0]!r} stayed at one point for "
+            f"{statistics.longest_dwell} of {n} draws. If the likelihood is noisy, its estimate "
+            "there is an overestimate: give its filter more particles. Otherwise tune longer, or "
+            "start elsewhere (initvals)."
         )
     return None
 
@@ -201,7 +258,7 @@ def _failure_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
 
 
 def chain_warnings(
-    target: Target, results: Sequence[tuple[Draws, ChainState]], tune: int
+    target: Target | RecordTarget, results: Sequence[tuple[Draws, ChainState]], tune: int
 ) -> list[SamplerWarning]:
     """Warnings about single chains, at most one for each."""
     lower = {low.chain: low for low in lower_chains_of([draws for draws, _ in results], tune)}
@@ -209,8 +266,10 @@ def chain_warnings(
     for i, (draws, state) in enumerate(results):
         statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
         if statistics.iterations:
-            growth = target.growth(state.proposal_cov)
+            growth = target.growth(state)
             warning = closing_warning(statistics, growth, target.collapse_remedy)
+            if isinstance(target, RecordTarget):
+                warning = _record_warning(target, statistics) or warning
             if warning is not None:
                 warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
             elif i in lower:

@@ -1,8 +1,4 @@
-"""One Markov chain: its state, its draws, and the machine code that advances it.
-
-PyMC's step method advances a `Chain` by one iteration at a time; `ChainTask` advances it block by
-block in a thread. Both get the same draws from the same key.
-"""
+"""A Markov chain that moves all parameters together."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,26 +11,17 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
     start_adaptation,
 )
 from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK, draw_seeds
+from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.kernel.state import (
-    ACCEPTANCE,
-    FAILURE,
     N_COUNTS,
-    N_DONE,
-    N_EVALUATIONS,
-    N_FAILED,
-    N_NUMBERS,
-    PAUSE_REQUESTED,
-    SCALING,
-    STAGE,
     ChainState,
-    Draws,
     Evaluation,
     PhaseSettings,
     RandomBlock,
 )
 from pymc_statespace_filters.sampling.kernel.transition import advance
 from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread, seed_spread
+from pymc_statespace_filters.sampling.run.chain_arrays import ChainArrays
 from pymc_statespace_filters.sampling.target.initial_points import (
     EvaluatedPoint,
     best_initial_point,
@@ -42,11 +29,7 @@ from pymc_statespace_filters.sampling.target.initial_points import (
 from pymc_statespace_filters.sampling.target.target import Target
 
 
-class StopRequested(Exception):
-    """A stop was requested outside of the chain's iterations."""
-
-
-class Chain:
+class Chain(ChainArrays):
     """A Markov chain of a prepared target.
 
     Parameters
@@ -60,6 +43,8 @@ class Chain:
         Of the first proposals. Default: the target's.
     """
 
+    _target: Target
+
     def __init__(
         self,
         target: Target,
@@ -68,14 +53,13 @@ class Chain:
         n_covs: int,
         proposal_cov: np.ndarray | None = None,
     ):
-        self._target = target
         self._density = target.density.bind()
         self._screen = None if target.screen is None else target.screen.bind()
         dim, n_noisy = target.raveled.dim, len(target.seed_names)
         adaptation = np.empty(packed_size(dim))
         first_cov = target.first_cov if proposal_cov is None else proposal_cov
         pack(start_adaptation(first_cov), adaptation)
-        self.state = ChainState(
+        state = ChainState(
             np.empty(dim),
             np.zeros(n_noisy, dtype=np.int64),
             np.zeros(3),
@@ -84,16 +68,7 @@ class Chain:
             self._density.carried,
             np.array(key),
         )
-        self.draws = Draws(
-            np.empty((n_rows, dim)),
-            np.empty((n_rows, N_NUMBERS)),
-            np.zeros((n_rows, N_COUNTS), dtype=np.int64),
-            np.empty((n_rows, n_noisy), dtype=np.int64),
-            np.empty((n_covs, dim, dim)),
-        )
-        # The control block, with the cells PAUSE_REQUESTED and N_DONE.
-        self.control = np.zeros(2, dtype=np.int64)
-        self._block: tuple[int, RandomBlock] | None = None
+        super().__init__(target, state, n_rows, N_COUNTS, np.empty((n_covs, dim, dim)))
 
     @property
     def others(self) -> list[np.ndarray]:
@@ -161,97 +136,22 @@ class Chain:
         self._set_current(EvaluatedPoint(position, seeds, *value, log_screen))
         return value.failure
 
-    def advance(self, tune: bool, iteration: int, row: int, n: int) -> int:
-        """Make up to n iterations, within one block of random numbers, and record them from a row.
-
-        Returns the number of iterations made: fewer at the end of the block, or after a pause was
-        requested. ``iteration`` counts from the start of the chain. Raises what the model raised.
-        """
-        random, first = self._random_numbers(iteration)
-        n = min(n, BLOCK - first)
-        target = self._density.native
-        screen = target if self._screen is None else self._screen.native
-        settings = self._phase_settings(tune)
-        state, draws, control = self.state, self.draws, self.control
-        done = advance(settings, target, screen, state, random, first, draws, row, n, control)
-        if done < n and not control[PAUSE_REQUESTED]:
-            for density in filter(None, (self._screen, self._density)):
-                density.raise_error()
-            raise RuntimeError("the model's log-density raised an error that did not occur again")
-        return done
-
-    def add_evaluations(self, failures: Sequence[int]) -> None:
-        """Add evaluations made in Python, given by their failure codes, to the first draw."""
-        if failures:
-            counts = self.draws.counts[0]
-            failed = [code for code in failures if code]
-            counts[N_EVALUATIONS] += len(failures)
-            counts[N_FAILED] += len(failed)
-            if failed and not counts[FAILURE]:
-                counts[FAILURE] = failed[-1]
-
-    def load_state(self, state: ChainState) -> None:
-        """Continue from a state, copied into the arrays that the machine code reads."""
-        for mine, given in zip(self.state, state, strict=True):
-            if mine is not given:
-                mine[...] = given
-        self._block = None
-
-    def snapshot(self, begin: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Draws from an iteration on, and the state, as plain arrays for a checkpoint.
-
-        Rows that repeat the row before, as after a rejection, are stored once.
-        """
-        rows = slice(begin, int(self.control[N_DONE]))
-        counts, numbers = self.draws.counts[rows], self.draws.numbers[rows]
-        changed = counts[:, STAGE] > 0
-        changed[1:] |= numbers[1:, SCALING] != numbers[:-1, SCALING]
-        changed[:1] = True
-        draws = {
-            "counts": counts.astype(np.int16),
-            "acceptance": numbers[:, ACCEPTANCE],
-            "changed": changed,
-            "positions": self.draws.positions[rows][changed],
-            "numbers": numbers[changed],
-            "seeds": self.draws.seeds[rows][changed],
-            "covs": self.draws.covs[rows],
-        }
-        return draws, self.state._asdict()
-
     def restore(self, draws: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> None:
         """Continue from the concatenated snapshots of a checkpoint."""
-        done = len(draws["counts"])
-        last_change = np.cumsum(draws["changed"]) - 1
-        for name in ("positions", "numbers", "seeds"):
-            getattr(self.draws, name)[:done] = draws[name][last_change]
-        self.draws.counts[:done] = draws["counts"]
-        self.draws.numbers[:done, ACCEPTANCE] = draws["acceptance"]
-        self.draws.covs[: len(draws["covs"])] = draws["covs"]
-        self.load_state(ChainState(**state))
-        self.control[N_DONE] = done
+        super().restore(draws, state)
         self._restore_correlation()
 
-    def _random_numbers(self, iteration: int) -> tuple[RandomBlock, int]:
-        """The block of random numbers of an iteration, and the row of the iteration in it."""
-        index, row = divmod(iteration, BLOCK)
-        if self._block is None or self._block[0] != index:
-            self._block = index, self._target.random_block(self.state.key, index)
-        return self._block[1], row
+    def _iterate(
+        self, settings: PhaseSettings, random: RandomBlock, first: int, row: int, n: int
+    ) -> int:
+        target = self._density.native
+        screen = target if self._screen is None else self._screen.native
+        state, draws, control = self.state, self.draws, self.control
+        return advance(settings, target, screen, state, random, first, draws, row, n, control)
 
-    def _phase_settings(self, tune: bool) -> PhaseSettings:
-        settings = self._target.settings
-        return PhaseSettings(
-            settings.stages[0 if tune else 1],
-            float(settings.stage_scale),
-            self._screen is not None,
-            tune,
-            settings.adaptation == "continuous",
-            int(settings.adapt_every),
-        )
-
-    def _check_pause(self) -> None:
-        if self.control[PAUSE_REQUESTED]:
-            raise StopRequested
+    def _raise_error(self) -> None:
+        for density in filter(None, (self._screen, self._density)):
+            density.raise_error()
 
     def _evaluate_screen(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: np.ndarray

@@ -21,13 +21,16 @@ from pymc_statespace_filters.sampling.kernel.state import (
     STAGE,
     ChainState,
     Draws,
+    has_moved,
 )
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     N_SEEDS,
     N_STUCK,
     start_warning,
 )
-from pymc_statespace_filters.sampling.run.chain import Chain, StopRequested
+from pymc_statespace_filters.sampling.run.chain_arrays import StopRequested
+from pymc_statespace_filters.sampling.run.record_chain import chain_of
+from pymc_statespace_filters.sampling.target.record_target import RecordTarget
 from pymc_statespace_filters.sampling.target.target import Target
 
 CHECKPOINT_SECONDS = 5.0
@@ -40,7 +43,7 @@ class ChainTask:
 
     Parameters
     ----------
-    target : Target
+    target : Target or RecordTarget
         Prepared.
     tune : int
     n_iterations : int
@@ -69,7 +72,7 @@ class ChainTask:
 
     def __init__(
         self,
-        target: Target,
+        target: Target | RecordTarget,
         tune: int,
         n_iterations: int,
         candidates: Candidates,
@@ -89,11 +92,12 @@ class ChainTask:
         self._candidates, self._measures_noise = candidates, measures_noise
         if population is not None:
             self._candidates = lambda rng: list(rng.permutation(population)[:1])
+        self._n_noisy = len(target.seed_names)
         self._index, self._name = index, name or f"chain {index}"
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0
         # Pages of these arrays that are never written to take no memory.
-        self.chain = Chain(target, draw_key(self._rng), n_rows, n_covs, proposal_cov)
+        self.chain = chain_of(target, draw_key(self._rng), n_rows, n_covs, proposal_cov)
         self.chain.state.mixture[:] = mixture
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
@@ -168,7 +172,7 @@ class ChainTask:
         draws, done = self.chain.draws, self.n_done
         begin = self._tune if done > self._tune else 0
         return {
-            "accept_rate": float(np.mean(draws.counts[begin:done, STAGE] > 0)),
+            "accept_rate": float(np.mean(has_moved(draws.counts[begin:done]))),
             "n_failed": int(draws.counts[done - 1, N_FAILED]),
         }
 
@@ -177,7 +181,7 @@ class ChainTask:
         failures = self.chain.start(self._candidates(self._rng), (), self._rng)
         if self._measures_noise:
             state = self.chain.state
-            seeds = draw_seeds(self._rng, (N_SEEDS, state.seeds.size))
+            seeds = draw_seeds(self._rng, (N_SEEDS, self._n_noisy))
             spread = self.chain.seed_spread(state.position, seeds)
             self._start_warning = start_warning(spread, self._index)
         return failures

@@ -20,7 +20,6 @@ from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.inspection import filters_used
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
 from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
-from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
 from pymc_statespace_filters.sampling.output.datatree import to_datatree
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
@@ -32,18 +31,19 @@ from pymc_statespace_filters.sampling.output.report import (
     element_names,
     until_ess_warning,
 )
-from pymc_statespace_filters.sampling.output.sample_stats import whole_chain
+from pymc_statespace_filters.sampling.output.sample_stats import stat_dims, whole_chain
 from pymc_statespace_filters.sampling.output.warnings import (
     PhaseStatistics,
     chain_warnings,
     lower_chains_of,
 )
-from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.population_search import search_population, searched_cov
+from pymc_statespace_filters.sampling.run.record_chain import chain_of
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.run.warm_up import WarmUp, stops_of
 from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
+from pymc_statespace_filters.sampling.target.record_target import RecordTarget, target_of
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import check_no_generators
 
@@ -86,7 +86,7 @@ class ModelTask:
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
         self._given = target
-        self._target: Target | None = None
+        self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the lengths of the chains that they are of.
@@ -98,12 +98,16 @@ class ModelTask:
         """Whether other ranks evaluate likelihoods together with this one."""
         return self._group is not None and self._group.size > 1
 
-    def prepare(self) -> Target:
+    def prepare(self) -> Target | RecordTarget:
         """Compile the model and find candidates for the starts, once."""
         if self._target is None:
             request = self.request
-            target = self._given or Target(
-                self.model, None, request.settings, request.proposal_cov, group=self._group
+            target = self._given or target_of(
+                self.model,
+                request.settings,
+                request.proposal_cov,
+                self._group,
+                has_pilot=request.pilot is not None,
             )
             self._target = target
             target.prepare()
@@ -123,6 +127,9 @@ class ModelTask:
         """Make the task of a chain, from its start or from its checkpoint."""
         target, request = self.prepare(), self.request
         population = self.population if request.initvals is None else None
+        cov = None
+        if isinstance(target, Target):
+            cov = searched_cov(request, target, population)
         return ChainTask(
             target,
             request.tune,
@@ -136,21 +143,26 @@ class ModelTask:
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
             population=population,
-            proposal_cov=searched_cov(request, target, population),
+            proposal_cov=cov,
             mixture=self.mixture,
         )
 
     def find_population(self, *, progressbar: bool) -> np.ndarray | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
+        None, too, if every record finds its own start, see `RecordChain.start`.
+
         Raises
         ------
         ModelError
             If no points can be found, though the pilot needs some.
         """
+        target = self.prepare()
+        if isinstance(target, RecordTarget):
+            return None
         return search_population(
             self.model,
-            self.prepare(),
+            target,
             self.request,
             self.checkpoint,
             self._said,
@@ -159,11 +171,11 @@ class ModelTask:
 
     def cost(self) -> float:
         """Estimate the seconds that a chain takes: as many evaluations as iterations."""
-        bound = self.prepare().density.bind()
+        evaluation = self.prepare().evaluation()
         seconds = []
         for _ in range(3):
             began = time.perf_counter()
-            evaluate(bound.native)  # reads arrays that live as long as `bound`
+            evaluation()
             seconds.append(time.perf_counter() - began)
         return min(seconds) * self.request.n_iterations
 
@@ -207,7 +219,9 @@ class ModelTask:
 
     @cached_property
     def _warm_up(self) -> WarmUp:
-        return WarmUp(self.request, self.prepare().raveled.dim, self.population)
+        target = self.prepare()
+        dim = target.raveled.dim if isinstance(target, Target) else 0
+        return WarmUp(self.request, dim, self.population)
 
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""
@@ -255,6 +269,7 @@ class ModelTask:
             tune=request.tune,
             keep_warmup=request.keeps_warmup,
             sampling_time=self._ended - self._began,
+            stat_dims=stat_dims(target),
         )
         tree.attrs |= {
             **filters_used(self.model),
@@ -301,7 +316,7 @@ class ModelTask:
         return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
 
     def _measure_noise(
-        self, target: Target, results: Sequence[tuple[Draws, ChainState]]
+        self, target: Target | RecordTarget, results: Sequence[tuple[Draws, ChainState]]
     ) -> tuple[dict[str, float], list[SamplerWarning]]:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request = self.request
@@ -312,8 +327,9 @@ class ModelTask:
                 spread, warning = spread_at_highest_draw(
                     [draws for draws, _ in results],
                     request.tune if request.draws else 0,
-                    Chain(target, keys[0], 0, 0).seed_spread,
+                    chain_of(target, keys[0], 0, 0).seed_spread,
                     keys,
+                    len(target.seed_names),
                 )
                 warnings = [] if warning is None else [warning]
                 return {"log_likelihood_variance": spread.variance}, warnings

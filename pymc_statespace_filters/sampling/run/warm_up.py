@@ -35,6 +35,7 @@ class WarmUp:
     ----------
     request : SamplingRequest
     dim : int
+        Of the mixture; 0 for chains that have none.
     population : ndarray, shape (m, d), optional
 
     Attributes
@@ -52,17 +53,19 @@ class WarmUp:
         if population is not None:
             fitted = fitted_mixture([population], generator_of(request, 0))
         self.mixture = no_mixture(dim) if fitted is None else fitted
+        self._has_mixture = dim > 0
 
     def end_part(self, chains: Sequence[Draws], end: int) -> int:
         """Fit the mixture to draws up to a stop; the next stop."""
         stops = stops_of(self._request)
-        self.mixture = improved_mixture(
-            self.mixture,
-            chains,
-            max((stop for stop in stops if stop < end), default=0),
-            end,
-            generator_of(self._request, end),
-            population=self._population,
-            tuning=end < self._request.tune,
-        )
+        if self._has_mixture:
+            self.mixture = improved_mixture(
+                self.mixture,
+                chains,
+                max((stop for stop in stops if stop < end), default=0),
+                end,
+                generator_of(self._request, end),
+                population=self._population,
+                tuning=end < self._request.tune,
+            )
         return min(stop for stop in stops if stop > end)

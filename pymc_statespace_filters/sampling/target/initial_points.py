@@ -96,10 +96,14 @@ class PriorDraws:
 
     def covariance(self) -> np.ndarray:
         """Give a first proposal covariance: the prior's variances times 2.38^2 / d, diagonal."""
+        return np.diag(self.variances()) * 2.38**2 / self._default.size
+
+    def variances(self) -> np.ndarray:
+        """Variances of the draws, 1 where that is not a positive number, shape (d,)."""
         dim = self._default.size
         variance = self.draws.var(axis=0) if len(self.draws) > 1 else np.ones(dim)
         variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
-        return np.diag(variance) * 2.38**2 / dim
+        return variance
 
 
 def best_initial_point(

@@ -5,9 +5,8 @@ the compiled graph; its ``bind`` gives a `BoundLogDensity`, callable from one th
 ``native`` is what machine code calls.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from pymc.model import Model
@@ -16,47 +15,29 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
-from pymc_statespace_filters.pymc_model.inspection import (
-    collapse_remedies,
-    exactness,
-    noise_seeds,
-    state_space_nodes,
-)
+from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
-from pymc_statespace_filters.sampling.kernel.state import RandomBlock
-from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
+from pymc_statespace_filters.sampling.kernel.state import ChainState, RandomBlock
+from pymc_statespace_filters.sampling.kernel.transition import evaluate
 from pymc_statespace_filters.sampling.target.leader_follower import check_group
 from pymc_statespace_filters.sampling.target.log_density import (
     LogDensity,
     screening_density,
     tempered_density,
 )
+from pymc_statespace_filters.sampling.target.sampled_model import Growth, SampledModel
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
-from pymc_statespace_filters.sampling.target.variables import (
-    RaveledVariables,
-    check_noise_dependencies,
-    continuous_value_vars,
-)
 
 PILOT_POWER = 0.5
 
 
-class Growth(NamedTuple):
-    """The variable whose proposals are widest relative to the draws from its prior."""
-
-    name: str
-    factor: float
-
-
-class Target:
-    """A model as the sampler sees it.
+class Target(SampledModel):
+    """A model as the sampler sees it, whose variables are moved together.
 
     Parameters
     ----------
-    model : pymc.Model
-    vars : sequence of TensorVariable, optional
-        Continuous variables to sample. Default: all.
-    settings : DRAMSettings
+    model, vars, settings
+        As `SampledModel`.
     proposal_cov : array_like, shape (d, d), optional
     compile_kwargs : dict, optional
         Passed to PyMC's compiler.
@@ -65,18 +46,10 @@ class Target:
     group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together, of which this is the first.
 
-    Attributes
-    ----------
-    exact : bool
-        Whether the chains target the posterior itself, without the bias of a filter's noise.
-    samples_all : bool
-        Whether no other step method moves continuous variables.
-
     Raises
     ------
     ModelError
-        If a variable is discrete, there are none, a noisy StateSpace depends on others than
-        ``vars``, or ``proposal_cov``, the screen or the group does not fit.
+        As `SampledModel`, and if ``proposal_cov``, the screen or the group does not fit.
     """
 
     def __init__(
@@ -93,25 +66,13 @@ class Target:
         group = None if group is None or group.size == 1 else group
         if group is not None:
             check_group(model, settings, group.size)
-        self.settings = settings
-        variables = continuous_value_vars(vars, model)
-        seeds = noise_seeds(model)
-        check_noise_dependencies(model, variables, seeds)
-        self.exact = exactness(model) and (settings.refresh_noise or not seeds)
-        self.seed_names = tuple(f"{name}_seed" for name in seeds)
-        self._seed_variables = tuple(seeds.values())
-        self.samples_all = set(variables) >= set(model.continuous_value_vars)
-        default = model.initial_point(random_seed=0)
-        self.raveled = RaveledVariables(variables, default)
-        if not self.raveled.dim:
-            raise ModelError("model must have at least one free variable to sample, got none")
-        self.prior_draws = PriorDraws(model, self.raveled, default)
+        super().__init__(model, vars, settings)
         if proposal_cov is None:
             self.first_cov = self.prior_draws.covariance()
         else:
             self.first_cov = checked_proposal_cov(proposal_cov, self.raveled.dim)
-        self._model = model
-        self._shared = (model, variables, default, seeds, compile_kwargs)
+        variables, seeds = self.raveled.variables, self._seeds
+        self._shared = (model, variables, self._default, seeds, compile_kwargs)
         self.density = LogDensity(
             *self._shared,
             fixed_noise=not settings.refresh_noise,
@@ -142,28 +103,26 @@ class Target:
         graph = tempered_density(self._model, filters, PILOT_POWER)
         return LogDensity(*self._shared, fixed_noise=True, graph=graph)
 
-    @cached_property
-    def collapse_remedy(self) -> str:
-        """What to do where particles collapse, for every filter of the model that has some."""
-        return collapse_remedies(self._model)
-
     @property
     def carries_noise(self) -> bool:
         """Whether proposals have noise correlated with that of the current point."""
         return self.settings.correlation is not None and bool(self.seed_names)
 
+    def evaluation(self) -> Callable[[], object]:
+        """A function that evaluates the log-density once, to measure what it costs."""
+        bound = self.density.bind()
+        return lambda: evaluate(bound.native)
+
     def prepare(self) -> None:
         """Load the machine code, and read data and fixed seeds as they are now."""
-        self.fixed_seeds = np.array([s.get_value() for s in self._seed_variables], dtype=np.int64)
+        self._read_seeds()
         self.density.prepare()
         if self.screen is not None:
             self.screen.prepare()
 
-    def growth(self, cov: np.ndarray) -> Growth:
-        """Compare a proposal covariance with that of the draws from the prior."""
-        variances = np.diag(cov) / np.diag(self.prior_draws.covariance())
-        most = int(variances.argmax())
-        return Growth(self.raveled.name_at(most), float(variances[most]) ** 0.5)
+    def growth(self, state: ChainState) -> Growth:
+        """Compare a chain's proposal covariance with that of the draws from the prior."""
+        return self._growth(np.diag(state.proposal_cov), np.diag(self.prior_draws.covariance()))
 
     def random_block(self, key: np.ndarray, index: int) -> RandomBlock:
         """Draw a block of random numbers for a chain with this key."""

@@ -1,0 +1,1 @@
+"""Iterations of a chain that moves the records of a panel one by one."""

@@ -1,0 +1,120 @@
+"""Arrays of a chain that moves the records of a panel one by one, see `moves`.
+
+A position has three blocks: the own parameters of every record, the shared ones, and those of the
+population. `ChainState` and `Draws` have the same arrays as for other chains, with more columns:
+the numbers of a state have the kept estimates behind the others, the counts of a draw have what
+each block has accepted.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.native.pytensor_function import Call
+from pymc_statespace_filters.sampling.kernel.adaptation_state import (
+    pack,
+    packed_size,
+    start_adaptation,
+    unpack,
+)
+from pymc_statespace_filters.sampling.kernel.random_numbers import (
+    BLOCK,
+    draw_seeds,
+    generator_of_block,
+)
+from pymc_statespace_filters.sampling.kernel.state import N_COUNTS
+
+# Of a chain's numbers, the first estimate: G of the records, then that of other data.
+FIRST_ESTIMATE = 3
+# Of the counts of a draw, the first of G: whether the record has accepted. The N_COMMON_BLOCKS
+# behind them are whether the shared block has accepted, and how many moves the population has.
+FIRST_ACCEPTED = N_COUNTS
+# Moves of the population in an iteration: without a likelihood they cost next to nothing.
+N_POPULATION_MOVES = 10
+# Evaluations of an iteration, each with noise of its own: of the records, of the shared block.
+N_NOISES = 2
+
+
+class NativeRecordDensities(NamedTuple):
+    """The log-density by record as machine code calls it, and the arrays that the calls read."""
+
+    # G likelihoods of the records, that of other data, and the health of each filter.
+    likelihood: Call
+    prior: Call  # G terms of the records, and all other terms
+    position: np.ndarray  # (d,)
+    seeds: np.ndarray  # int64 (noisy,), of an evaluation
+    n_healths: int
+
+
+class RecordLayout(NamedTuple):
+    """Where the blocks are in a position, and the seeds in a state."""
+
+    own: np.ndarray  # int64 (G, k): places of a record's own parameters
+    shared: np.ndarray  # int64 (s,)
+    population: np.ndarray  # int64 (p,)
+    # int64 (G, panels): places of the seeds of a record's estimate in those of a state
+    seeds: np.ndarray
+    # int64: for every seed of a state, the column of the seeds of an evaluation
+    columns: np.ndarray
+
+    @property
+    def n_records(self) -> int:
+        """The number of records."""
+        return len(self.own)
+
+    def blocks(self) -> list[np.ndarray]:
+        """Places of each block: those of every record, then the shared one and the population."""
+        return [*self.own, self.shared, self.population]
+
+    def first_adaptation(self, cov: np.ndarray) -> np.ndarray:
+        """Packed states of the adaptation of every block, one after the other.
+
+        ``cov`` is the covariance of the first proposals (d, d), or its diagonal (d,).
+        """
+        packed = np.zeros(sum(packed_size(len(block)) for block in self.blocks()))
+        for block, part in self._adaptations(packed):
+            mine = np.diag(cov[block]) if cov.ndim == 1 else cov[np.ix_(block, block)]
+            pack(start_adaptation(mine), part)
+        return packed
+
+    def proposal_variances(self, packed: np.ndarray) -> np.ndarray:
+        """Variances of the proposals of every parameter, (d,), from the packed states."""
+        variances = np.empty(sum(map(len, self.blocks())))
+        for block, part in self._adaptations(packed):
+            variances[block] = np.diag(unpack(part, len(block)).cov)
+        return variances
+
+    def _adaptations(self, packed: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Each block that is not empty, and the part of the packed states that belongs to it."""
+        first = 0
+        for block in self.blocks():
+            last = first + packed_size(len(block))
+            if len(block):
+                yield block, packed[first:last]
+            first = last
+
+
+class RecordRandomBlock(NamedTuple):
+    """Random numbers of consecutive iterations, along the first axis."""
+
+    own: np.ndarray  # (iterations, G, k), normals for the proposals
+    shared: np.ndarray  # (iterations, s)
+    population: np.ndarray  # (iterations, N_POPULATION_MOVES, p)
+    log_uniforms: np.ndarray  # (iterations, G + 1 + N_POPULATION_MOVES), to accept
+    seeds: np.ndarray  # int64 (iterations, N_NOISES, noisy)
+
+
+def record_random_block(
+    key: np.ndarray, index: int, layout: RecordLayout, n_noisy: int
+) -> RecordRandomBlock:
+    """Draw a chain's random numbers for iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``."""
+    rng = generator_of_block(key, index)
+    n_uniforms = layout.n_records + 1 + N_POPULATION_MOVES
+    return RecordRandomBlock(
+        rng.standard_normal((BLOCK, *layout.own.shape)),
+        rng.standard_normal((BLOCK, len(layout.shared))),
+        rng.standard_normal((BLOCK, N_POPULATION_MOVES, len(layout.population))),
+        -rng.standard_exponential((BLOCK, n_uniforms)),
+        draw_seeds(rng, (BLOCK, N_NOISES, n_noisy)),
+    )

@@ -1,0 +1,141 @@
+"""A PyMC model's log-density by record of its panel, as two calls of machine code.
+
+One call estimates the likelihoods of all records. The other gives the terms without a likelihood,
+which takes microseconds: the moves of the population evaluate it alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pymc.model import Model
+from pymc.pytensorf import compile as compile_pymc
+from pymc.pytensorf import join_nonshared_inputs
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.pymc_model.inspection import health_outputs
+from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
+from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
+from pymc_statespace_filters.sampling.kernel.records.evaluation import (
+    RecordEvaluation,
+    evaluate_likelihoods,
+    evaluate_priors,
+)
+from pymc_statespace_filters.sampling.kernel.state import RAISED
+
+
+class RecordDensities:
+    """Compiled log-density of a model, by record, with its noise as an argument.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    structure : PanelStructure
+    variables : sequence of TensorVariable
+        All value variables, in the order of the vector into which they are raveled.
+    point : mapping of str to ndarray
+        Any point of the model.
+    seeds : mapping of str to shared variable
+        The noise seeds, by the name of their StateSpace variable.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        structure: PanelStructure,
+        variables: Sequence[TensorVariable],
+        point: Mapping[str, np.ndarray],
+        seeds: Mapping[str, TensorVariable],
+    ):
+        other = structure.other_likelihood
+        likelihoods = [structure.likelihood, pt.zeros(()) if other is None else other]
+        healths = health_outputs(likelihoods)
+        self._n_healths, self._n_terms = len(healths), structure.n_records + 1
+        seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
+        outputs, joined = join_nonshared_inputs(
+            point, [*likelihoods, *healths], variables, shared_inputs=seed_inputs
+        )
+        self._likelihood = _compiled([joined, *seed_inputs.values()], outputs)
+        outputs, joined = join_nonshared_inputs(
+            point, [structure.prior, structure.rest], variables, shared_inputs={}
+        )
+        self._prior = _compiled([joined], outputs)
+        self._n_seeds = len(seeds)
+        self._start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
+        self._native: tuple[NativeFunction, NativeFunction] | None = None
+
+    def __getstate__(self) -> dict:
+        """Leave out the machine code, which another process loads itself."""
+        return self.__dict__ | {"_native": None}
+
+    def prepare(self) -> tuple[NativeFunction, NativeFunction]:
+        """Load the machine code, and read the data as they are now."""
+        inputs = _inputs(self._start, np.zeros(self._n_seeds, dtype=np.int64))
+        self._native = (
+            NativeFunction(self._likelihood, inputs),
+            NativeFunction(self._prior, inputs[:1]),
+        )
+        return self._native
+
+    def bind(self) -> "BoundRecordDensities":
+        """Make the log-density callable from one thread, with separate arrays."""
+        likelihood, prior = self._native or self.prepare()
+        position = self._start.copy()
+        seeds = np.zeros(self._n_seeds, dtype=np.int64)
+        inputs = _inputs(position, seeds)
+        likelihood_call, first_buffers = likelihood.bind(inputs)
+        prior_call, buffers = prior.bind(inputs[:1])
+
+        def raise_error(_keep_alive: Any = (first_buffers, buffers)) -> None:
+            likelihood(*inputs)
+            prior(*inputs[:1])
+
+        native = NativeRecordDensities(
+            likelihood_call, prior_call, position, seeds, self._n_healths
+        )
+        return BoundRecordDensities(native, self._n_terms, raise_error)
+
+
+@dataclass(frozen=True)
+class BoundRecordDensities:
+    """A log-density by record, with the arrays that its machine code reads and writes."""
+
+    native: NativeRecordDensities
+    n_terms: int  # one for each record, and one more
+    # Evaluates again in Python, to raise the error of the machine code, and keeps the memory of the
+    # machine code's arguments alive.
+    raise_error: Callable[[], None]
+
+    def estimate(
+        self, position: np.ndarray, seeds: np.ndarray
+    ) -> tuple[np.ndarray, RecordEvaluation]:
+        """Estimate the log-likelihoods (G + 1,) at a position; an exception is raised."""
+        self.native.position[:] = position
+        self.native.seeds[:] = seeds
+        estimates = np.empty(self.n_terms)
+        found = evaluate_likelihoods(self.native, estimates)
+        if found.failure == RAISED:
+            self.raise_error()
+        return estimates, found
+
+    def priors(self, position: np.ndarray) -> np.ndarray:
+        """All other terms (G + 1,) at a position; an exception is raised."""
+        self.native.position[:] = position
+        priors = np.empty(self.n_terms)
+        if not evaluate_priors(self.native, priors):
+            self.raise_error()
+        return priors
+
+
+def _compiled(inputs: list, outputs: list) -> Any:
+    function = compile_pymc(inputs, outputs, on_unused_input="ignore")
+    function.trust_input = True
+    return function
+
+
+def _inputs(position: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:
+    """Arguments of the compiled functions; each seed is a view of the vector."""
+    return [position, *(seeds[i : i + 1].reshape(()) for i in range(seeds.size))]

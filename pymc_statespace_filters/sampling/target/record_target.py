@@ -1,0 +1,184 @@
+"""A model with a panel as the sampler sees it, if it moves every record by itself."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pymc.model import Model
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.pymc_model.inspection import panel_variables
+from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure, panel_structure
+from pymc_statespace_filters.sampling.kernel.records.arrays import (
+    RecordLayout,
+    RecordRandomBlock,
+    record_random_block,
+)
+from pymc_statespace_filters.sampling.kernel.state import ChainState
+from pymc_statespace_filters.sampling.target.record_densities import RecordDensities
+from pymc_statespace_filters.sampling.target.sampled_model import Growth, SampledModel
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
+from pymc_statespace_filters.sampling.target.target import Target
+
+
+class RecordTarget(SampledModel):
+    """A model whose records are moved one by one.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    settings : DRAMSettings
+    structure : PanelStructure
+    proposal_cov : array_like, shape (d, d), optional
+        Of the first proposals; each block takes its own part.
+    of_all : bool
+        Whether that covariance is one of proposals of all parameters together, as of a pilot. It
+        has the factor 2.38^2 / d of their number, and each block that of its own.
+
+    Attributes
+    ----------
+    structure : PanelStructure
+    labels : tuple
+        Of the records.
+    densities : RecordDensities
+    layout : RecordLayout
+    first_adaptation : ndarray
+        Packed states of the adaptation of all blocks.
+
+    Raises
+    ------
+    ModelError
+        As `SampledModel`, and if ``proposal_cov`` or a setting does not fit.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        settings: DRAMSettings,
+        structure: PanelStructure,
+        proposal_cov: np.ndarray | None = None,
+        *,
+        of_all: bool = False,
+    ):
+        _check_settings(settings, structure.name)
+        super().__init__(model, None, settings)
+        self.structure = structure
+        self.labels = tuple(model.coords[f"{structure.name}_record"])
+        self.layout = self._layout(model)
+        first = self._first_variances()
+        if proposal_cov is not None:
+            first = checked_proposal_cov(proposal_cov, self.raveled.dim)
+            if of_all:
+                first *= self.raveled.dim / self._block_sizes()
+        self.first_adaptation = self.layout.first_adaptation(first)
+        self.densities = RecordDensities(
+            model, structure, self.raveled.variables, self._default, self._seeds
+        )
+
+    def _layout(self, model: Model) -> RecordLayout:
+        structure, panels = self.structure, panel_variables(model)
+        n_records = structure.n_records
+        index = self.raveled.unravel(np.arange(self.raveled.dim))
+        places = {name: values.astype(np.int64) for name, values in index.items()}
+        columns: list[int] = []
+        of_records = []
+        for column, name in enumerate(self._seeds):
+            n_seeds = n_records if name in panels else 1
+            if name in panels:
+                of_records.append(len(columns) + np.arange(n_records))
+            columns += [column] * n_seeds
+        seeds = np.array(of_records, dtype=np.int64).reshape(-1, n_records).T
+        return RecordLayout(
+            np.concatenate([places[v.name].reshape(n_records, -1) for v in structure.own], axis=1),
+            _joined([places[v.name] for v in structure.shared]),
+            _joined([places[v.name] for v in structure.population]),
+            np.ascontiguousarray(seeds),
+            np.array(columns, dtype=np.int64),
+        )
+
+    @property
+    def n_noisy(self) -> int:
+        """Seeds of an evaluation, one for each noisy variable."""
+        return len(self._seeds)
+
+    def evaluation(self) -> Callable[[], object]:
+        """A function that evaluates all records once, to measure what they cost."""
+        bound = self.densities.bind()
+        start, seeds = bound.native.position.copy(), bound.native.seeds.copy()
+        return lambda: bound.estimate(start, seeds)
+
+    def variable_name(self, value: TensorVariable) -> str:
+        """The name of the free variable of a value."""
+        return self._model.values_to_rvs[value].name
+
+    def prepare(self) -> None:
+        """Load the machine code, and read data and fixed seeds as they are now."""
+        self._read_seeds()
+        self.densities.prepare()
+
+    def growth(self, state: ChainState) -> Growth:
+        """Compare a chain's proposals with draws from the prior."""
+        variances = self.layout.proposal_variances(state.adaptation)
+        return self._growth(variances, self._first_variances())
+
+    def random_block(self, key: np.ndarray, index: int) -> RecordRandomBlock:
+        """Draw a block of random numbers for a chain with this key."""
+        block = record_random_block(key, index, self.layout, self.n_noisy)
+        if not self.settings.refresh_noise:
+            block.seeds[...] = self.fixed_seeds
+        return block
+
+    def _first_variances(self) -> np.ndarray:
+        """Variances of the prior's draws times 2.38^2 over the dimension of the block."""
+        return self.prior_draws.variances() * 2.38**2 / self._block_sizes()
+
+    def _block_sizes(self) -> np.ndarray:
+        """The number of parameters in the block of each, (d,)."""
+        sizes = np.empty(self.raveled.dim)
+        for block in self.layout.blocks():
+            sizes[block] = len(block)
+        return sizes
+
+
+def target_of(
+    model: Model,
+    settings: DRAMSettings,
+    proposal_cov: np.ndarray | None,
+    group: Communicator | None,
+    *,
+    has_pilot: bool,
+) -> Target | RecordTarget:
+    """The target of a panel whose records have parameters of their own, or of any other model.
+
+    Arguments as of `Target`; ``has_pilot`` is whether the covariance comes from one.
+    """
+    structure = panel_structure(model)
+    if structure is None:
+        return Target(model, None, settings, proposal_cov, group=group)
+    if group is not None and group.size > 1:
+        raise ModelError(
+            f"ranks_per_chain must be 1 for the panel {structure.name!r}, got {group.size}: every "
+            "rank evaluates all records of its chains"
+        )
+    return RecordTarget(model, settings, structure, proposal_cov, of_all=has_pilot)
+
+
+def _joined(places: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.empty(0, dtype=np.int64), *map(np.ravel, places)])
+
+
+def _check_settings(settings: DRAMSettings, name: str) -> None:
+    """Raise if a setting asks for what the moves of single records do not have."""
+    asked = {"screen": settings.screen, "correlation": settings.correlation}
+    for setting, value in asked.items():
+        if value is not None:
+            raise ModelError(
+                f"{setting} must be None for the panel {name!r}, whose records are moved one by "
+                f"one, got {value!r}; pm.sample(step=psf.DRAM()) moves all parameters together"
+            )
+    if settings.stages not in ((2, 1), (1, 1)):
+        raise ModelError(
+            f"stages must be 1 for the panel {name!r}, whose records make one proposal at a time, "
+            f"got {settings.stages}; pm.sample(step=psf.DRAM()) moves all parameters together"
+        )

@@ -1,0 +1,86 @@
+"""What targets have in common: the variables that are moved, and what is known of them."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from pymc.model import Model
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model.inspection import (
+    collapse_remedies,
+    exactness,
+    noise_seeds,
+)
+from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.variables import (
+    RaveledVariables,
+    check_noise_dependencies,
+    continuous_value_vars,
+)
+
+
+class Growth(NamedTuple):
+    """The variable whose proposals are widest relative to the draws from its prior."""
+
+    name: str
+    factor: float
+
+
+class SampledModel:
+    """A model, the variables that a sampler moves, their prior draws and noise seeds.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    vars : sequence of TensorVariable, optional
+        Continuous variables to sample. Default: all.
+    settings : DRAMSettings
+
+    Attributes
+    ----------
+    exact : bool
+        Whether the chains target the posterior itself, without the bias of a filter's noise.
+    seed_names : tuple of str
+        Names of the noise seeds, one for each noisy StateSpace variable.
+    samples_all : bool
+        Whether no other step method moves continuous variables.
+
+    Raises
+    ------
+    ModelError
+        If a variable is discrete, there are none, or a noisy StateSpace depends on others than
+        ``vars``.
+    """
+
+    def __init__(self, model: Model, vars: Sequence[TensorVariable] | None, settings: DRAMSettings):
+        self.settings = settings
+        variables = continuous_value_vars(vars, model)
+        self._seeds = noise_seeds(model)
+        check_noise_dependencies(model, variables, self._seeds)
+        self.exact = exactness(model) and (settings.refresh_noise or not self._seeds)
+        self.seed_names = tuple(f"{name}_seed" for name in self._seeds)
+        self.samples_all = set(variables) >= set(model.continuous_value_vars)
+        self._default = model.initial_point(random_seed=0)
+        self.raveled = RaveledVariables(variables, self._default)
+        if not self.raveled.dim:
+            raise ModelError("model must have at least one free variable to sample, got none")
+        self.prior_draws = PriorDraws(model, self.raveled, self._default)
+        self._model = model
+
+    @cached_property
+    def collapse_remedy(self) -> str:
+        """What to do where particles collapse, for every filter of the model that has some."""
+        return collapse_remedies(self._model)
+
+    def _read_seeds(self) -> None:
+        seeds = [seed.get_value() for seed in self._seeds.values()]
+        self.fixed_seeds = np.array(seeds, dtype=np.int64)
+
+    def _growth(self, variances: np.ndarray, of_prior: np.ndarray) -> Growth:
+        ratios = variances / of_prior
+        most = int(ratios.argmax())
+        return Growth(self.raveled.name_at(most), float(ratios[most]) ** 0.5)

@@ -1,0 +1,260 @@
+"""Which parameters of a panel belong to single records, for models of many forms.
+
+In each form the four graphs add up to the model's log-density, and own terms of a record do not
+change with the own parameters of another one.
+"""
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.panel_structure import panel_structure
+
+LABELS = ["a", "b", "c"]
+N_ROWS = 4
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q, rate, level: [level + rate * (x[0] - level) + q[0]],
+    process_noise=[[0.3]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.1]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+DATA = np.linspace(-1.0, 1.0, 3 * N_ROWS)
+
+
+def panel(name="d", **params):
+    return psf.StateSpace(
+        name,
+        SYSTEM,
+        psf.EKF(),
+        panel=np.repeat(LABELS, N_ROWS),
+        steps=np.tile(np.arange(1, N_ROWS + 1), 3),
+        observed=DATA,
+        params=params,
+    )
+
+
+def centred():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    panel(rate=pm.Normal("x", mu, sd, dims="machine"), level=pm.Normal("level"))
+
+
+def non_centred():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    panel(rate=mu + sd * pm.Normal("z", dims="machine"), level=0.5)
+
+
+def population_of_shared():
+    """A parameter of the distribution of a shared one reaches no likelihood either."""
+    tau = pm.HalfNormal("tau")
+    panel(rate=pm.Uniform("x", -0.9, 0.9, shape=3), level=pm.Normal("level", 0, tau))
+
+
+def bounded_by_population():
+    """On the unconstrained space the bound is a factor of each record's parameter."""
+    top = pm.HalfNormal("top")
+    panel(rate=pm.Uniform("x", 0, top, dims="machine"), level=0.0)
+
+
+def correlated():
+    """Two parameters of each record from a normal distribution of the population."""
+    chol, *_ = pm.LKJCholeskyCov("chol", n=2, eta=2, sd_dist=pm.HalfNormal.dist())
+    x = pm.MvNormal("x", mu=[0.3, 0.0], chol=chol, shape=(3, 2))
+    panel(rate=pm.math.tanh(x[:, 0]), level=x[:, 1])
+
+
+def regression():
+    """Own parameters by a linear predictor of a table of their columns; shared coefficients."""
+    b = pm.Normal("b", shape=2)
+    x = pm.Normal("x", shape=(3, 2))
+    scores = pt.dot(x, np.array([0.2, 0.1]))
+    panel(rate=scores, level=pt.dot(np.arange(6.0).reshape(3, 2), b))
+
+
+def own_data():
+    """Other data of the same records, in rows of their own."""
+    x = pm.Normal("x", dims="machine")
+    panel(rate=0.3, level=x)
+    pm.Normal("y", x[np.array([0, 0, 1, 2, 2])], 1.0, observed=np.arange(5.0))
+
+
+def two_panels():
+    x = pm.Normal("x", dims="machine")
+    panel(rate=0.3, level=x)
+    panel("e", rate=0.4, level=2.0 * x)
+
+
+def summed_potential():
+    x = pm.Normal("x", dims="machine")
+    pm.Potential("far", pt.sum(-(x**4)))
+    panel(rate=0.3, level=x)
+
+
+def mixture():
+    weights = pm.Dirichlet("weights", np.ones(2))
+    components = [pm.Normal.dist(-1.0, 0.5), pm.Normal.dist(1.0, 0.5)]
+    panel(rate=0.3, level=pm.Mixture("x", weights, components, dims="machine"))
+
+
+def as_data():
+    """The labels are data that may be replaced later."""
+    labels = pm.Data("labels", np.repeat([4, 7, 9], N_ROWS))
+    x = pm.Normal("x", shape=3)
+    steps = np.tile(np.arange(1, N_ROWS + 1), 3)
+    psf.StateSpace(
+        "d",
+        SYSTEM,
+        psf.EKF(),
+        panel=labels,
+        steps=steps,
+        observed=DATA,
+        params={"rate": 0.3, "level": x},
+    )
+
+
+FORMS = {  # own, population, shared
+    centred: (["x"], ["mu", "sd"], ["level"]),
+    non_centred: (["z"], [], ["mu", "sd"]),
+    population_of_shared: (["x"], ["tau"], ["level"]),
+    bounded_by_population: (["x"], [], ["top"]),
+    correlated: (["x"], ["chol"], []),
+    regression: (["x"], [], ["b"]),
+    own_data: (["x"], [], []),
+    two_panels: (["x"], [], []),
+    summed_potential: (["x"], [], []),
+    mixture: (["x"], ["weights"], []),
+    as_data: (["x"], [], []),
+}
+
+
+def model_of(form):
+    with pm.Model(coords={"machine": LABELS}) as model:
+        form()
+    return model
+
+
+@pytest.mark.parametrize("form", FORMS, ids=lambda form: form.__name__)
+def test_the_parameters_of_a_form(form):
+    model = model_of(form)
+    found = panel_structure(model)
+    names = [
+        sorted(model.values_to_rvs[value].name for value in block)
+        for block in (found.own, found.population, found.shared)
+    ]
+    assert names == list(map(sorted, FORMS[form]))
+    assert (found.name, found.n_records) == ("d", 3)
+    check_terms(model, found)
+
+
+def check_terms(model, found):
+    """They add up to the log-density, and each record's own terms are its own."""
+    graphs = [found.likelihood, found.prior, found.rest]
+    if found.other_likelihood is not None:
+        graphs.append(found.other_likelihood)
+    # Too few calls to be worth machine code.
+    whole = model.compile_fn(model.logp(), mode="FAST_COMPILE")
+    terms = model.compile_fn(graphs, mode="FAST_COMPILE", on_unused_input="ignore")
+    rng = np.random.default_rng(1)
+    point = {
+        name: value + 0.2 * rng.normal(size=np.shape(value))
+        for name, value in model.initial_point(random_seed=0).items()
+    }
+    before = terms(point)
+    total = sum(np.sum(part) for part in before)
+    np.testing.assert_allclose(total, whole(point), rtol=1e-10)
+    for value in found.own:
+        moved = dict(point) | {value.name: point[value.name].copy()}
+        moved[value.name][1] += 0.1
+        after = terms(moved)
+        for old, new in zip(before[:2], after[:2], strict=True):
+            np.testing.assert_array_equal(old[[0, 2]], new[[0, 2]])
+        np.testing.assert_array_equal(before[2:], after[2:])
+    others = [*found.population, *found.shared]
+    changes = dict.fromkeys((value.name for value in others), False)
+    for value in others:
+        after = terms(dict(point) | {value.name: point[value.name] + 0.1})
+        changes[value.name] = bool((np.asarray(before[0]) != np.asarray(after[0])).any())
+    assert not any(changes[value.name] for value in found.population)
+
+
+def sum_to_zero():
+    panel(rate=0.3, level=pm.ZeroSumNormal("x", dims="machine"))
+
+
+def random_walk():
+    """A random walk over the records."""
+    panel(rate=0.3, level=pm.GaussianRandomWalk("x", init_dist=pm.Normal.dist(), steps=2))
+
+
+def shared_norm():
+    x = pm.Normal("x", dims="machine")
+    panel(rate=0.3, level=x / pt.sqrt((x**2).sum()))
+
+
+def squared_sum():
+    x = pm.Normal("x", dims="machine")
+    pm.Potential("sum", -(x.sum() ** 2))
+    panel(rate=0.3, level=x)
+
+
+def reversed_order():
+    """Each record has the parameter of another one."""
+    panel(rate=0.3, level=pm.Normal("x", dims="machine")[::-1])
+
+
+def correlated_records():
+    x = pm.MvNormal("x", np.zeros(3), np.eye(3) + 0.5)
+    panel(rate=0.3, level=x)
+
+
+def nothing_own():
+    panel(rate=pm.Normal("rate"), level=pm.Normal("level"))
+
+
+MIXING = [
+    sum_to_zero,
+    random_walk,
+    shared_norm,
+    squared_sum,
+    reversed_order,
+    correlated_records,
+    nothing_own,
+]
+
+
+@pytest.mark.parametrize("form", MIXING, ids=lambda form: form.__name__)
+def test_forms_that_mix_records_have_no_structure(form):
+    assert panel_structure(model_of(form)) is None
+
+
+@pytest.mark.parametrize("form", MIXING[:4], ids=lambda form: form.__name__)
+def test_what_mixes_is_shared_beside_what_does_not(form):
+    with pm.Model(coords={"machine": LABELS}) as model:
+        form()
+        own = pm.Normal("own", dims="machine")
+        panel("e", rate=pm.math.tanh(own), level=model["x"])
+    found = panel_structure(model)
+    assert [model.values_to_rvs[value].name for value in found.own] == ["own"]
+    assert [model.values_to_rvs[value].name for value in found.shared] == ["x"]
+    check_terms(model, found)
+
+
+def test_a_vector_as_long_as_the_panel_that_is_none_of_its_records():
+    """Three columns of three records: the vector along the columns is shared."""
+    with pm.Model() as model:
+        scale = pm.Normal("scale", shape=3)
+        x = pm.Normal("x", 0.0, 1.0, shape=(3, 3))
+        panel(rate=0.3, level=(x * scale).sum(axis=1))
+    found = panel_structure(model)
+    assert [value.name for value in found.own] == ["x"]
+    assert [value.name for value in found.shared] == ["scale"]
+    check_terms(model, found)
+
+
+def test_a_model_without_a_panel_has_no_structure():
+    with pm.Model() as model:
+        pm.Normal("rate", shape=3)
+    assert panel_structure(model) is None
