@@ -57,6 +57,7 @@ from .system.integrators import (
 )
 from .system.model import StateSpaceModel
 from .system.noise_distributions import euler_multinomial, gamma_white_noise
+from .system.panel_frame import panel_from
 from .system.record import nearest_steps
 from .system.second_order import second_order
 
@@ -113,6 +114,7 @@ __all__ = [
     "marginal_modes",
     "maximum_likelihood",
     "nearest_steps",
+    "panel_from",
     "plot_average",
     "plot_evidence",
     "plot_filter_health",

@@ -1,5 +1,6 @@
 """Modes of a system linearised about a rest point."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -122,11 +123,26 @@ def _parameters(system: StateSpaceModel, params: Any) -> Array:
     if isinstance(params, xr.Dataset):
         first = [dim for dim in ("chain", "draw") if dim in params.dims]
         params = {
-            name: params[name].transpose(*first, ..., missing_dims="ignore").values
+            name: params[name].transpose(*first, ..., missing_dims="ignore")
             for name in system.parameters
             if name in params
         }
+    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
+        _check_dims(name, shape, params)
     return flat_parameters(system, params)
+
+
+def _check_dims(name: str, shape: tuple[int, ...], params: Any) -> None:
+    """Raise if a parameter has a value for each record of a panel, which would count as draws."""
+    value = params.get(name) if isinstance(params, Mapping) else None
+    if not isinstance(value, xr.DataArray):
+        return
+    others = [str(dim) for dim in value.dims if dim not in ("chain", "draw")]
+    if len(others) > len(shape):
+        raise ModelError(
+            f"params must hold one value of {name!r} for each draw, got the dimension {others[0]!r}"
+            f" too: select one record, as in posterior.isel({others[0]}=0)"
+        )
 
 
 def _states(system: StateSpaceModel, at: Any, draws: Array) -> Array:

@@ -1,6 +1,7 @@
 """A run of a filter at fixed parameters, without PyMC: likelihood terms and filtered states."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
+from pymc_statespace_filters.ops.panel import single_records
 from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import checked_panel, panel_parameters, row_coords
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_at, check_seed, checked_record, rows_at
 
@@ -24,6 +27,7 @@ def run_filter(
     *,
     steps: Any = None,
     times: Any = None,
+    panel: Any = None,
     inputs: Any = None,
     t0: float = 0.0,
     seed: int = 0,
@@ -36,9 +40,9 @@ def run_filter(
     system : StateSpaceModel
     filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
     params : mapping
-        A value for every parameter.
-    observed, steps, times, inputs, t0
-        The record, as in `log_likelihood`.
+        A value for every parameter; in a panel of G records, one for all or one for each.
+    observed, steps, times, panel, inputs, t0
+        The record, or the records of a panel, as in `log_likelihood`.
     seed : int
         Seed of the noise inside the filter, if it has any. The run is that of `log_likelihood` with
         this seed.
@@ -54,7 +58,10 @@ def run_filter(
         the weights sum to one; a particle that is not finite has weight zero, and where none is
         finite mean and covariance are NaN. ``log_likelihood`` (obs_time) holds the terms
         log p(d_j | d_1 .. d_{j-1}). From an observation at which the filter fails on, terms are
-        -inf and states NaN.
+        -inf and states NaN. Of a panel, the dimension of the states is ``row`` instead of ``time``,
+        with the coordinates ``record``, ``step`` and ``time`` of each row, the records one below
+        the other; that of ``log_likelihood`` is ``obs``, with ``obs_record``, ``obs_step`` and
+        ``obs_time``.
 
     Raises
     ------
@@ -94,41 +101,61 @@ def run_filter(
     check_system_and_filter(system, filter)
     warn_of_choice(system, filter)
     check_at(at)
-    record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
-    theta = flat_parameters(system, params)
-    if theta.ndim != 1:
-        raise ModelError(
-            f"run_filter takes one value per parameter, got arrays of {theta.shape[:-1]}"
-        )
     noise = check_seed("seed", seed)
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
-    rows = rows_at(at, record.steps)
+    data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+    if panel is None:
+        record = checked_record(system, observed, **data)
+        theta = flat_parameters(system, params)
+        if theta.ndim != 1:
+            raise ModelError(
+                f"run_filter takes one value per parameter, got arrays of {theta.shape[:-1]}"
+            )
+        arguments: list[Any] = [(theta, *record, noise)]
+    else:
+        table = checked_panel(system, panel, observed, **data)
+        of_records = panel_parameters(system, params, table.records)
+        records = single_records(table, noise)
+        arguments = [(own, *each) for own, each in zip(of_records, records, strict=True)]
     evaluate = evaluator(FilterRun(system, filter))
-    terms, health, *states = evaluate(theta, *record, noise, rows)
-    warn_about(system, filter, health[None], lambda i: (theta, *record, noise))
-    dataset = _dataset(system, *states).assign(log_likelihood=("obs_time", terms))
-    seen = {"time": rows, "obs_time": record.steps}
-    times_of = {name: record.t0 + at_steps * system.dt for name, at_steps in seen.items()}
-    return dataset.assign_coords(times_of).assign_attrs(filter=repr(filter), at=at)
+    at_steps = [each[1] for each in arguments]
+    rows = [rows_at(at, own) for own in at_steps]
+    runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
+    terms, health, *states = (list(parts) for parts in zip(*runs, strict=True))
+    warn_about(system, filter, np.array(health), lambda i: arguments[i])
+    row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
+    dataset = _dataset(system, row_dim, *map(np.concatenate, states))
+    dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
+    begin = float(arguments[0][4])
+    if panel is None:
+        coords: dict[str, Any] = {
+            dim: begin + own[0] * system.dt for dim, own in ((row_dim, rows), (term_dim, at_steps))
+        }
+    else:
+        coords_of = partial(row_coords, t0=begin, dt=system.dt)
+        labels = table.records.labels
+        coords = coords_of(row_dim, labels, rows) | coords_of(term_dim, labels, at_steps, "obs_")
+    return dataset.assign_coords(coords).assign_attrs(filter=repr(filter), at=at)
 
 
 def _dataset(
     system: StateSpaceModel,
+    dim: str,
     mean: np.ndarray,
     cov: np.ndarray,
     members: np.ndarray,
     weights: np.ndarray,
 ) -> xr.Dataset:
-    """States by time, with members if the filter has any."""
+    """States along ``dim``, with members if the filter has any."""
     variances = np.diagonal(cov, axis1=1, axis2=2)
     found: dict[str, tuple] = {
-        "mean": (("time", "state"), mean),
-        "sd": (("time", "state"), np.sqrt(np.maximum(variances, 0.0))),
-        "cov": (("time", "state", "state_bis"), cov),
+        "mean": ((dim, "state"), mean),
+        "sd": ((dim, "state"), np.sqrt(np.maximum(variances, 0.0))),
+        "cov": ((dim, "state", "state_bis"), cov),
     }
     if weights.shape[1]:
-        found["particles"] = (("time", "particle", "state"), members)
-        found["weights"] = (("time", "particle"), weights)
+        found["particles"] = ((dim, "particle", "state"), members)
+        found["weights"] = ((dim, "particle"), weights)
     names = list(system.states)
     return xr.Dataset(found, coords={"state": names, "state_bis": names})

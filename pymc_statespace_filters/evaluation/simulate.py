@@ -1,7 +1,7 @@
 """Forward simulation of a system, in machine code."""
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,11 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.ops.panel import generators_of_records, single_records
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import checked_panel, panel_parameters, row_coords
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_inputs, check_system, steps_of
 
@@ -142,12 +144,13 @@ def simulate(
     *,
     steps: Any = None,
     times: Any = None,
+    panel: Any = None,
     inputs: Any = None,
     t0: float = 0.0,
     noise: bool = True,
     random_seed: Any = None,
 ) -> xr.Dataset:
-    """Simulate one path of the states and its observations.
+    """Simulate one path of the states and its observations, or those of each record of a panel.
 
     Parameters
     ----------
@@ -156,8 +159,11 @@ def simulate(
         A value for every parameter.
     steps, times : array_like, shape (J,)
         When observations are taken, as steps or as times; give one of them.
+    panel : array_like of int or str, shape (J,), optional
+        For many records: the label of the record of each observation, see `StateSpace`. Parameters
+        are then numbers for all G records, or have a leading dimension G.
     inputs : array_like, shape (rows, n_inputs)
-        Row k holds during step k.
+        Row k holds during step k; in a panel, one such array for all records or one for each.
     t0 : float
         Time of step 0.
     noise : bool
@@ -166,12 +172,16 @@ def simulate(
         ``process_dist`` and ``observation_dist`` is then the mean of the distribution, given the
         state and the variables above it.
     random_seed : None, int or numpy.random.Generator
+        In a panel, the noise of each record depends on it and on the record's label.
 
     Returns
     -------
     xarray.Dataset
         ``states`` (step, state) at every step from 0 to the last, ``observations``
-        (obs, observable), with the coordinates ``time`` and ``obs_time``.
+        (obs, observable), with the coordinates ``time`` and ``obs_time``. Of a panel,
+        ``states`` (row, state) with the coordinates ``record``, ``step`` and ``time`` of each row,
+        the records one below the other, and ``observations`` (obs, observable) with
+        ``obs_record``, ``obs_step`` and ``obs_time``.
 
     Raises
     ------
@@ -193,8 +203,16 @@ def simulate(
     {'step': 41, 'state': 1, 'obs': 3, 'observable': 1}
     >>> psf.simulate(system, {"a": 1.0}, steps=[0, 1, 2], noise=False)["states"].values.ravel()
     array([1.    , 0.99  , 0.9801])
+    >>> labels, steps = ["A", "A", "A", "B", "B"], [0, 20, 40, 0, 30]
+    >>> params = {"a": [1.0, 2.0]}  # of A and B
+    >>> panel = psf.simulate(system, params, panel=labels, steps=steps, random_seed=1)
+    >>> dict(panel.sizes)
+    {'row': 72, 'state': 1, 'obs': 5, 'observable': 1}
     """
     check_system(system)
+    if panel is not None:
+        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+        return _simulate_panel(system, params, panel, data, noise, random_seed)
     t0 = check_finite("t0", t0)
     at = steps_of(steps, times, system.dt, t0)
     forces = check_inputs(inputs, system, at)
@@ -219,5 +237,42 @@ def simulate(
             "observable": list(system.observables),
             "time": ("step", t0 + n_steps * system.dt),
             "obs_time": ("obs", t0 + at * system.dt),
+        },
+    )
+
+
+def _simulate_panel(
+    system: StateSpaceModel,
+    params: Mapping[str, Any],
+    panel: Any,
+    data: Mapping[str, Any],
+    noise: bool,
+    random_seed: Any,
+) -> xr.Dataset:
+    """Simulate every record with a generator of its own."""
+    unseen = np.full((np.size(panel), system.p), np.nan)
+    table = checked_panel(system, panel, unseen, **data)
+    theta = panel_parameters(system, params, table.records)
+    run = simulator(system, check_flag("noise", noise)).function
+    generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
+    records = single_records(table, 0)
+    simulated = [
+        run(rng, own, steps, inputs, float(t0))
+        for rng, own, (steps, _, inputs, t0, _) in zip(generators, theta, records, strict=True)
+    ]
+    states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
+    n_steps = [np.arange(len(path)) for path, _ in simulated]
+    coords_of = partial(row_coords, t0=float(table.t0), dt=system.dt)
+    labels = table.records.labels
+    return xr.Dataset(
+        {
+            "states": (("row", "state"), states),
+            "observations": (("obs", "observable"), observations),
+        },
+        coords={
+            "state": list(system.states),
+            "observable": list(system.observables),
+            **coords_of("row", labels, n_steps),
+            **coords_of("obs", labels, [record[0] for record in records], "obs_"),
         },
     )

@@ -141,7 +141,7 @@ def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
     records = table.records
     return [
         (
-            table.rows[rows, STEP],
+            table.rows[rows, STEP].copy(),
             table.observed[rows],
             table.inputs[table.rows[rows.start, FIRST_INPUT] :],
             table.t0,
@@ -149,6 +149,12 @@ def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
         )
         for rows, code in zip(records.slices(), records.codes, strict=True)
     ]
+
+
+def generators_of_records(rng: np.random.Generator, codes: np.ndarray) -> list[np.random.Generator]:
+    """A generator for each record, which depends on ``rng`` and on the code of the record alone."""
+    seed = rng.integers(np.iinfo(np.int64).max)
+    return [np.random.default_rng(seed_of_record(seed, code)) for code in codes]
 
 
 @jit

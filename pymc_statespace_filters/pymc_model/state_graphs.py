@@ -20,7 +20,8 @@ class StateSpaceVariable(NamedTuple):
     """One variable of a model: its system, its filter, and the symbols of its record.
 
     ``dims`` names time and observables; theta and inputs may depend on the free variables. Terms of
-    the rows before ``score_from`` do not count.
+    the rows before ``score_from`` do not count. The variable of a panel has theta (G, k) and rows
+    (J, 3), see `system.panel`, as steps.
     """
 
     name: str
@@ -34,6 +35,11 @@ class StateSpaceVariable(NamedTuple):
     seed: TensorVariable
     observed: TensorVariable
     score_from: int
+
+    @property
+    def is_panel(self) -> bool:
+        """Whether the variable holds several records."""
+        return self.steps.type.ndim == 2
 
 
 def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:

@@ -19,10 +19,12 @@ from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_p
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
+from pymc_statespace_filters.ops.panel import PanelLogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.system.accumulators import without_resets
 from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
 
 MAX_STEPS = 500
 STEPS_PER_JACOBIAN = 10
@@ -156,12 +158,39 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
         columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]
         stable = np.ones(len(x), dtype=bool)
         for i, node in enumerate(nodes):
-            system = node.op.system
-            eigenvalues = path_eigenvalues(system, *columns[4 * i : 4 * i + 4])
-            stable &= system.integrator.is_stable_at(eigenvalues).all(axis=1)
+            system, arguments = node.op.system, columns[4 * i : 4 * i + 4]
+            if isinstance(node.op, PanelLogLikelihood):
+                arguments = _each_record(*arguments)
+            eigenvalues = path_eigenvalues(system, *arguments)
+            is_stable_at = system.integrator.is_stable_at(eigenvalues).all(axis=1)
+            stable &= is_stable_at.reshape(len(x), -1).all(axis=1)
         return stable
 
     return is_stable
+
+
+def _each_record(theta: Array, rows: Array, inputs: Array, t0: Array) -> list[Array]:
+    """The arguments of `path_eigenvalues` of all records of a panel at m points, m times G points.
+
+    Each record has as many rows of inputs as a path reads, its last one repeated.
+    """
+    n_points, n_records, n_theta = theta.shape
+    codes = rows[0, :, RECORD]
+    starts = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1]]))
+    lasts = rows[0, np.append(starts[1:], codes.size) - 1, STEP]
+    steps = np.arange(min(int(lasts.max()), MAX_STEPS) + 1)
+    if inputs.shape[1]:
+        own = np.minimum(steps, np.maximum(lasts - 1, 0)[:, None])
+        inputs = inputs[:, rows[0, starts, FIRST_INPUT][:, None] + own]
+        inputs = inputs.reshape(n_points * n_records, steps.size, -1)
+    else:
+        inputs = np.repeat(inputs, n_records, axis=0)
+    return [
+        theta.reshape(-1, n_theta),
+        np.tile(steps, (n_points * n_records, 1)),
+        inputs,
+        np.repeat(t0, n_records),
+    ]
 
 
 def path_eigenvalues(

@@ -86,6 +86,24 @@ class SymbolicPanel(NamedTuple):
     t0: float
 
 
+def row_coords(
+    dim: str,
+    labels: Sequence[Any],
+    steps: Sequence[np.ndarray],
+    prefix: str = "",
+    *,
+    t0: float,
+    dt: float,
+) -> dict[str, tuple[str, np.ndarray]]:
+    """Coordinates of the rows of a result: record, step and time, given the steps by record."""
+    at = np.concatenate(steps)
+    return {
+        f"{prefix}record": (dim, np.repeat(np.array(labels), [len(one) for one in steps])),
+        f"{prefix}step": (dim, at),
+        f"{prefix}time": (dim, t0 + at * dt),
+    }
+
+
 def checked_panel(
     system: StateSpaceModel,
     panel: Any,

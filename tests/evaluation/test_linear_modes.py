@@ -6,6 +6,7 @@ import arviz as az
 import numpy as np
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 
 import pymc_statespace_filters as psf
 from tests.small_systems import FORCED, PAIR
@@ -228,3 +229,10 @@ def test_a_table_is_narrow_enough_for_a_terminal():
     text = psf.linear_modes(PAIR, {"a": 0.5}).to_string()
     assert max(map(len, text.splitlines())) <= 80
     assert len(psf.linear_modes(FORCED, {"a": 0.5})) == 1
+
+
+def test_parameters_of_each_record_are_no_draws():
+    draws = xr.Dataset({"a": (("chain", "draw", "patient"), np.full((2, 5, 3), 0.5))})
+    with pytest.raises(psf.ModelError, match=r"got the dimension 'patient' too: .*isel\(patient=0"):
+        psf.linear_modes(FORCED, draws)
+    assert len(psf.linear_modes(FORCED, draws.isel(patient=0))) == 1

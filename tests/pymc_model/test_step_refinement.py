@@ -136,3 +136,25 @@ def test_an_incomplete_integrator_is_refused():
 
     with pytest.raises(psf.ModelError, match="without noise_size, substep, refined, is_stable_at"):
         linear_by(Step())
+
+
+def test_a_panel_is_stable_where_each_record_is():
+    """Every record with its own parameter and its own stretch of inputs."""
+    system = euler(lambda x, u, a: [-a * x[0] ** 3 + u[0]], mean=0.5, inputs=["u"])
+    steps, observed = np.array([0, 4, 2, 5, 9]), np.zeros(5)
+    rows, forces = [[0, 1], [2, 3, 4]], [np.full((4, 1), 9.0), np.zeros((9, 1))]
+    points = np.array([[1.0, 1.0], [5.0, 1.0], [1.0, 5.0], [1.0, 90.0]])
+
+    def stable(x, **data):
+        with pm.Model() as model:
+            pm.Normal("a", shape=x.shape[1] if "panel" in data else ())
+            psf.StateSpace("d", system, psf.EKF(), **data)
+        return step_stability(model)(x)
+
+    found = stable(points, panel=[-1, -1, 7, 7, 7], steps=steps, observed=observed, inputs=forces)
+    alone = [
+        stable(points[:, [g]], steps=steps[own], observed=observed[own], inputs=forces[g])
+        for g, own in enumerate(rows)
+    ]
+    assert [one.all() for one in alone] == [False, False]
+    np.testing.assert_array_equal(found, np.all(alone, axis=0))

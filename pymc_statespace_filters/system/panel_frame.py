@@ -1,0 +1,123 @@
+"""The rows of a panel from a table in long format: one row for each observation."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import shortened
+from pymc_statespace_filters.system.panel import records_of
+from pymc_statespace_filters.system.record import nearest_steps
+
+
+def panel_from(
+    frame: pd.DataFrame,
+    *,
+    record: str,
+    time: str,
+    values: str | Sequence[str],
+    dt: float,
+    t0: float = 0.0,
+) -> dict[str, Any]:
+    """Arguments of a panel from a table in long format, one row for each observation.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        Its rows may be in any order.
+    record : str
+        The column of labels of records, integers or texts.
+    time : str
+        The column of times, in the unit of `dt`. Every record starts at ``t0`` by this clock: of
+        dates, subtract the start of each record before.
+    values : str or sequence of str
+        The column of each observable, in the order of the system's; NaN where missing.
+    dt : float
+        Length of a step of the system. Times are rounded to the nearest steps.
+    t0 : float
+        Time of step 0.
+
+    Returns
+    -------
+    dict
+        The arguments ``panel``, ``steps`` and ``observed`` (J, p) of `StateSpace`,
+        `log_likelihood` and `run_filter`, and ``t0``. Records are in the order of their first
+        rows, the rows of each by time.
+
+    Raises
+    ------
+    ModelError
+        If a column is missing, a label or a time is none, two times of a record fall on one step,
+        or a time lies before ``t0``.
+
+    See Also
+    --------
+    nearest_steps : The steps of a single record.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> import pymc_statespace_filters as psf
+    >>> frame = pd.DataFrame({
+    ...     "patient": ["A", "B", "A", "B"],
+    ...     "hour": [2.0, 1.0, 0.0, 2.6],
+    ...     "level": [0.8, 0.7, 1.1, None],
+    ... })
+    >>> panel = psf.panel_from(frame, record="patient", time="hour", values="level", dt=0.5)
+    >>> panel["panel"], panel["steps"]
+    (array(['A', 'A', 'B', 'B'], dtype=object), array([0, 4, 2, 5]))
+    >>> panel["observed"].ravel()
+    array([1.1, 0.8, 0.7, nan])
+    """
+    if not isinstance(frame, pd.DataFrame):
+        raise ModelError(f"frame must be a pandas.DataFrame, got {type(frame).__name__}")
+    columns = [values] if isinstance(values, str) else list(values)
+    for argument, names in (("record", [record]), ("time", [time]), ("values", columns)):
+        if missing := [name for name in names if name not in frame.columns]:
+            raise ModelError(
+                f"{argument} must name columns of frame, {list(frame.columns)}, got {missing}"
+            )
+    if not len(frame) or not columns:
+        raise ModelError("frame must have at least one row and one column of values, got none")
+    numbers = pd.factorize(frame[record])[0]
+    if (numbers < 0).any():
+        row = frame.index[int(np.argmax(numbers < 0))]
+        raise ModelError(f"every row of frame must have a record, got none in row {row!r}")
+    times, observed = _floats(frame, [time])[:, 0], _floats(frame, columns)
+    order = np.lexsort([times, numbers])
+    labels = np.asarray(frame[record])[order]
+    records = records_of(labels)
+    steps = [
+        _steps(frame, order[rows], times[order[rows]], label, dt, t0)
+        for label, rows in zip(records.labels, records.slices(), strict=True)
+    ]
+    return {
+        "panel": labels,
+        "steps": np.concatenate(steps),
+        "observed": observed[order],
+        "t0": t0,
+    }
+
+
+def _steps(
+    frame: pd.DataFrame, rows: np.ndarray, times: np.ndarray, label: Any, dt: float, t0: float
+) -> np.ndarray:
+    if np.isnan(times).any():
+        row = frame.index[rows[int(np.argmax(np.isnan(times)))]]
+        raise ModelError(
+            f"record {label!r} of frame must have a time in every row, got none in row {row!r}"
+        )
+    try:
+        return nearest_steps(times, dt, t0=t0)
+    except ModelError as error:
+        first = shortened([frame.index[row] for row in rows])
+        raise ModelError(f"record {label!r}, rows {first} of frame: {error}") from None
+
+
+def _floats(frame: pd.DataFrame, columns: Sequence[str]) -> np.ndarray:
+    for name in columns:
+        if not pd.api.types.is_numeric_dtype(frame[name]):
+            raise ModelError(f"column {name!r} of frame must hold numbers, got {frame[name].dtype}")
+    return frame[list(columns)].to_numpy(dtype="float64", na_value=np.nan)
