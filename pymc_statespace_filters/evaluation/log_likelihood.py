@@ -8,13 +8,16 @@ import numpy as np
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, NONE
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
 from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.panel import PanelLogLikelihood, single_records
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import CheckedPanel, checked_panel, panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_seed, checked_record
 
@@ -27,12 +30,13 @@ def log_likelihood(
     *,
     steps: Any = None,
     times: Any = None,
+    panel: Any = None,
     inputs: Any = None,
     t0: float = 0.0,
     seed: Any = 0,
     comm: Any = None,
 ) -> np.ndarray:
-    """Evaluate the log-likelihood of a record, term by term.
+    """Evaluate the log-likelihood of a record, or of the records of a panel, term by term.
 
     Parameters
     ----------
@@ -47,8 +51,11 @@ def log_likelihood(
         The step of each observation; 0 is where the initial state holds. Or give `times`.
     times : array_like, shape (J,)
         Times of the observations, on the grid ``t0 + k * dt`` to a millionth of a step.
+    panel : array_like of int or str, shape (J,), optional
+        For many records: the label of the record of each row, see `StateSpace`. Parameters are
+        then numbers for all G records, or have a leading dimension G; ``seed`` is one number.
     inputs : array_like, shape (rows, n_inputs)
-        Row k holds during step k.
+        Row k holds during step k; in a panel, one such array for all records or one for each.
     t0 : float
         Time of step 0.
     seed : int or array_like of int
@@ -93,6 +100,9 @@ def log_likelihood(
     """
     check_system_and_filter(system, filter)
     warn_of_choice(system, filter)
+    if panel is not None:
+        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+        return _of_panel(system, filter, params, panel, observed, data, seed, comm)
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
@@ -114,6 +124,40 @@ def log_likelihood(
             flat = seeds.ravel()
             warn_about(system, filter, health, lambda i: (points[i], *record, flat[i]))
     return terms.reshape(*shape, record.steps.size)
+
+
+def _of_panel(
+    system: StateSpaceModel,
+    filter: Filter,
+    params: Any,
+    panel: Any,
+    observed: Any,
+    data: dict[str, Any],
+    seed: Any,
+    comm: Any,
+) -> np.ndarray:
+    if comm is not None:
+        raise ModelError("comm must be None for a panel: every rank evaluates all records")
+    table = checked_panel(system, panel, observed, **data)
+    theta = panel_parameters(system, params, table.records)
+    seeds = check_seed("seed", seed)
+    if seeds.ndim:
+        raise ModelError(f"seed must be one number for a panel, got shape {seeds.shape}")
+    record = (table.rows, table.observed, table.inputs, table.t0)
+    terms, health = evaluator(PanelLogLikelihood(system, filter))(theta, *record, seeds)
+    if health[1] != NONE or health[0] < COLLAPSED:
+        _warn_of_records(system, filter, theta, table, seeds)
+    return terms
+
+
+def _warn_of_records(
+    system: StateSpaceModel, filter: Filter, theta: np.ndarray, table: CheckedPanel, seed: Any
+) -> None:
+    """Repeat every record alone, and warn of those that failed or collapsed."""
+    evaluate = evaluator(LogLikelihood(system, filter))
+    arguments = [(theta[g], *record) for g, record in enumerate(single_records(table, seed))]
+    health = np.array([evaluate(*each)[1] for each in arguments])
+    warn_about(system, filter, health, lambda g: arguments[g], stacklevel=5)
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:

@@ -341,6 +341,28 @@ class DifferentiableFilter(Filter, Protocol):
 
 
 @runtime_checkable
+class PanelFilter(DifferentiableFilter, Protocol):
+    """A filter that evaluates the records of a panel side by side.
+
+    ``theta`` (G, k) has a row for each record, and ``rows`` (J, 3), see `system.panel`, take the
+    place of the steps. Every record has the terms that it has alone. Health is that of the panel:
+    inf, the code of the first failing record, and the index of its failing row.
+    """
+
+    def compile_panel(self, system: System) -> CompiledFunction:
+        """Compile terms and health: (theta, rows, observed, inputs, t0, seed)."""
+
+    def compile_panel_gradient(self, system: System) -> CompiledFunction:
+        """Compile both passes as one function: (theta .. seed, terms_bar) -> theta_bar (G, k)."""
+
+    def compile_panel_taped(self, system: System) -> CompiledFunction:
+        """Compile the forward pass: terms, health and a tape of two dimensions."""
+
+    def compile_panel_pullback(self, system: System) -> CompiledFunction:
+        """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar (G, k)."""
+
+
+@runtime_checkable
 class EnsembleFilter(Filter, Protocol):
     """A filter of members moved by normals, which can be stored, moved a little, or distributed."""
 

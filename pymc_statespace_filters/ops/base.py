@@ -30,6 +30,7 @@ from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
 from pymc_statespace_filters.system.record import check_system
 
 HEALTH_SIZE = 3
@@ -61,7 +62,11 @@ class FilterOp(Op):
     __props__ = ("system", "filter")
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
     output_types: ClassVar[tuple[TensorType, ...]]
-    checks_record: ClassVar[bool] = True
+    # Calls of the checks of what `pm.set_data` may have replaced; kernels do not check bounds.
+    record_checks: ClassVar[tuple[str, ...]] = (
+        "check(steps, inputs)",
+        "check_observed(steps, observed)",
+    )
     # How an input is written in the call of the kernel, where not as a number or a copy.
     argument_code: ClassVar[Mapping[str, str]] = {}
 
@@ -129,7 +134,7 @@ def evaluator(op: FilterOp) -> Any:
 
 
 def check_record(system: StateSpaceModel) -> Any:
-    """A compiled check of what `pm.set_data` may have replaced; kernels do not check bounds."""
+    """A compiled check of steps and inputs."""
     return _check_of_inputs(system.n_input_columns, int(system.observation_uses_inputs))
 
 
@@ -149,13 +154,45 @@ def _check_of_inputs(n_columns: int, last_row: int) -> Any:
     return check
 
 
+def check_panel(system: StateSpaceModel) -> Any:
+    """A compiled check of the rows of a panel, see `system.panel`."""
+    return _check_of_rows(system.n_input_columns, int(system.observation_uses_inputs))
+
+
+@cache
+def _check_of_rows(n_columns: int, last_row: int) -> Any:
+    @jit
+    def check(theta, rows, inputs):
+        if rows.shape[1] != N_COLUMNS:
+            raise ModelError("the rows of a panel must have a column each for record, step, inputs")
+        if n_columns and inputs.shape[1] != n_columns:
+            raise ModelError("inputs must have one column for each input of the system")
+        n_records = 0
+        for j in range(rows.shape[0]):
+            begins = j == 0 or rows[j, RECORD] != rows[j - 1, RECORD]
+            n_records += begins
+            if rows[j, STEP] < 0 or (not begins and rows[j, STEP] <= rows[j - 1, STEP]):
+                raise ModelError(
+                    "steps must not be negative and must increase strictly within a record"
+                )
+            if n_columns and inputs.shape[0] < rows[j, FIRST_INPUT] + rows[j, STEP] + last_row:
+                raise ModelError("inputs has too few rows: row k holds during step k")
+        if n_records != theta.shape[0]:
+            raise ModelError(
+                "the parameters must have a row for each record of the panel; for another number "
+                "of records replace the parameters' dimension too"
+            )
+
+    return check
+
+
 @cache
 def check_observed(p: int) -> Any:
     """A compiled check that a record has the shape that the kernels read."""
 
     @jit
     def check(steps, observed):
-        if observed.shape[0] != steps.size or observed.shape[1] != p:
+        if observed.shape[0] != steps.shape[0] or observed.shape[1] != p:
             raise ModelError(
                 "observed must have a row for each step and a column for each observable; for a "
                 "record of another length give the variable steps=pm.Data(...) and "
@@ -217,14 +254,14 @@ def _call(op: FilterOp) -> tuple[Any, str | None]:
         op.argument_code.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
         for name, _, ndim in op.input_types
     ]
-    checks = ["check(steps, inputs)", "check_observed(steps, observed)"] * op.checks_record
-    lines = [*checks, f"return run({', '.join(arguments)})"]
+    lines = [*op.record_checks, f"return run({', '.join(arguments)})"]
     source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
     namespace = {
         "__name__": __name__,
         "np": np,
         "run": compiled.function,
         "check": check_record(op.system),
+        "check_panel": check_panel(op.system),
         "check_observed": check_observed(op.system.p),
         "no_normals": np.empty(0),
     }

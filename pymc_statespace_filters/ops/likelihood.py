@@ -73,8 +73,12 @@ class LogLikelihood(FilterOp):
         if isinstance(terms_bar.type, DisconnectedType):
             theta_bar = pt.zeros_like(inputs[0])
         else:
-            theta_bar = LogLikelihoodGradient(self.system, self.filter)(*inputs, terms_bar)
+            theta_bar = self.gradient()(*inputs, terms_bar)
         return theta_cotangent_only(self, inputs, theta_bar)
+
+    def gradient(self) -> "LogLikelihoodGradient":
+        """The operation of the vector-Jacobian product."""
+        return LogLikelihoodGradient(self.system, self.filter)
 
 
 class LogLikelihoodGradient(ThetaDerivative):
@@ -110,7 +114,7 @@ class TapePullback(ThetaDerivative):
     filter: DifferentiableFilter
     input_types = (*RECORD_INPUTS, ("tape", "float64", 2), ("terms_bar", "float64", 1))
     # The tape was made by the other operation, which checked the record.
-    checks_record = False
+    record_checks = ()
     argument_code: ClassVar[Mapping[str, str]] = {"tape": "tape"}
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
@@ -122,12 +126,23 @@ class TapePullback(ThetaDerivative):
 @node_rewriter([LogLikelihoodGradient])
 def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
     """Make one forward pass where a graph holds value and gradient at the same inputs."""
+    return fused(fgraph, node, LogLikelihood, TapedLogLikelihood, TapePullback)
+
+
+def fused(
+    fgraph: FunctionGraph,
+    node: Apply,
+    value_op: type[LogLikelihood],
+    taped_op: type[TapedLogLikelihood],
+    pullback_op: type[TapePullback],
+) -> dict[Variable, Variable] | None:
+    """Replacements of a gradient and of the value at the same inputs, if there is one."""
     *inputs, terms_bar = node.inputs
     system, filter = node.op.system, node.op.filter
     for value, _ in fgraph.clients[inputs[0]]:
-        is_value = value.op in (LogLikelihood(system, filter), TapedLogLikelihood(system, filter))
+        is_value = value.op in (value_op(system, filter), taped_op(system, filter))
         if is_value and value.inputs == inputs:
-            terms, health, tape = TapedLogLikelihood(system, filter)(*inputs)
-            theta_bar = TapePullback(system, filter)(*inputs, tape, terms_bar)
+            terms, health, tape = taped_op(system, filter)(*inputs)
+            theta_bar = pullback_op(system, filter)(*inputs, tape, terms_bar)
             return {value.outputs[0]: terms, value.outputs[1]: health, node.outputs[0]: theta_bar}
     return None

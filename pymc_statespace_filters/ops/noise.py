@@ -22,7 +22,7 @@ class StoredNoise(FilterOp):
     filter: EnsembleFilter
     input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
     output_types = (pt.dvector,)
-    checks_record = False
+    record_checks = ()
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The normals, in the filter's layout."""

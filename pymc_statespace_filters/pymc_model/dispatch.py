@@ -1,6 +1,7 @@
 """Registers how `StateSpaceRV` is drawn, in Python and in numba, and its log-density."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,23 @@ from pytensor.graph.basic import Variable
 from pytensor.link.numba.dispatch.basic import numba_njit
 from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
 from pytensor.raise_op import CheckAndRaise
+from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import simulator
-from pymc_statespace_filters.ops.base import cache_key, check_record
+from pymc_statespace_filters.ops.base import cache_key, check_panel, check_record
 from pymc_statespace_filters.ops.batch import vectorized
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV, draw_in_python
+from pymc_statespace_filters.ops.panel import PANEL_INPUTS, PanelLogLikelihood, end_of_record
+from pymc_statespace_filters.pymc_model.random_variable import (
+    PanelRV,
+    StateSpaceRV,
+    draw_in_python,
+)
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
 
@@ -26,7 +36,7 @@ _TOO_SHORT = "score_from must be less than the number of observations, of which 
 def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
     *params, size = arguments
     theta, steps, inputs, t0, _ = params
-    core_ndims = (1, 1, 2, 0, 0)
+    core_ndims = op.ndims_params
     batch = np.broadcast_shapes(
         *(np.shape(p)[: np.ndim(p) - n] for p, n in zip(params, core_ndims, strict=True))
     )
@@ -35,28 +45,54 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
         np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
         for p, n in zip((theta, steps, inputs, t0), core_ndims, strict=False)
     )
-    simulate, check = simulator(op.system, True).function, check_record(op.system)
-    draws = np.empty((*batch, steps.shape[-1], op.system.p))
+    draw = _draw(op).function
+    draws = np.empty((*batch, steps.shape[len(batch)], op.system.p))
     for i in np.ndindex(batch):
-        parts = [np.ascontiguousarray(a[i]) for a in (theta, steps, inputs)]
-        check(*parts[1:])
-        _, draws[i] = simulate(rng, *parts, float(t0[i]))
+        parts = [np.require(a[i], requirements=("C", "W")) for a in (theta, steps, inputs)]
+        draws[i] = draw(rng, *parts, float(t0[i]))
     return draws
+
+
+@cache
+def _draw(op: StateSpaceRV) -> CompiledFunction:
+    """The function (rng, theta, steps, inputs, t0) -> observations, which checks the record."""
+    compiled = simulator(op.system, True)
+    simulate = compiled.function
+    if isinstance(op, PanelRV):
+        check = check_panel(op.system)
+
+        def draw(rng, theta, rows, inputs, t0):
+            check(theta, rows, inputs)
+            observations = np.empty((rows.shape[0], p))
+            first = 0
+            for record in range(theta.shape[0]):
+                last = end_of_record(rows, first)
+                steps, own = rows[first:last, STEP].copy(), inputs[rows[first, FIRST_INPUT] :]
+                _, observations[first:last] = simulate(rng, theta[record].copy(), steps, own, t0)
+                first = last
+            return observations
+    else:
+        check = check_record(op.system)
+
+        def draw(rng, theta, steps, inputs, t0):
+            check(steps, inputs)
+            return simulate(rng, theta, steps, inputs, t0)[1]
+
+    p = op.system.p
+    return CompiledFunction(numba_njit(draw), cache_key(op.system, compiled))
 
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system, True)
-    simulate, check = compiled.function, check_record(op.system)
-    key = cache_key(op.system, compiled)
+    compiled = _draw(op)
+    draw_record = compiled.function
 
     @numba_njit
     def draw(rng, theta, steps, inputs, t0, seed):
-        check(steps, inputs)
-        _, observations = simulate(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
-        return observations
+        return draw_record(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
 
     # PyTensor requires an integer as the cache key of a random variable.
+    key = None if compiled.key is None else key_of(type(op).__name__, compiled.key)
     return draw, None if key is None else int(key[:15], 16)
 
 
@@ -75,3 +111,23 @@ def _log_density(
     n_rows = steps.shape[-1]
     rows = CheckAndRaise(ModelError, _TOO_SHORT)(pt.arange(n_rows), pt.gt(n_rows, op.score_from))
     return pt.switch(pt.ge(rows, op.score_from), terms, 0.0)
+
+
+@_logprob.register(PanelRV)
+def _log_density_of_panel(
+    op: PanelRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
+) -> TensorVariable:
+    """The same for every record; the first rows of each are not scored."""
+    (value,) = values
+    theta, rows, inputs, t0, seed = params
+    likelihood, record = PanelLogLikelihood(op.system, op.filter), (rows, value, inputs, t0, seed)
+    cores = [ndim for _, _, ndim in PANEL_INPUTS]
+    is_batch = any(v.type.ndim > n for v, n in zip((theta, *record), cores, strict=True))
+    terms = (Blockwise(likelihood) if is_batch else likelihood)(theta, *record)[0]
+    if op.score_from == 0:
+        return terms
+    codes = rows[..., RECORD]
+    # A row counts if the row so many rows before it belongs to the same record.
+    counts = pt.eq(codes[..., op.score_from :], codes[..., : -op.score_from])
+    before = pt.zeros((*codes.shape[:-1], op.score_from), dtype="bool")
+    return pt.switch(pt.concatenate([before, counts], axis=-1), terms, 0.0)

@@ -17,9 +17,14 @@ from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
-from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
+from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
 from pymc_statespace_filters.system.checks import is_integer
 from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.panel import (
+    SymbolicPanel,
+    symbolic_panel,
+    symbolic_panel_parameters,
+)
 from pymc_statespace_filters.system.parameters import check_names, symbolic_parameters
 from pymc_statespace_filters.system.record import check_seed, symbolic_record
 
@@ -44,25 +49,35 @@ class StateSpace(Continuous):
         that name in the PyMC model, else the default in the function's signature.
     steps, times : array_like, shape (J,)
         Steps or times of the observations; give exactly one of them. See `log_likelihood`.
+    panel : array_like of int or str, shape (J,), optional
+        For many records of one system: the label of the record of each row. The rows of a record
+        are together, its steps increase, and it starts at step 0 and ``t0``. Parameters are then
+        scalars, which all G records share, or have a leading dimension G, in the order of the
+        records' rows (a declared parameter's own shape comes last). See `panel_from`.
     observed : array_like, shape (J, p) or (J,), optional
         The data. NaN marks a missing component and is never imputed; a wholly missing row has the
         term 0. To replace the data later, give `steps`, `observed` and `inputs` as ``pm.Data``,
         with ``dims=("{name}_time", "observable")``; ``pm.Data`` refuses NaN, ``pytensor.shared``
         accepts it.
     inputs : array_like, shape (rows, n_inputs), optional
-        Row k holds during step k.
+        Row k holds during step k. The records of a panel share them, or have one such array each:
+        a mapping from labels, or a list in the order of the records.
     t0 : float
         Time of step 0.
     seed : int
-        Seed of the noise inside the filter. The model stores it as shared data ``{name}_seed``,
+        Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
+        on the record's label. The model stores it as shared data ``{name}_seed``,
         which sampling does not change.
     score_from : int
-        The first row of the data whose term counts, 0 for all. The filter passes through the rows
-        before it, which settle a state whose start is not known; their terms are 0 in the
-        log-density and in `compute_log_likelihood`, and they do not count as observations in the
-        evidence. Models are comparable only with the same number.
+        The first row of the data, or of each record, whose term counts, 0 for all. The filter
+        passes through the rows before it, which settle a state whose start is not known; their
+        terms are 0 in the log-density and in `compute_log_likelihood`, and they do not count as
+        observations in the evidence. Models are comparable only with the same number.
     dims : (str, str), optional
-        Names of the dimensions, default ``({name}_time, observable)``.
+        Names of the dimensions, default ``({name}_time, observable)``; of a panel
+        ``({name}_obs, observable)``. A panel also adds the dimension ``{name}_record``, whose
+        coordinates are the labels, and the data ``{name}_panel`` (the label of each row, or its
+        number if labels are texts) and ``{name}_time``.
 
     Raises
     ------
@@ -104,6 +119,7 @@ class StateSpace(Continuous):
         params: Mapping[str, Any] | None = None,
         steps: Any = None,
         times: Any = None,
+        panel: Any = None,
         observed: Any = None,
         inputs: Any = None,
         t0: float = 0.0,
@@ -118,30 +134,44 @@ class StateSpace(Continuous):
         given = {} if params is None else params
         check_names(system, given)
         values = dict(system.defaults) | _model_variables(system, model) | dict(given)
-        theta = symbolic_parameters(system, values, others=tuple(model.named_vars))
-        record = symbolic_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
+        others = tuple(model.named_vars)
+        full_name = model.name_for(name)
+        _check_name(model, full_name, name, system)
+        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+        record: Any
+        if panel is None:
+            theta = symbolic_parameters(system, values, others)
+            record = symbolic_record(system, observed, **data)
+            n_rows = record.current_steps.size
+            row_dim, component_dim = _dims(dims, f"{full_name}_time")
+            row_coords: Any = record.t0 + record.current_steps * system.dt
+        else:
+            record = symbolic_panel(system, panel, observed, **data)
+            theta = symbolic_panel_parameters(system, values, record, others)
+            n_rows = int(np.diff(record.records.starts).max())
+            row_dim, component_dim = _dims(dims, f"{full_name}_obs")
+            row_coords = range(record.current_steps.size)
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
-        full_name = model.name_for(name)
-        _check_name(model, full_name, name, system)
-        time_dim, component_dim = _dims(full_name, dims)
-        _add_coord(model, time_dim, record.t0 + record.current_steps * system.dt, name)
+        _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
+        if panel is not None:
+            _add_records(model, full_name, row_dim, record, system.dt)
         noise_seed = _add_seed(model, full_name, seed_array) if filter.noisy else seed_array
         return super().__new__(
             cls,
             name,
             theta,
-            record.steps,
+            record.steps if panel is None else record.rows,
             record.inputs,
             record.t0,
             noise_seed,
             system=system,
             filter=filter,
-            score_from=_check_score_from(score_from, record.current_steps.size),
+            score_from=_check_score_from(score_from, n_rows),
             observed=record.observed,
-            dims=(time_dim, component_dim),
+            dims=(row_dim, component_dim),
         )
 
     @classmethod
@@ -174,7 +204,8 @@ class StateSpace(Continuous):
     ) -> TensorVariable:
         """Apply the operation; called by PyMC."""
         rng = pt.random.shared_rng(seed=None) if rng is None else rng
-        operation = StateSpaceRV(system=system, filter=filter, score_from=score_from)
+        kind = PanelRV if params[1].type.ndim == 2 else StateSpaceRV
+        operation = kind(system=system, filter=filter, score_from=score_from)
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 
@@ -211,13 +242,29 @@ def _check_score_from(score_from: Any, n_observations: int) -> int:
     return int(score_from)
 
 
-def _dims(name: str, dims: Sequence[str] | None) -> tuple[str, str]:
+def _dims(dims: Sequence[str] | None, of_rows: str) -> tuple[str, str]:
     if dims is None:
-        return f"{name}_time", "observable"
+        return of_rows, "observable"
     if isinstance(dims, str) or len(dims) != 2 or not all(isinstance(d, str) for d in dims):
-        raise ModelError(f"dims must be two names (time, observable), got {dims!r}")
-    time_dim, component_dim = dims
-    return time_dim, component_dim
+        raise ModelError(f"dims must be two names ({of_rows}, observable), got {dims!r}")
+    row_dim, component_dim = dims
+    return row_dim, component_dim
+
+
+def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel, dt: float) -> None:
+    """Add the labels of a panel, and the record and time of every row, to the model.
+
+    Rows given as ``pm.Data`` are in the model already, and may change.
+    """
+    _add_coord(model, f"{name}_record", panel.records.labels, name)
+    if isinstance(panel.rows, Variable):
+        return
+    of_rows = panel.records.of_rows()
+    if isinstance(panel.records.labels[0], int):
+        of_rows = panel.records.codes[of_rows]
+    for what, values in (("panel", of_rows), ("time", panel.t0 + panel.current_steps * dt)):
+        shared = pytensor.shared(values, name=f"{name}_{what}")
+        model.register_data_var(shared, dims=(row_dim,))
 
 
 def _add_seed(model: pm.Model, name: str, seed: np.ndarray) -> SharedVariable:

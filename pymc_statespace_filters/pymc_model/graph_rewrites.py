@@ -25,6 +25,7 @@ from pymc_statespace_filters.ops.distributed import (
 )
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.panel import PanelLogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import (
     likelihood_nodes,
     noisy_filters,
@@ -57,13 +58,15 @@ def with_likelihood_callback(
 ) -> tuple[list[Variable], CallbackLikelihoods]:
     """Graphs whose noisy likelihoods a `PythonCallback` can evaluate, with the same values.
 
-    Likelihoods whose seed is in ``held`` read stored normals, made once from that seed.
+    Likelihoods whose seed is in ``held`` read stored normals, made once from that seed. Those of
+    panels stay as they are.
     """
     address = pt.lscalar("callback")
     replaced: dict[Variable, Variable] = {}
     normals: dict[TensorVariable, TensorVariable] = {}
     names = {seed: name for name, seed in held.items()}
-    noisy_nodes = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
+    nodes = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
+    noisy_nodes = [node for node in nodes if not isinstance(node.op, PanelLogLikelihood)]
     for number, node in enumerate(noisy_nodes):
         system, filter = node.op.system, node.op.filter
         steps, seed = node.inputs[1], node.inputs[-1]
@@ -119,6 +122,11 @@ def autoregressive_noise(
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
+            if isinstance(node.op, PanelLogLikelihood):
+                raise ModelError(
+                    "correlation must be None for a panel, whose records keep estimates of their "
+                    "own"
+                )
             if not isinstance(noisy, EnsembleFilter):
                 raise ModelError(
                     f"correlation needs a filter whose normals can be stored, such as "
@@ -166,7 +174,7 @@ def with_filter(
                 f"filters must be the same for {', '.join(names)}: their likelihoods are equal"
             )
         if names:
-            outputs = LogLikelihood(node.op.system, new.pop())(*node.inputs)
+            outputs = type(node.op)(node.op.system, new.pop())(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     if missing := [name for name in filters if name not in found]:
         raise ModelError(f"the graphs must contain the likelihood of {', '.join(missing)}")

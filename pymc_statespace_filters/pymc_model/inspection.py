@@ -16,7 +16,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.filters.recommendation import collapse_remedy, quiet_filter, short_form
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.random_variable import StateSpaceRV
+from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
 
 
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:
@@ -26,6 +26,12 @@ def state_space_nodes(model: pm.Model) -> dict[str, Any]:
         for rv in model.basic_RVs
         if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
     }
+
+
+def panel_variables(model: pm.Model) -> list[str]:
+    """The names of the StateSpace variables that hold several records."""
+    nodes = state_space_nodes(model)
+    return [name for name, node in nodes.items() if isinstance(node.op, PanelRV)]
 
 
 def likelihood_nodes(graphs: Sequence[Variable]) -> list[Any]:

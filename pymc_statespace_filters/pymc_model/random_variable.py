@@ -39,12 +39,22 @@ class StateSpaceRV(RandomVariable):
         return f"StateSpaceRV{{{self.filter}}}"
 
     def _supp_shape_from_params(self, dist_params: Sequence, param_shapes: Any = None) -> list:
+        # Steps (J,), or the rows (J, 3) of a panel: the other dimensions before are of a batch.
         steps = dist_params[1].shape if param_shapes is None else param_shapes[1]
-        return [steps[-1], self.system.p]
+        return [steps[-self.ndims_params[1]], self.system.p]
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
         """Draw in PyTensor's modes without numba."""
         return draw_in_python(self, rng, *arguments)
+
+
+class PanelRV(StateSpaceRV):
+    """Draws the rows (J, p) of a panel from theta (G, k), rows (J, 3), inputs and t0.
+
+    The log-density leaves out the terms of the first ``score_from`` rows of every record.
+    """
+
+    signature = "(g,k),(j,c),(s,u),(),()->(j,p)"
 
 
 @singledispatch

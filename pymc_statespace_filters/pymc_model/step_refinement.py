@@ -19,7 +19,6 @@ from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_p
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.system.accumulators import without_resets
 from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
@@ -51,7 +50,7 @@ def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable]
         if filter is None:
             return None
         for replaced, version in ((coarse, system), (fine, refined)):
-            outputs = LogLikelihood(version, filter)(*node.inputs)
+            outputs = type(node.op)(version, filter)(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     return clone_replace(log_density, coarse), clone_replace(log_density, fine)
 
@@ -105,7 +104,7 @@ def _halved(node: Any, halvings: int) -> list[list[Variable]]:
         filter = filter.smooth(compile_system(systems[0]))
     for version in systems:
         filter.check(compile_system(version))
-    return [LogLikelihood(version, filter)(*node.inputs) for version in systems]
+    return [type(node.op)(version, filter)(*node.inputs) for version in systems]
 
 
 def _likelihood(node: Any, system: StateSpaceModel) -> list[Variable]:
@@ -118,7 +117,7 @@ def _likelihood(node: Any, system: StateSpaceModel) -> list[Variable]:
         filter.check(compile_system(system))
     except ModelError:
         return _with_shorter_steps(node, system)
-    return LogLikelihood(system, filter)(*node.inputs)
+    return type(node.op)(system, filter)(*node.inputs)
 
 
 def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
@@ -132,8 +131,10 @@ def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
     if system.accumulators:
         begins_step = pt.eq(pt.arange(rows.shape[0]) % factor, 0)
         rows = pt.set_subtensor(rows[:, -1], rows[:, -1] * begins_step)
-    likelihood = LogLikelihood(single, node.op.filter)
-    return likelihood(theta, steps * factor, observed, rows, *others)
+    # The rows of a panel have a column of records before those of steps and inputs.
+    factors = factor if steps.type.ndim == 1 else np.array([1, factor, factor])
+    likelihood = type(node.op)(single, node.op.filter)
+    return likelihood(theta, steps * factors, observed, rows, *others)
 
 
 def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | None:

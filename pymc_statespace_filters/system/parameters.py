@@ -27,10 +27,10 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     """Parameter values as an array of shape S + (k,), S the shape to which they broadcast."""
     check_names(system, params)
     values = dict(system.defaults) | dict(params)
-    _check_complete(system, values)
+    check_complete(system, values)
     parts, batches = [], []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        part = _numbers(name, values[name])
+        part = numbers(name, values[name])
         core = part.ndim - len(shape)
         if core < 0 or part.shape[core:] != shape:
             raise ModelError(
@@ -55,7 +55,7 @@ def symbolic_parameters(
 
     ``others`` are the names among which a missing one may be, misspelt.
     """
-    _check_complete(system, values, f"the model's variables are {sorted(others)}")
+    check_complete(system, values, f"the model's variables are {sorted(others)}")
     parts = [
         _symbol(name, values[name], shape).ravel()
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
@@ -65,7 +65,7 @@ def symbolic_parameters(
 
 
 def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
-    symbol: Any = value if isinstance(value, Variable) else pt.as_tensor(_numbers(name, value))
+    symbol: Any = value if isinstance(value, Variable) else pt.as_tensor(numbers(name, value))
     has_shape = symbol.type.ndim == len(shape) and all(
         s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
     )
@@ -77,7 +77,7 @@ def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
     return pt.cast(symbol, "float64")
 
 
-def _check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: str = "") -> None:
+def check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: str = "") -> None:
     """Raise unless every parameter has a value."""
     if missing := [name for name in system.parameters if name not in found]:
         optional = [name for name, _ in system.defaults]
@@ -90,7 +90,8 @@ def _check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: s
         )
 
 
-def _numbers(name: str, value: Any) -> np.ndarray:
+def numbers(name: str, value: Any) -> np.ndarray:
+    """The value of a parameter as an array, which may hold infinities but no NaN."""
     try:
         array = np.asarray(value, dtype="float64")
     except (TypeError, ValueError):

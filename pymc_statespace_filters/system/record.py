@@ -107,11 +107,12 @@ def _symbolic_inputs_of_user(
     if inputs.type.ndim == 1 and system.n_inputs == 1:
         inputs = inputs[:, None]
     if not system.n_inputs or inputs.type.ndim != 2:
-        raise _inputs_of_other_shape(system, inputs.type)
+        raise inputs_of_other_shape(system, inputs.type)
     return inputs
 
 
-def _inputs_of_other_shape(system: StateSpaceModel, found: Any) -> ModelError:
+def inputs_of_other_shape(system: StateSpaceModel, found: Any) -> ModelError:
+    """The error for inputs with other columns than those of the system."""
     return ModelError(
         f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
         f"{list(system.inputs)}, got {found}"
@@ -254,7 +255,7 @@ def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, steps: np.ndarra
     if array.ndim == 1 and system.n_inputs == 1:
         array = array[:, None]
     if array.ndim != 2 or array.shape[1] != system.n_inputs:
-        raise _inputs_of_other_shape(system, np.shape(inputs))
+        raise inputs_of_other_shape(system, np.shape(inputs))
     needed = n_input_rows(system, steps)
     if array.shape[0] < needed:
         last_row = ", and the observation uses u" if system.observation_uses_inputs else ""

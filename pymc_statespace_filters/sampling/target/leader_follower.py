@@ -29,7 +29,7 @@ from pymc_statespace_filters.parallel.communicator import (
     describe_error,
 )
 from pymc_statespace_filters.parallel.signals import deferred_interrupts, ignored_interrupts
-from pymc_statespace_filters.pymc_model.inspection import noisy_filters
+from pymc_statespace_filters.pymc_model.inspection import noisy_filters, panel_variables
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 
 # Messages of the leader: a likelihood with its record, an evaluation of it, the end.
@@ -75,6 +75,11 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
         raise ModelError(
             "ranks_per_chain must be 1 for a model without a StateSpace variable whose filter has "
             f"particles, got {n_ranks}"
+        )
+    if panels := [name for name in filters if name in panel_variables(model)]:
+        raise ModelError(
+            f"ranks_per_chain must be 1 for the panel {panels[0]!r}, got {n_ranks}: every rank "
+            "evaluates all records of its chains"
         )
     for filter in filters.values():
         check_ranks(filter, n_ranks)

@@ -1,0 +1,218 @@
+"""The log-likelihood of a panel, all records of one table, as single operations.
+
+Theta has a row for each record, and ``rows`` (J, 3), see `system.panel`, take the place of the
+steps. A record is evaluated by the machine code of a single one, so that it has the same bits,
+unless the filter evaluates records side by side (`filters.protocol.PanelFilter`).
+"""
+
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.replace import _vectorize_node
+from pytensor.graph.rewriting.basic import node_rewriter
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.rewriting.basic import register_specialize
+
+from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.filters.outcomes import NONE
+from pymc_statespace_filters.filters.protocol import PanelFilter
+from pymc_statespace_filters.ops.base import RECORD_INPUTS
+from pymc_statespace_filters.ops.likelihood import (
+    LogLikelihood,
+    LogLikelihoodGradient,
+    TapedLogLikelihood,
+    TapePullback,
+    fused,
+)
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, CheckedPanel
+
+PANEL_INPUTS = (("theta", "float64", 2), ("steps", "int64", 2), *RECORD_INPUTS[2:])
+_CHECKS = ("check_panel(theta, steps, inputs)", "check_observed(steps, observed)")
+
+
+class PanelLogLikelihood(LogLikelihood):
+    """`LogLikelihood` of a panel: theta (G, k), rows (J, 3) -> terms (J,), health (3,).
+
+    Health is that of the whole panel: the smallest effective number of particles, and code and row
+    of the first failing record. A record that fails has terms of -inf, the others keep theirs.
+    """
+
+    input_types = PANEL_INPUTS
+    record_checks = _CHECKS
+    gufunc_signature = "(g,k),(j,c),(j,p),(s,u),(),()->(j),(h)"
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """All records side by side if the filter has that, else one after the other."""
+        if isinstance(self.filter, PanelFilter):
+            return _without_stored_noise(self.filter.compile_panel(system))
+        return _one_by_one(self.filter.compile(system))
+
+    def gradient(self) -> "PanelLogLikelihoodGradient":
+        """The operation of the vector-Jacobian product."""
+        return PanelLogLikelihoodGradient(self.system, self.filter)
+
+
+class PanelLogLikelihoodGradient(LogLikelihoodGradient):
+    """Vector-Jacobian product of `PanelLogLikelihood`: terms_bar (J,) -> theta_bar (G, k)."""
+
+    input_types = (*PANEL_INPUTS, ("terms_bar", "float64", 1))
+    output_types = (pt.dmatrix,)
+    record_checks = _CHECKS
+    gufunc_signature = "(g,k),(j,c),(j,p),(s,u),(),(),(j)->(g,k)"
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """Both passes of the filter."""
+        if isinstance(self.filter, PanelFilter):
+            return self.filter.compile_panel_gradient(system)
+        return _gradients_one_by_one(self.filter.compile_gradient(system))
+
+
+class TapedPanelLogLikelihood(TapedLogLikelihood):
+    """`PanelLogLikelihood` with a third output, the filter's tape."""
+
+    input_types = PANEL_INPUTS
+    record_checks = _CHECKS
+    filter: Any
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The forward pass."""
+        return self.filter.compile_panel_taped(system)
+
+
+class PanelTapePullback(TapePullback):
+    """Vector-Jacobian product of `TapedPanelLogLikelihood`."""
+
+    input_types = (*PANEL_INPUTS, ("tape", "float64", 2), ("terms_bar", "float64", 1))
+    output_types = (pt.dmatrix,)
+    filter: Any
+
+    def compile(self, system: CompiledSystem) -> CompiledFunction:
+        """The backward pass."""
+        return self.filter.compile_panel_pullback(system)
+
+
+@register_specialize
+@node_rewriter([PanelLogLikelihoodGradient])
+def fuse_value_and_gradient_of_panel(
+    fgraph: FunctionGraph, node: Apply
+) -> dict[Variable, Variable] | None:
+    """Make one forward pass where a graph holds value and gradient at the same inputs."""
+    if not isinstance(node.op.filter, PanelFilter):
+        return None
+    return fused(fgraph, node, PanelLogLikelihood, TapedPanelLogLikelihood, PanelTapePullback)
+
+
+@_vectorize_node.register(PanelLogLikelihood)
+def _vectorize(op: PanelLogLikelihood, node: Apply, *inputs: Variable) -> list[Variable]:
+    return Blockwise(op)(*inputs, return_list=True)
+
+
+@jit
+def end_of_record(rows, first):
+    """The row behind the record that begins in row ``first``."""
+    last = first + 1
+    while last < rows.shape[0] and rows[last, RECORD] == rows[first, RECORD]:
+        last += 1
+    return last
+
+
+@jit
+def seed_of_record(seed, code):
+    """The seed of a record's noise; that of the record with the code 0 is ``seed`` itself.
+
+    The finaliser of MurmurHash3 (A. Appleby) maps 0 to 0 and neighbouring codes far apart.
+    """
+    bits = np.uint64(code)
+    bits ^= bits >> np.uint64(33)
+    bits *= np.uint64(0xFF51AFD7ED558CCD)
+    bits ^= bits >> np.uint64(33)
+    bits *= np.uint64(0xC4CEB9FE1A85EC53)
+    bits ^= bits >> np.uint64(33)
+    return np.int64((np.uint64(seed) + bits) & np.uint64(0x7FFFFFFFFFFFFFFF))
+
+
+def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
+    """Steps, observed, inputs, t0 and seed of every record, as a single one takes them."""
+    records = table.records
+    return [
+        (
+            table.rows[rows, STEP],
+            table.observed[rows],
+            table.inputs[table.rows[rows.start, FIRST_INPUT] :],
+            table.t0,
+            np.asarray(seed_of_record(np.int64(seed), code)),
+        )
+        for rows, code in zip(records.slices(), records.codes, strict=True)
+    ]
+
+
+@jit
+def worst_health(health, of_record, first):
+    """Include the health of a record whose first row is ``first`` in that of its panel."""
+    health[0] = min(health[0], of_record[0])
+    if health[1] == NONE and of_record[1] != NONE:
+        health[1], health[2] = of_record[1], first + of_record[2]
+
+
+def _one_by_one(value: CompiledFunction) -> CompiledFunction:
+    run = value.function
+
+    def panel(theta, rows, observed, inputs, t0, noise):
+        seed, normals = noise
+        terms = np.empty(rows.shape[0])
+        health = np.array([np.inf, float(NONE), -1.0])
+        first = 0
+        for record in range(theta.shape[0]):
+            last = end_of_record(rows, first)
+            terms[first:last], of_record = run(
+                theta[record].copy(),
+                rows[first:last, STEP].copy(),
+                observed[first:last],
+                inputs[rows[first, FIRST_INPUT] :],
+                t0,
+                (seed_of_record(seed, rows[first, RECORD]), normals),
+            )
+            worst_health(health, of_record, first)
+            first = last
+        return terms, health
+
+    return CompiledFunction(jit(panel, value.large), key_of("panel", value.key), value.large)
+
+
+def _gradients_one_by_one(gradient: CompiledFunction) -> CompiledFunction:
+    run = gradient.function
+
+    def panel(theta, rows, observed, inputs, t0, seed, terms_bar):
+        theta_bar = np.empty(theta.shape)
+        first = 0
+        for record in range(theta.shape[0]):
+            last = end_of_record(rows, first)
+            theta_bar[record] = run(
+                theta[record].copy(),
+                rows[first:last, STEP].copy(),
+                observed[first:last],
+                inputs[rows[first, FIRST_INPUT] :],
+                t0,
+                seed,
+                terms_bar[first:last],
+            )
+            first = last
+        return theta_bar
+
+    key = key_of("gradient of a panel", gradient.key)
+    return CompiledFunction(jit(panel, gradient.large), key, gradient.large)
+
+
+def _without_stored_noise(value: CompiledFunction) -> CompiledFunction:
+    """A deterministic filter's function, with the noise of a call that it does not read."""
+    run = value.function
+
+    def panel(theta, rows, observed, inputs, t0, noise):
+        return run(theta, rows, observed, inputs, t0, noise[0])
+
+    return CompiledFunction(jit(panel, value.large), key_of("no noise", value.key), value.large)

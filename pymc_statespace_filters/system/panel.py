@@ -1,0 +1,387 @@
+"""Panels: several records of one system in one table, as one evaluation takes them.
+
+The rows of a panel are a table of integers (J, 3), one for each observation: a code of the record
+that it belongs to, its step, and the row of the inputs that holds during step 0 of that record.
+Records that share their inputs all begin at row 0; others have stretches of their own, one below
+the other. Every record starts at step 0 and time t0.
+
+The code of a record is its label, or a hash of it if that is a text. The noise of a record depends
+on the seed and this code alone, so that it does not change when other records are added.
+"""
+
+from collections.abc import Mapping, Sequence
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Variable
+from pytensor.raise_op import CheckAndRaise
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.checks import check_finite, is_integer, shortened
+from pymc_statespace_filters.system.model import StateSpaceModel
+from pymc_statespace_filters.system.parameters import check_complete, check_names, numbers
+from pymc_statespace_filters.system.record import (
+    check_inputs,
+    check_observed,
+    check_steps,
+    inputs_of_other_shape,
+    steps_of,
+)
+
+# Columns of the rows of a panel.
+RECORD, STEP, FIRST_INPUT = range(3)
+N_COLUMNS = 3
+
+_OTHER_NUMBER = (
+    "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
+    "records, change the parameter's dimension too"
+)
+# What comes before the messages of a single record's checks.
+_IN = "record {label!r}, whose first row is {first}: "
+
+
+class Records(NamedTuple):
+    """The records of a panel, in the order of their rows.
+
+    ``labels`` has one label for each, ``starts`` (G + 1,) the first row of each and the number of
+    rows, ``codes`` (G,) what their noise depends on.
+    """
+
+    labels: list[Any]
+    starts: np.ndarray
+    codes: np.ndarray
+
+    def slices(self) -> list[slice]:
+        """The rows of each record."""
+        return [slice(*ends) for ends in zip(self.starts[:-1], self.starts[1:], strict=True)]
+
+    def of_rows(self) -> np.ndarray:
+        """The number of the record of each row, (J,)."""
+        return np.repeat(np.arange(len(self.labels)), np.diff(self.starts))
+
+
+class CheckedPanel(NamedTuple):
+    """A panel of numbers: its records, rows (J, 3), data (J, p), inputs and t0 ()."""
+
+    records: Records
+    rows: np.ndarray
+    observed: np.ndarray
+    inputs: np.ndarray
+    t0: np.ndarray
+
+
+class SymbolicPanel(NamedTuple):
+    """A panel of numbers or symbols, with the current numbers of its records and steps."""
+
+    records: Records
+    current_steps: np.ndarray
+    n_records: Any
+    rows: Any
+    observed: Any
+    inputs: Any
+    t0: float
+
+
+def checked_panel(
+    system: StateSpaceModel,
+    panel: Any,
+    observed: Any,
+    *,
+    steps: Any,
+    times: Any,
+    inputs: Any,
+    t0: Any,
+) -> CheckedPanel:
+    """Check every part of a panel of numbers."""
+    t0 = check_finite("t0", t0)
+    records = records_of(panel)
+    at = _steps(records, steps, times, system.dt, t0)
+    data = _check_observed(observed, system, records)
+    forces, first_inputs = _inputs(inputs, system, records, at)
+    number = records.of_rows()
+    begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
+    rows = np.stack([records.codes[number], at, begin], axis=1)
+    return CheckedPanel(records, rows, data, forces, np.asarray(t0))
+
+
+def symbolic_panel(
+    system: StateSpaceModel,
+    panel: Any,
+    observed: Any,
+    *,
+    steps: Any,
+    times: Any,
+    inputs: Any,
+    t0: Any,
+) -> SymbolicPanel:
+    """Check every part of a panel as far as it is known: numbers and the values of shared data."""
+    t0 = check_finite("t0", t0)
+    if isinstance(times, Variable):
+        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+    records = records_of(_current(panel))
+    at = _steps(records, _current(steps), times, system.dt, t0)
+    data = None if observed is None else _symbolic_observed(observed, system, records)
+    is_symbolic = isinstance(panel, Variable) or isinstance(steps, Variable)
+    if is_symbolic and system.accumulators:
+        raise ModelError(
+            "panel and steps must be numbers for a system with accumulators, which are reset at the"
+            " steps of each record, got pm.Data"
+        )
+    forces, first_inputs = _symbolic_inputs(inputs, system, records, at)
+    if isinstance(panel, Variable):
+        codes: Any = pt.cast(panel, "int64")
+        begins = pt.neq(codes[1:], codes[:-1])
+        n_records: Any = 1 + begins.sum()
+        number: Any = pt.concatenate([[0], pt.cumsum(begins)])
+    else:
+        n_records, number = len(records.labels), records.of_rows()
+        codes = records.codes[number]
+    begin = codes * 0 if first_inputs is None else pt.as_tensor(first_inputs)[number]
+    columns = [codes, steps if isinstance(steps, Variable) else at, begin]
+    rows: Any = pt.stack([pt.cast(pt.as_tensor(column), "int64") for column in columns], axis=1)
+    if not any(isinstance(part, Variable) for part in (panel, steps, first_inputs)):
+        rows = rows.eval(mode="FAST_COMPILE")
+    return SymbolicPanel(records, at, n_records, rows, data, forces, t0)
+
+
+def _current(value: Any) -> Any:
+    return value.eval() if isinstance(value, Variable) else value
+
+
+def records_of(panel: Any) -> Records:
+    """Check the labels of all rows, of one record together, and find the records."""
+    labels = np.asarray(panel)
+    if labels.ndim != 1 or labels.size == 0:
+        raise ModelError(
+            f"panel must be a vector, the label of the record of each row, got {shortened(panel)}"
+        )
+    if labels.dtype.kind not in "iu":
+        labels = _integers_or_texts(labels)
+    has_texts = labels.dtype.kind == "O"
+    codes = np.array([_hash(text) for text in labels] if has_texts else labels, dtype=np.int64)
+    starts = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1], [True]]))
+    seen: dict[Any, int] = {}
+    for first in starts[:-1].tolist():
+        label = labels[first]
+        if label in seen:
+            raise ModelError(
+                f"panel must have the rows of a record together, got record {label!r} in row "
+                f"{seen[label]} and, behind others, in row {first}: sort the rows by record, then "
+                "by time"
+            )
+        seen[label] = first
+    found = [label.item() if isinstance(label, np.generic) else label for label in seen]
+    return Records(found, starts, codes[starts[:-1]])
+
+
+def _integers_or_texts(labels: np.ndarray) -> np.ndarray:
+    """Labels of one kind, integers or objects; tables hold integers also as floats and objects."""
+    if labels.dtype.kind == "f":
+        is_number = np.isfinite(labels) & (labels == np.round(labels))
+    else:
+        is_number = np.array([is_integer(label) for label in labels])
+    is_text = np.array([isinstance(label, str) and label != "" for label in labels])
+    if not (is_label := is_number if is_number.any() else is_text).all():
+        row = int(np.argmin(is_label))
+        raise ModelError(
+            f"panel must hold integers or texts, got {labels.tolist()[row]!r} in row {row}: every "
+            "row needs the label of its record"
+        )
+    return labels.astype("int64" if is_number.any() else object)
+
+
+def _hash(label: str) -> int:
+    """63 bits of a text, the same in every process."""
+    return int.from_bytes(blake2b(label.encode(), digest_size=8).digest()) >> 1
+
+
+def _each(records: Records) -> list[tuple[Any, slice]]:
+    return list(zip(records.labels, records.slices(), strict=True))
+
+
+def _of_record(label: Any, first: int, check: Any, *arguments: Any, **options: Any) -> Any:
+    """Check the part of one record; an error names the record and its first row."""
+    try:
+        return check(*arguments, **options)
+    except ModelError as error:
+        raise ModelError(_IN.format(label=label, first=first) + str(error)) from None
+
+
+def _steps(records: Records, steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
+    """Steps of all rows; those of a record increase strictly."""
+    if (steps is None) == (times is None):
+        raise ModelError("give exactly one of steps and times")
+    name, values = ("steps", steps) if times is None else ("times", times)
+    array = np.asarray(values)
+    n_rows = records.starts[-1]
+    if array.shape != (n_rows,):
+        raise ModelError(
+            f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
+            f"{array.shape}"
+        )
+    parts = [
+        _of_record(label, rows.start, check_steps, array[rows])
+        if times is None
+        else _of_record(label, rows.start, steps_of, None, array[rows], dt, t0)
+        for label, rows in _each(records)
+    ]
+    return np.concatenate(parts)
+
+
+def _check_observed(observed: Any, system: StateSpaceModel, records: Records) -> np.ndarray:
+    return check_observed(observed, system, int(records.starts[-1]))
+
+
+def _symbolic_observed(observed: Any, system: StateSpaceModel, records: Records) -> Variable:
+    if not isinstance(observed, Variable):
+        # A symbol, because PyMC would mask and impute the NaN of an array.
+        return pt.as_tensor(_check_observed(observed, system, records))
+    if observed.type.ndim != 2:
+        raise ModelError(
+            f"observed must have 2 dimensions (rows, observables) if it is symbolic, got "
+            f"{observed.type.ndim}"
+        )
+    if isinstance(observed, SharedVariable):
+        _check_observed(observed.get_value(), system, records)
+    return observed
+
+
+def _own_inputs(inputs: Any, records: Records) -> list[Any] | None:
+    """The inputs of each record, if they have their own: a mapping or a sequence of arrays."""
+    if isinstance(inputs, Mapping):
+        if list(inputs) != records.labels and set(inputs) != set(records.labels):
+            missing = [label for label in records.labels if label not in inputs]
+            raise ModelError(
+                f"inputs must have an array for each record, got none for {shortened(missing)}"
+                if missing
+                else f"inputs must have an array for each record, got others: {shortened(inputs)}"
+            )
+        return [inputs[label] for label in records.labels]
+    is_list = isinstance(inputs, list | tuple) and all(
+        isinstance(part, np.ndarray | Variable) and part.ndim for part in inputs
+    )
+    if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
+        return None
+    if len(inputs) != len(records.labels):
+        raise ModelError(
+            f"inputs must have an array for each of the {len(records.labels)} records, or one for "
+            f"all, got {len(inputs)}"
+        )
+    return list(inputs)
+
+
+def _inputs(
+    inputs: Any, system: StateSpaceModel, records: Records, steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """All rows of inputs, and the first row of each record; None if all share them."""
+    own = _own_inputs(inputs, records)
+    if own is None:
+        # The observations of one record do not reset the accumulators of another.
+        if not system.accumulators:
+            for label, rows in _each(records):
+                _of_record(label, rows.start, check_inputs, inputs, system, steps[rows])
+            longest = np.array([steps.max()])
+            return check_inputs(inputs, system, longest), None
+        own = [inputs] * len(records.labels)
+    parts = [
+        _of_record(label, rows.start, check_inputs, part, system, steps[rows])
+        for part, (label, rows) in zip(own, _each(records), strict=True)
+    ]
+    return np.concatenate(parts), _first_rows([len(part) for part in parts])
+
+
+def _first_rows(lengths: Sequence[int]) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype("int64")
+
+
+def _symbolic_inputs(
+    inputs: Any, system: StateSpaceModel, records: Records, steps: np.ndarray
+) -> tuple[Any, Any]:
+    own = _own_inputs(inputs, records)
+    parts = [inputs] if own is None else own
+    if not any(isinstance(part, Variable) for part in parts):
+        return _inputs(inputs, system, records, steps)
+    if system.accumulators:
+        raise ModelError(
+            "inputs must be numbers for a system with accumulators in a panel, got a symbol"
+        )
+    current = [
+        part.get_value() if isinstance(part, SharedVariable) else part
+        for part in parts
+        if isinstance(part, SharedVariable) or not isinstance(part, Variable)
+    ]
+    if len(current) == len(parts):
+        _inputs(current[0] if own is None else current, system, records, steps)
+    columns = [_two_dimensional(part, system) for part in parts]
+    if own is None:
+        return columns[0], None
+    lengths = pt.stack([column.shape[0] for column in columns])
+    return pt.concatenate(columns), pt.concatenate([[0], pt.cumsum(lengths)[:-1]])
+
+
+def _two_dimensional(inputs: Any, system: StateSpaceModel) -> TensorVariable:
+    symbol = pt.as_tensor(inputs)
+    if symbol.type.ndim == 1 and system.n_inputs == 1:
+        symbol = symbol[:, None]
+    if not system.n_inputs or symbol.type.ndim != 2:
+        raise inputs_of_other_shape(system, symbol.type)
+    return symbol
+
+
+def panel_parameters(
+    system: StateSpaceModel, params: Mapping[str, Any], records: Records
+) -> np.ndarray:
+    """Parameter values (G, k): each shared, or with a leading dimension of records."""
+    check_names(system, params)
+    values = dict(system.defaults) | dict(params)
+    check_complete(system, values)
+    n_records, parts = len(records.labels), [np.zeros((len(records.labels), 0))]
+    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
+        part = numbers(name, values[name])
+        _check_shape(name, shape, part.shape, n_records)
+        whole = np.broadcast_to(part, (n_records, *shape))
+        parts.append(whole.reshape(n_records, -1))
+    return np.concatenate(parts, axis=1)
+
+
+def symbolic_panel_parameters(
+    system: StateSpaceModel,
+    values: Mapping[str, Any],
+    panel: SymbolicPanel,
+    others: Sequence[str],
+) -> TensorVariable:
+    """Parameter values, numbers or symbols, as a symbolic matrix (G, k)."""
+    check_complete(system, values, f"the model's variables are {sorted(others)}")
+    n_records = len(panel.records.labels)
+    parts: list[Any] = [np.zeros((n_records, 0))] if not system.parameters else []
+    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
+        value = values[name]
+        symbol = pt.as_tensor(value if isinstance(value, Variable) else numbers(name, value))
+        _check_shape(name, shape, symbol.type.shape, n_records)
+        size = int(np.prod(shape, dtype=int))
+        if symbol.type.ndim == len(shape):
+            part = pt.broadcast_to(symbol.reshape((1, size)), (panel.n_records, size))
+        else:
+            part = symbol.reshape((symbol.shape[0], size))
+            if isinstance(panel.n_records, Variable):
+                fits = pt.eq(symbol.shape[0], panel.n_records)
+                part = CheckAndRaise(ModelError, _OTHER_NUMBER.format(name=name))(part, fits)
+        parts.append(pt.cast(part, "float64"))
+    return pt.specify_shape(pt.concatenate(parts, axis=1), (None, system.n_theta))
+
+
+def _check_shape(name: str, shape: tuple[int, ...], found: tuple, n_records: int) -> None:
+    """Raise unless the shape is that of a shared parameter or one of each record."""
+    own = (n_records, *shape)
+    expected = shape if len(found) == len(shape) else own
+    if len(found) != len(expected) or any(
+        n is not None and n != m for n, m in zip(found, expected, strict=True)
+    ):
+        raise ModelError(
+            f"parameter {name!r} must have shape {shape} (one value for all records) or {own} (one "
+            f"for each of the {n_records} records), got {tuple(found)}"
+        )
