@@ -1,7 +1,6 @@
 """Registers how `StateSpaceRV` is drawn, in Python and in numba, and its log-density."""
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import simulator
@@ -45,54 +43,59 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
         np.broadcast_to(p, batch + np.shape(p)[np.ndim(p) - n :])
         for p, n in zip((theta, steps, inputs, t0), core_ndims, strict=False)
     )
-    draw = _draw(op).function
+    is_panel = isinstance(op, PanelRV)
+    simulate, check = simulator(op.system, True).function, _check(op)
     draws = np.empty((*batch, steps.shape[len(batch)], op.system.p))
     for i in np.ndindex(batch):
         parts = [np.require(a[i], requirements=("C", "W")) for a in (theta, steps, inputs)]
-        draws[i] = draw(rng, *parts, float(t0[i]))
+        check(*(parts if is_panel else parts[1:]))
+        records = _single_records(*parts) if is_panel else iter([(slice(None), *parts)])
+        for rows, *record in records:
+            _, draws[(*i, rows)] = simulate(rng, *record, float(t0[i]))
     return draws
 
 
-@cache
-def _draw(op: StateSpaceRV) -> CompiledFunction:
-    """The function (rng, theta, steps, inputs, t0) -> observations, which checks the record."""
-    compiled = simulator(op.system, True)
-    simulate = compiled.function
-    if isinstance(op, PanelRV):
-        check = check_panel(op.system)
+def _check(op: StateSpaceRV) -> Any:
+    """The compiled check of a record (steps, inputs), or of a panel (theta, rows, inputs)."""
+    return check_panel(op.system) if isinstance(op, PanelRV) else check_record(op.system)
 
-        def draw(rng, theta, rows, inputs, t0):
-            check(theta, rows, inputs)
-            observations = np.empty((rows.shape[0], p))
-            first = 0
-            for record in range(theta.shape[0]):
-                last = end_of_record(rows, first)
-                steps, own = rows[first:last, STEP].copy(), inputs[rows[first, FIRST_INPUT] :]
-                _, observations[first:last] = simulate(rng, theta[record].copy(), steps, own, t0)
-                first = last
-            return observations
-    else:
-        check = check_record(op.system)
 
-        def draw(rng, theta, steps, inputs, t0):
-            check(steps, inputs)
-            return simulate(rng, theta, steps, inputs, t0)[1]
-
-    p = op.system.p
-    return CompiledFunction(numba_njit(draw), cache_key(op.system, compiled))
+def _single_records(
+    theta: np.ndarray, rows: np.ndarray, inputs: np.ndarray
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+    """The rows of every record of a panel, its parameters, steps and inputs."""
+    ends = np.flatnonzero(np.diff(rows[:, RECORD], append=rows[-1, RECORD] + 1)) + 1
+    for own, first, last in zip(theta, [0, *ends[:-1]], ends, strict=True):
+        steps, begin = rows[first:last, STEP].copy(), rows[first, FIRST_INPUT]
+        yield slice(first, last), own, steps, inputs[begin:]
 
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = _draw(op)
-    draw_record = compiled.function
+    compiled = simulator(op.system, True)
+    simulate, check, p = compiled.function, _check(op), op.system.p
 
     @numba_njit
-    def draw(rng, theta, steps, inputs, t0, seed):
-        return draw_record(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
+    def draw_record(rng, theta, steps, inputs, t0, seed):
+        check(steps, inputs)
+        _, observations = simulate(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
+        return observations
 
+    @numba_njit
+    def draw_panel(rng, theta, rows, inputs, t0, seed):
+        check(theta, rows, inputs)
+        observations, forces = np.empty((rows.shape[0], p)), inputs.copy()
+        first = 0
+        for record in range(theta.shape[0]):
+            last = end_of_record(rows, first)
+            steps, own = rows[first:last, STEP].copy(), forces[rows[first, FIRST_INPUT] :]
+            _, observations[first:last] = simulate(rng, theta[record].copy(), steps, own, t0)
+            first = last
+        return observations
+
+    draw, what = (draw_panel, "panel") if isinstance(op, PanelRV) else (draw_record, "record")
+    key = key_of(what, cache_key(op.system, compiled))
     # PyTensor requires an integer as the cache key of a random variable.
-    key = None if compiled.key is None else key_of(type(op).__name__, compiled.key)
     return draw, None if key is None else int(key[:15], 16)
 
 

@@ -226,3 +226,9 @@ def test_steps_half_as_long_are_those_of_every_record():
 
     alone = [finest(rows) for rows in RECORDS.slices()]
     np.testing.assert_allclose(finest(slice(None), panel=LABELS), sum(alone), rtol=1e-12)
+
+
+def test_draws_are_the_same_in_every_mode():
+    variable = model_of(observed=None)["d"]
+    draws = [pm.draw(variable, 2, random_seed=3, mode=mode) for mode in (None, "FAST_COMPILE")]
+    np.testing.assert_array_equal(*draws)
