@@ -16,6 +16,7 @@ from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import observer
 from pymc_statespace_filters.progress import row_progress
+from pymc_statespace_filters.pymc_model.inspection import panel_variables
 from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
@@ -209,4 +210,9 @@ def select_variables(
     if name is not None and name not in list(found):  # `in found` fails for unhashable names
         raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
     chosen = list(found.values()) if name is None else [found[name]]
+    if panels := [variable.name for variable in chosen if variable.name in panel_variables(model)]:
+        raise ModelError(
+            f"the panel {panels[0]!r} has no such results: make a model of one record, or give the "
+            "var_name of a variable without a panel"
+        )
     return chosen if filter is None else [with_other_filter(v, filter) for v in chosen]

@@ -264,14 +264,20 @@ def build(
 
     A block is given by its arguments and lines.
     """
+    namespace, key = blocks_of(writer, **blocks)
+    large |= sum(len(lines) for _, lines in blocks.values()) > LARGE
+    function, source = function_of(name, arguments, body, namespace, large)
+    return CompiledFunction(function, digest(source, key), large)
+
+
+def blocks_of(writer: Writer, **blocks: tuple[str, Sequence[str]]) -> tuple[dict[str, Any], str]:
+    """Blocks of a writer's statements, and what they call, as functions; and their key."""
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     namespace = {**writer.namespace, **others}
     code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
-    large |= sum(len(lines) for _, lines in blocks.values()) > LARGE
-    function, source = function_of(name, arguments, body, {**namespace, **code}, large)
     texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
     operations = [repr(op) for op, _ in writer.fallbacks.values()]
-    return CompiledFunction(function, digest(source, *texts, *operations), large)
+    return {**namespace, **code}, digest(*texts, *operations)
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

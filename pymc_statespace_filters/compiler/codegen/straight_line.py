@@ -42,8 +42,9 @@ _BUILTINS = {"abs": abs, "float": float, "int": int}
 def straight_line(arguments: str, lines: Sequence[str], namespace: Mapping[str, Any]) -> Any:
     """A function of these arguments that consists of straight-line code, for compiled callers.
 
-    Its code is inserted into the caller's. Arguments are numbers, arrays and tuples; the last line
-    may return numbers in nested tuples. Indices count from zero and are not checked.
+    Its code is inserted into the caller's. Arguments are numbers, arrays, addresses of numbers and
+    tuples; the last line may return numbers in nested tuples. Indices count from zero and are not
+    checked. Numbers at different addresses must not overlap, which spares a loop the checks.
     """
     statements = ast.parse("\n".join(lines)).body
     names = [argument.strip() for argument in arguments.split(",")]
@@ -51,9 +52,11 @@ def straight_line(arguments: str, lines: Sequence[str], namespace: Mapping[str, 
     def typed(typing: Any, kinds: tuple) -> tuple:
         reader = _Reader(typing, namespace, dict(zip(names, kinds, strict=True)))
         steps = [reader.statement(statement) for statement in statements]
+        of_address = zip(names, kinds, strict=True)
+        addresses = [name for name, kind in of_address if isinstance(kind, types.CPointer)]
 
         def generate(context: Any, builder: Any, _: Any, values: Sequence) -> Any:
-            frame = _Frame(context, builder, dict(zip(names, values, strict=True)))
+            frame = _Frame(context, builder, dict(zip(names, values, strict=True)), addresses)
             result = None
             for step in steps:
                 result = step(frame)
@@ -74,6 +77,7 @@ class _Frame:
     context: Any
     builder: Any
     values: dict[str, Any]
+    addresses: Sequence[str]
     arrays: dict[str, Any] = field(default_factory=dict)
     functions: dict[Any, Any] = field(default_factory=dict)
 
@@ -86,13 +90,36 @@ class _Frame:
         self.context.add_linking_libs(getattr(code, "libs", ()))
         return result
 
-    def element(self, name: str, kind: types.Array, indices: Sequence) -> Any:
+    def element(self, name: str, kind: Any, indices: Sequence) -> Any:
         """The address of an element."""
         if name not in self.arrays:
             self.arrays[name] = make_array(kind)(self.context, self.builder, self.values[name])
         return cgutils.get_item_pointer(
             self.context, self.builder, kind, self.arrays[name], indices, wraparound=False
         )
+
+    def access(self, name: str, kind: Any, indices: Sequence, value: Any = None) -> Any:
+        """Read an element, or set it to a value."""
+        if isinstance(kind, types.CPointer):
+            address = self.builder.gep(self.values[name], list(indices))
+            read = value is None
+            made = self.builder.load(address) if read else self.builder.store(value, address)
+            self._mark(made, name)
+            return made
+        address = self.element(name, kind, indices)
+        if value is None:
+            return load_item(self.context, self.builder, kind, address)
+        return store_item(self.context, self.builder, kind, value, address)
+
+    def _mark(self, instruction: Any, name: str) -> None:
+        """Tell LLVM that what is at one address overlaps with nothing at the others."""
+        module = self.builder.module
+        domain = module.add_metadata(["addresses"])
+        scopes = {other: module.add_metadata([other, domain]) for other in self.addresses}
+        own = scopes.pop(name)
+        instruction.set_metadata("alias.scope", module.add_metadata([own]))
+        if scopes:
+            instruction.set_metadata("noalias", module.add_metadata(list(scopes.values())))
 
 
 Emit = Callable[[_Frame], Any]
@@ -131,8 +158,8 @@ class _Reader:
         value = self._cast(term, kind.dtype)
 
         def emit(frame: _Frame) -> None:
-            address = frame.element(name, kind, [index.emit(frame) for index in indices])
-            store_item(frame.context, frame.builder, kind, value.emit(frame), address)
+            places = [index.emit(frame) for index in indices]
+            frame.access(name, kind, places, value.emit(frame))
 
         return emit
 
@@ -221,8 +248,7 @@ class _Reader:
             return _Term(kind[i], lambda f: f.builder.extract_value(f.values[name], i))
 
         def emit(frame: _Frame) -> Any:
-            address = frame.element(name, kind, [index.emit(frame) for index in indices])
-            return load_item(frame.context, frame.builder, kind, address)
+            return frame.access(name, kind, [index.emit(frame) for index in indices])
 
         return _Term(kind.dtype, emit)
 

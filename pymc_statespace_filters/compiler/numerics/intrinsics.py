@@ -20,14 +20,22 @@ _EXPONENT_BITS = np.uint64(52)
 _SIGN = np.uint64(0x8000000000000000)
 
 
+def _precision(a):
+    return types.float32 if a == types.float32 else types.float64
+
+
 @intrinsic
 def fma(typing_context, a, b, c):
-    """``a * b + c``, rounded once; a slow call on processors without the instruction."""
+    """``a * b + c``, rounded once; a slow call on processors without the instruction.
+
+    In single precision if ``a`` is.
+    """
 
     def code(context, builder, signature, arguments):
         return builder.fma(*arguments)
 
-    return types.float64(types.float64, types.float64, types.float64), code
+    kind = _precision(a)
+    return kind(kind, kind, kind), code
 
 
 @intrinsic
@@ -43,7 +51,10 @@ def sqrt(typing_context, x):
 
 @intrinsic
 def polynomial(typing_context, x, coefficients):
-    """A polynomial in x by Horner's rule; the coefficients are a tuple, highest power first."""
+    """A polynomial in x by Horner's rule; the coefficients are a tuple, highest power first.
+
+    In single precision if x and the coefficients are.
+    """
 
     def code(context, builder, signature, arguments):
         argument, packed = arguments
@@ -52,7 +63,8 @@ def polynomial(typing_context, x, coefficients):
             total = builder.fma(total, argument, coefficient)
         return total
 
-    return types.float64(types.float64, coefficients), code
+    kind = _precision(x)
+    return kind(kind, coefficients), code
 
 
 @intrinsic

@@ -27,7 +27,7 @@ MAX_EXPLICIT = 8  # states
 
 def compile_pullback(recursion: GaussianFilterFunctions) -> CompiledFunction:
     """The function (theta, steps, observed, inputs, t0, seed, tape, terms_bar) -> theta_bar."""
-    parts = vector_functions(_vjps(recursion))
+    parts = vector_functions(vjps(recursion, explicit=recursion.has_short_rows))
     parameters, zeros, start_vjp, predict_vjp, update_vjp = (
         part.function for part in parts.values()
     )
@@ -72,16 +72,17 @@ def compile_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
     return compiled_of(gradient, "gradient", parts, recursion)
 
 
-def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
+def vjps(recursion: GaussianFilterFunctions, *, explicit: bool) -> dict[str, VectorFunction]:
     """Vector-Jacobian products of the three parts; each adds to ``c_bar``, theta's cotangent.
 
-    They are linear in the cotangent, which is their only input from the later step. For the first
-    ``n_explicit`` elements of the cotangent the row of the Jacobian is computed explicitly: the
+    They are linear in the cotangent, which is their only input from the later step. If ``explicit``,
+    the rows of the Jacobian for the first elements of the cotangent are computed explicitly: the
     processor does so ahead of time, and the cotangent then takes one multiplication. The other
     elements are propagated through the equations, with fewer operations in all. The numbers of
     explicit elements were chosen by measurement: with ten states rows no longer pay, and twenty
     would take 15 s to write out. A linearisation that evaluates the equations at many points has
-    none, because each row is as long as a propagation.
+    none, because each row is as long as a propagation, and records side by side have none, because
+    they fill the time in which a single one waits.
     """
     theta, s = (recursion.predict.graph.inputs[name] for name in ("theta", "s"))
     s_bar, c_bar = s.type("s_bar"), theta.type("c_bar")
@@ -90,7 +91,7 @@ def _vjps(recursion: GaussianFilterFunctions) -> dict[str, VectorFunction]:
     of_predict, of_update = size if n == 1 else n, size + 1 if n <= 2 else 0
     if n > MAX_EXPLICIT:
         of_predict = 0
-    if not recursion.has_short_rows:
+    if not explicit:
         of_predict = of_update = 0
 
     def vjp(part: VectorFunction, wrt: list, cotangents: dict, n_explicit: int) -> VectorFunction:

@@ -7,12 +7,15 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp, log1p
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma, sqrt
+from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial, sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
     SMALL,
-    TINY,
     UNDECIDED,
-    bottom_up_binomial,
+    add_upwards,
+    found,
+    rows,
+    small_quantile,
+    start,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -22,9 +25,11 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
     stirling_error,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
+from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import ONE, TWO
 
 _LARGE = 1e6
-_small_binomial, _tiny_binomial = bottom_up_binomial(SMALL), bottom_up_binomial(TINY)
+# artanh(s) / s in s**2 for s <= 1/3: Taylor, truncation 1.4e-8
+_ARTANH = tuple(np.float32(1.0 / i) for i in range(13, 0, -2))
 
 
 @inlined
@@ -110,7 +115,8 @@ def binomial_quantile(z, n, p):
         return np.nan
     rarer_z, rarer_p, flipped = _rarer(limited(z), p)
     if n * rarer_p < SMALL:
-        k = _small_binomial(rarer_z, n, rarer_p)
+        odds = rarer_p / (1.0 - rarer_p)
+        k = small_quantile(rarer_z, exp(n * log1p(-rarer_p)), n * odds, odds)
     else:
         k = _large_binomial(rarer_z, n, rarer_p)
     if k == UNDECIDED:
@@ -119,43 +125,58 @@ def binomial_quantile(z, n, p):
 
 
 @njit_internal
-def binomial_block(buffer, z, n, p, out, size):
-    """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
-    n_large = n_tiny = 0
+def _small_block(buffer, z, n, p, out, size):
+    work = rows()
     for j in range(size):
         i = np.uint64(j)
-        mean = buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i])
-        n_large += mean >= SMALL
-        n_tiny += mean < TINY
+        rarer_z, rarer_p, _ = _rarer(buffer[z, i], buffer[p, i])
+        mean = buffer[n, i] * rarer_p
+        is_small = mean < SMALL
+        mean, rarer_p = (
+            np.float32(mean if is_small else 0.0),
+            np.float32(rarer_p if is_small else 0.0),
+        )
+        q, two = ONE - rarer_p, TWO - rarer_p
+        inverse = ONE / (q * two)
+        s = rarer_p * (q * inverse)  # log(1 - p) = -2 artanh(s)
+        log_first = -TWO * mean * (q * inverse) * polynomial(s * s, _ARTANH)
+        two *= inverse
+        start(work, i, np.float32(rarer_z), log_first, mean * two, rarer_p * two)
+    add_upwards(work, size)
+    for j in range(size):
+        i = np.uint64(j)
+        trials, other, k = buffer[n, i], buffer[out, i], found(work, i)
+        _, rarer_p, flipped = _rarer(0.0, buffer[p, i])
+        k = trials - k if flipped & (k != UNDECIDED) else k
+        buffer[out, i] = k if trials * rarer_p < SMALL else other
+
+
+@njit_internal
+def binomial_block(buffer, z, n, p, out, size):
+    """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
+    n_large = n_undecided = 0
+    for j in range(size):
+        i = np.uint64(j)
+        n_large += buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i]) >= SMALL
     if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
             rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
             k = _large_binomial(rarer_z, buffer[n, i], rarer_p)
             buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
-    if n_tiny == size:
-        for j in range(size):
-            i = np.uint64(j)
-            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
-            k = _tiny_binomial(rarer_z, buffer[n, i], rarer_p)
-            buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
-    elif n_large < size:
-        for j in range(size):
-            i = np.uint64(j)
-            rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
-            is_small, other = buffer[n, i] * rarer_p < SMALL, buffer[out, i]
-            k = _small_binomial(rarer_z, buffer[n, i], rarer_p if is_small else 0.0)
-            k = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
-            buffer[out, i] = k if is_small else other
+    if n_large < size:
+        _small_block(buffer, z, n, p, out, size)
     for j in range(size):
         i = np.uint64(j)
-        buffer[out, i] = (
-            buffer[out, i] if _valid(buffer[z, i], buffer[n, i], buffer[p, i]) else np.nan
-        )
-    for j in range(size):
-        i = np.uint64(j)
-        if buffer[out, i] == UNDECIDED:
-            buffer[out, i] = exact_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
+        k, is_valid = buffer[out, i], _valid(buffer[z, i], buffer[n, i], buffer[p, i])
+        k = k if is_valid else np.nan
+        n_undecided += k == UNDECIDED
+        buffer[out, i] = k
+    if n_undecided > 0:
+        for j in range(size):
+            i = np.uint64(j)
+            if buffer[out, i] == UNDECIDED:
+                buffer[out, i] = exact_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
 
 
 @inlined

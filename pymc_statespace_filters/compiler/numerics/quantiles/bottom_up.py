@@ -1,123 +1,140 @@
 """Quantiles of small counts, found by adding probabilities from zero upwards.
 
-All sums are compared with the probability sought, without a branch, so that loops over members
-vectorise.
+The probability of j + 1 is that of j times (a - j b) / (j + 1), with b = 0 for a Poisson law. All
+members of a block add four terms at a time, until the sums of all have passed the probability that
+is sought. Single precision suffices: where its error might move a result, the result is undecided.
 """
 
-from typing import Any
-
+import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import carray, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.intrinsics import polynomial
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import short_exp, short_tail
+from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal, njit_reassoc
+from pymc_statespace_filters.compiler.numerics.intrinsics import fma
+from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
+from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import (
+    FOUR,
+    ONE,
+    THREE,
+    TWO,
+    ZERO,
+    exp,
+)
+from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import (
+    normal_probability as single_normal_probability,
+)
 
 SMALL = 8.0
 """Means below are small."""
 
-TINY = 3.0
-"""Means below are tiny."""
-
-# Numbers from these on are undecided: one in 4000 draws of the largest mean.
-_N_TERMS = {SMALL: 20, TINY: 12}
-
 UNDECIDED = -1.0
-TWO_52 = 2.0**52
 
-# artanh(s) / s in s**2 for s <= 1/3: Taylor, truncation 2e-10
-_ARTANH = tuple(1.0 / i for i in range(17, 0, -2))
+_MOST = np.float32(20.0)  # one in 4000 draws of the largest mean is above
+# Of sums and of the probability sought, absolute: twice the largest of 1e8 errors.
+_ERROR, _ERROR_OF_EXPONENT = np.float32(3e-6), np.float32(4e-7)
+_SCALAR_ERROR = 1e-10
 
-
-def _counted(builder: Any, n_terms: int, first: Any, factor: Any, low: Any, high: Any) -> Any:
-    """How many partial sums are below ``low`` and ``high``; undecided where these differ.
-
-    Term j + 1 is term j times ``factor(j)`` / (j + 1).
-    """
-    double, whole = ir.DoubleType(), ir.IntType(64)
-    power = total = first
-    counts = [ir.Constant(whole, 0)] * 2
-    divisor = 1.0
-    for j in range(n_terms):
-        below = [builder.fcmp_ordered("<", total, limit) for limit in (low, high)]
-        counts = [
-            builder.sub(count, builder.sext(b, whole))
-            for count, b in zip(counts, below, strict=True)
-        ]
-        power, divisor = builder.fmul(power, factor(j)), divisor / (j + 1)
-        total = builder.fma(power, ir.Constant(double, divisor), total)
-    decided = builder.icmp_signed("==", *counts)
-    decided = builder.and_(
-        decided, builder.icmp_signed("<", counts[1], ir.Constant(whole, n_terms))
-    )
-    # Adding a small whole number to the bits of 2**52 adds it to 2**52.
-    bits = builder.add(counts[0], builder.bitcast(ir.Constant(double, TWO_52), whole))
-    count = builder.fsub(builder.bitcast(bits, double), ir.Constant(double, TWO_52))
-    return builder.select(decided, count, ir.Constant(double, UNDECIDED))
+_WIDTH = 64  # members of a block, at most
+_A, _B, _TERM, _TOTAL, _LOW, _HIGH, _N_LOW, _N_HIGH = range(0, 8 * _WIDTH, _WIDTH)
+_SIZE = 8 * _WIDTH
 
 
-def _poisson_counter(n_terms: int) -> Any:
-    @intrinsic
-    def count(typing_context, first, mean, low, high):
-        def code(context, builder, signature, arguments):
-            first, mean, low, high = arguments
-            return _counted(builder, n_terms, first, lambda j: mean, low, high)
+@intrinsic
+def _on_stack(typing_context):
+    """The address of the rows of a block, which LLVM knows that nothing else refers to."""
 
-        return types.float64(*[types.float64] * 4), code
+    def code(context, builder, signature, arguments):
+        size = ir.Constant(ir.IntType(64), _SIZE)
+        return cgutils.alloca_once(builder, ir.FloatType(), size=size)
 
-    return count
-
-
-def _binomial_counter(n_terms: int) -> Any:
-    @intrinsic
-    def count(typing_context, first, n, odds, low, high):
-        def code(context, builder, signature, arguments):
-            first, n, odds, low, high = arguments
-            product = builder.fmul(n, odds)
-
-            def factor(j):  # (n - j) odds
-                return builder.fma(ir.Constant(ir.DoubleType(), -float(j)), odds, product)
-
-            return _counted(builder, n_terms, first, factor, low, high)
-
-        return types.float64(*[types.float64] * 5), code
-
-    return count
+    return types.CPointer(types.float32)(), code
 
 
 @inlined
-def _limits(z):
-    """Φ(z) less and more the largest errors of it and of the sums."""
-    tail = short_tail(abs(z))
-    sought = tail if z <= 0.0 else 1.0 - tail
-    error = 1e-7 * tail + 4e-8
-    return sought - error, sought + error
+def rows():
+    """Room for the sums of a block."""
+    return carray(_on_stack(), (_SIZE,))
 
 
-def bottom_up_poisson(largest: float) -> Any:
-    """The Poisson quantile of (z, mean), or `UNDECIDED`, for a mean up to ``largest``."""
-    count = _poisson_counter(_N_TERMS[largest])
-
-    @inlined
-    def quantile(z, mean):
-        low, high = _limits(z)
-        return count(short_exp(-mean), mean, low, high)
-
-    return quantile
+@inlined
+def start(work, i, z, log_first, a, b):
+    """Begin the sum of member i with the probability of zero."""
+    first, sought = exp(log_first), single_normal_probability(z)
+    error = fma(-log_first, _ERROR_OF_EXPONENT, _ERROR)
+    work[i + _A], work[i + _B], work[i + _TERM], work[i + _TOTAL] = a, b, first, first
+    work[i + _LOW], work[i + _HIGH] = sought - error, sought + error
+    work[i + _N_LOW], work[i + _N_HIGH] = ZERO, ZERO
 
 
-def bottom_up_binomial(largest: float) -> Any:
-    """The binomial quantile of (z, n, p), or `UNDECIDED`, for n p to ``largest`` and p <= 1/2."""
-    count = _binomial_counter(_N_TERMS[largest])
+@njit_internal
+def _add_four(work, first, size):
+    """Count the sums to four numbers from ``first`` on that are below, and add the next terms."""
+    j0, j1, j2, j3 = first, first + ONE, first + TWO, first + THREE
+    r0, r1, r2, r3 = ONE / (j0 + ONE), ONE / (j1 + ONE), ONE / (j2 + ONE), ONE / (j3 + ONE)
+    for j in range(size):
+        i = np.uint64(j)
+        a, b, low, high = work[i + _A], work[i + _B], work[i + _LOW], work[i + _HIGH]
+        term, total = work[i + _TERM], work[i + _TOTAL]
+        n_low, n_high = work[i + _N_LOW], work[i + _N_HIGH]
+        n_low, n_high = _counted(total, low, n_low), _counted(total, high, n_high)
+        term *= fma(-j0, b, a) * r0
+        total += term
+        n_low, n_high = _counted(total, low, n_low), _counted(total, high, n_high)
+        term *= fma(-j1, b, a) * r1
+        total += term
+        n_low, n_high = _counted(total, low, n_low), _counted(total, high, n_high)
+        term *= fma(-j2, b, a) * r2
+        total += term
+        n_low, n_high = _counted(total, low, n_low), _counted(total, high, n_high)
+        term *= fma(-j3, b, a) * r3
+        work[i + _TERM], work[i + _TOTAL] = term, total + term
+        work[i + _N_LOW], work[i + _N_HIGH] = n_low, n_high
 
-    @inlined
-    def quantile(z, n, p):
-        low, high = _limits(z)
-        q, two = 1.0 - p, 2.0 - p
-        inverse = 1.0 / (q * two)
-        s = p * (q * inverse)  # log(1 - p) = -2 artanh(s)
-        log_q = -2.0 * s * polynomial(s * s, _ARTANH)
-        return count(short_exp(n * log_q), n, p * (two * inverse), low, high)
 
-    return quantile
+@inlined
+def _counted(total, limit, n):
+    return n + (ONE if total < limit else ZERO)
+
+
+@njit_reassoc
+def _n_below(work, size):
+    n = ZERO
+    for j in range(size):
+        i = np.uint64(j)
+        n += ONE if work[i + _TOTAL] < work[i + _HIGH] else ZERO
+    return n
+
+
+@njit_internal
+def add_upwards(work, size):
+    """Add terms until the sums of all members have passed what is sought."""
+    first = ZERO
+    while first < _MOST:
+        _add_four(work, first, size)
+        if _n_below(work, size) == ZERO:
+            break
+        first += FOUR
+
+
+@inlined
+def found(work, i):
+    """The quantile of member i, or `UNDECIDED`."""
+    n, other = work[i + _N_LOW], work[i + _N_HIGH]
+    is_decided = (n == other) & (work[i + _TOTAL] >= work[i + _HIGH])
+    k = np.float64(n)
+    return k if is_decided else UNDECIDED
+
+
+@njit_internal
+def small_quantile(z, first, a, b):
+    """The quantile, or `UNDECIDED`, for a single number in double precision."""
+    sought = normal_probability(z)
+    term, total, before, k = first, first, 0.0, 0.0
+    while total < sought and k < 60.0:
+        term *= (a - k * b) / (k + 1.0)
+        before, total = total, total + term
+        k += 1.0
+    is_decided = before < sought - _SCALAR_ERROR and total > sought + _SCALAR_ERROR
+    return k if is_decided else UNDECIDED

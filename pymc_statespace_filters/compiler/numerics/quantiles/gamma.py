@@ -283,11 +283,16 @@ def gamma_block(buffer, z, shape, scale, out, size):
             is_medium = (a >= _MEDIUM_FROM) & (a < _LARGE_FROM)
             y = _medium(limited(buffer[z, i]), a if is_medium else _MEDIUM_FROM)
             buffer[out, i] = y if is_medium else other
+    n_undecided = 0
+    for j in range(size):
+        n_undecided += buffer[out, np.uint64(j)] == _UNDECIDED
+    if n_undecided > 0:
+        for j in range(size):
+            i = np.uint64(j)
+            if buffer[out, i] == _UNDECIDED and _valid(buffer[z, i], buffer[shape, i], 0.0):
+                buffer[out, i] = exact_log_gamma(buffer[z, i], buffer[shape, i])
     for j in range(size):
         i = np.uint64(j)
-        if buffer[out, i] == _UNDECIDED and _valid(buffer[z, i], buffer[shape, i], 0.0):
-            buffer[out, i] = exact_log_gamma(buffer[z, i], buffer[shape, i])
-    for j in range(size):
-        i = np.uint64(j)
-        x = buffer[scale, i] * _exp(buffer[out, i])
-        buffer[out, i] = x if _valid(buffer[z, i], buffer[shape, i], buffer[scale, i]) else np.nan
+        s, is_valid = buffer[scale, i], _valid(buffer[z, i], buffer[shape, i], buffer[scale, i])
+        x = s * _exp(buffer[out, i])
+        buffer[out, i] = x if is_valid else np.nan

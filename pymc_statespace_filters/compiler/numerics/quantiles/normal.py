@@ -1,22 +1,8 @@
 """The standard normal distribution function, both tails alike."""
 
-import math
-
 from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.exponential import (
-    EXPONENT_BITS,
-    LN2_HIGH,
-    LN2_LOW,
-    LOG2_E,
-    exp,
-)
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    ROUND,
-    bits_of,
-    float_of,
-    fma,
-    polynomial,
-)
+from pymc_statespace_filters.compiler.numerics.exponential import exp
+from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
 
 FARTHEST = 37.0
 """Standard deviations beyond which a normal counts as if it were there."""
@@ -33,14 +19,6 @@ _RATIO = (
     -0.02640104296630763, 0.010002352385220747, 0.03103036842596369, -0.09155228183400893,
     0.46151582985003775,
 )  # fmt: skip
-# The same in t = (x - 3) / (x + 3), to 2.3e-8.
-_SHORT_RATIO = (
-    6.261944899485827e-05, 3.593166307622856e-05, -0.0004812877560776958,
-    -0.00036574862380308855, 0.002993102136812593, 0.0011643253288702042, -0.02272675503958853,
-    0.04516336581453794, -0.016432321142273568, -0.09652673371584654, 0.4860557934222487,
-)  # fmt: skip
-
-_SHORT_EXP = tuple(1.0 / math.factorial(i) for i in range(7, -1, -1))
 
 
 @inlined
@@ -59,27 +37,6 @@ def tail(x):
     inverse = 1.0 / (one * five)
     ratio = polynomial((x - 5.0) * one * inverse, _RATIO)
     return exp(-0.5 * square) * fma(-0.5 * lost, ratio, ratio) * (five * inverse)
-
-
-@inlined
-def short_tail(x):
-    """Φ(-x) for 0 <= x <= 37, to a relative 5e-8."""
-    one, three = x + 1.0, x + 3.0
-    inverse = 1.0 / (one * three)
-    return (
-        short_exp(-0.5 * x * x)
-        * polynomial((x - 3.0) * one * inverse, _SHORT_RATIO)
-        * (three * inverse)
-    )
-
-
-@inlined
-def short_exp(x):
-    """exp(x) for -700 <= x <= 0, to a relative 1e-8."""
-    shifted = fma(x, LOG2_E, ROUND)
-    k = shifted - ROUND
-    r = fma(-k, LN2_LOW, fma(-k, LN2_HIGH, x))
-    return float_of(bits_of(polynomial(r, _SHORT_EXP)) + (bits_of(shifted) << EXPONENT_BITS))
 
 
 @inlined

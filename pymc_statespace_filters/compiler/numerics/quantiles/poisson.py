@@ -13,9 +13,12 @@ from pymc_statespace_filters.compiler.numerics.exponential import exp
 from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
     SMALL,
-    TINY,
     UNDECIDED,
-    bottom_up_poisson,
+    add_upwards,
+    found,
+    rows,
+    small_quantile,
+    start,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
 from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
@@ -25,9 +28,9 @@ from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
     stirling_error,
 )
 from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
+from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import ZERO
 
 _LARGE = 1e6
-_small_poisson, _tiny_poisson = bottom_up_poisson(SMALL), bottom_up_poisson(TINY)
 
 
 @inlined
@@ -93,36 +96,49 @@ def poisson_quantile(z, mean):
     if not _valid(z, mean):
         return np.nan
     z = limited(z)
-    k = _small_poisson(z, mean) if mean < SMALL else _large_poisson(z, mean)
+    if mean < SMALL:
+        k = small_quantile(z, exp(-mean), mean, 0.0)
+    else:
+        k = _large_poisson(z, mean)
     return exact_poisson(z, mean) if k == UNDECIDED else k
+
+
+@njit_internal
+def _small_block(buffer, z, mean, out, size):
+    work = rows()
+    for j in range(size):
+        i = np.uint64(j)
+        m = buffer[mean, i]
+        m = np.float32(m if m < SMALL else SMALL)
+        start(work, i, np.float32(buffer[z, i]), -m, m, ZERO)
+    add_upwards(work, size)
+    for j in range(size):
+        i = np.uint64(j)
+        m, other, k = buffer[mean, i], buffer[out, i], found(work, i)
+        buffer[out, i] = k if m < SMALL else other
 
 
 @njit_internal
 def poisson_block(buffer, z, mean, out, size):
     """The quantiles of the rows ``z`` and ``mean`` of a buffer, into its row ``out``."""
-    n_large = n_tiny = 0
+    n_large = n_undecided = 0
     for j in range(size):
         n_large += buffer[mean, np.uint64(j)] >= SMALL
-        n_tiny += buffer[mean, np.uint64(j)] < TINY
     if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
             m = buffer[mean, i]
             buffer[out, i] = _large_poisson(limited(buffer[z, i]), m if m > SMALL else SMALL)
-    if n_tiny == size:
-        for j in range(size):
-            i = np.uint64(j)
-            buffer[out, i] = _tiny_poisson(limited(buffer[z, i]), buffer[mean, i])
-    elif n_large < size:
-        for j in range(size):
-            i = np.uint64(j)
-            m, other = buffer[mean, i], buffer[out, i]
-            k = _small_poisson(limited(buffer[z, i]), m if m < SMALL else SMALL)
-            buffer[out, i] = k if m < SMALL else other
+    if n_large < size:
+        _small_block(buffer, z, mean, out, size)
     for j in range(size):
         i = np.uint64(j)
-        buffer[out, i] = buffer[out, i] if _valid(buffer[z, i], buffer[mean, i]) else np.nan
-    for j in range(size):
-        i = np.uint64(j)
-        if buffer[out, i] == UNDECIDED:
-            buffer[out, i] = exact_poisson(buffer[z, i], buffer[mean, i])
+        k, is_valid = buffer[out, i], _valid(buffer[z, i], buffer[mean, i])
+        k = k if is_valid else np.nan
+        n_undecided += k == UNDECIDED
+        buffer[out, i] = k
+    if n_undecided > 0:
+        for j in range(size):
+            i = np.uint64(j)
+            if buffer[out, i] == UNDECIDED:
+                buffer[out, i] = exact_poisson(buffer[z, i], buffer[mean, i])
