@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import pymc as pm
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
@@ -17,6 +18,7 @@ from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.filters.recommendation import collapse_remedy, quiet_filter, short_form
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
+from pymc_statespace_filters.system.panel import RECORD
 
 
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:
@@ -32,6 +34,19 @@ def panel_variables(model: pm.Model) -> list[str]:
     """The names of the StateSpace variables that hold several records."""
     nodes = state_space_nodes(model)
     return [name for name, node in nodes.items() if isinstance(node.op, PanelRV)]
+
+
+def scored_rows(node: Any) -> Any:
+    """An index of the rows of an observed variable that have a term in the log-density."""
+    score_from = getattr(node.op, "score_from", 0)
+    if not score_from:
+        return ...
+    if not isinstance(node.op, PanelRV):
+        return slice(score_from, None)
+    codes = node.inputs[-4].eval(mode="FAST_COMPILE")[:, RECORD]
+    # A row counts if the row so many rows before it belongs to the same record.
+    before = np.zeros(min(score_from, codes.size), dtype=bool)
+    return np.concatenate([before, codes[score_from:] == codes[:-score_from]])
 
 
 def likelihood_nodes(graphs: Sequence[Variable]) -> list[Any]:

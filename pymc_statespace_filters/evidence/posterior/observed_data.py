@@ -1,27 +1,31 @@
 """The observed data of a model: number of observations and fingerprint."""
 
 import hashlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
+from pymc_statespace_filters.pymc_model.inspection import scored_rows
+
 
 class _Observed(NamedTuple):
     """Observed values of a variable, and whether an observation is a vector (the last axis).
 
-    Rows before ``score_from`` have no term in the log-density.
+    The first ``score_from`` rows, of each record in a panel, have no term in the log-density;
+    ``is_scored`` are the others.
     """
 
     values: NDArray[np.float64]
     is_vector: bool
     score_from: int
+    is_scored: Any
 
     @property
     def scored(self) -> NDArray[np.float64]:
         """The values that have a term."""
-        return self.values[self.score_from :] if self.score_from else self.values
+        return self.values[self.is_scored]
 
 
 def _observed(model: pm.Model) -> list[_Observed]:
@@ -31,6 +35,7 @@ def _observed(model: pm.Model) -> list[_Observed]:
             np.asarray(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"), dtype=np.float64),
             getattr(rv.owner.op, "ndim_supp", 0) > 0,
             getattr(rv.owner.op, "score_from", 0),
+            scored_rows(rv.owner),
         )
         for rv in model.observed_RVs
     ]
