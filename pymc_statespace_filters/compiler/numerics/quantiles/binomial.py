@@ -9,10 +9,12 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp, log1p
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial, sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    RARE,
     SMALL,
     UNDECIDED,
     add_upwards,
     found,
+    is_surely_zero,
     rows,
     small_quantile,
     start,
@@ -152,19 +154,34 @@ def _small_block(buffer, z, n, p, out, size):
 
 
 @njit_internal
-def binomial_block(buffer, z, n, p, out, size):
-    """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
-    n_large = n_undecided = 0
+def _rare_block(buffer, z, n, p, out, size):
     for j in range(size):
         i = np.uint64(j)
-        n_large += buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i]) >= SMALL
+        trials = buffer[n, i]
+        rarer_z, rarer_p, flipped = _rarer(buffer[z, i], buffer[p, i])
+        is_zero = is_surely_zero(np.float32(rarer_z), np.float32(trials * rarer_p))
+        k = trials if flipped else 0.0
+        buffer[out, i] = k if is_zero else UNDECIDED
+
+
+@njit_internal
+def binomial_block(buffer, z, n, p, out, size):
+    """The quantiles of the rows ``z``, ``n`` and ``p`` of a buffer, into its row ``out``."""
+    n_large = n_rare = n_undecided = 0
+    for j in range(size):
+        i = np.uint64(j)
+        mean = buffer[n, i] * min(buffer[p, i], 1.0 - buffer[p, i])
+        n_large += mean >= SMALL
+        n_rare += mean < RARE
     if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
             rarer_z, rarer_p, flipped = _rarer(limited(buffer[z, i]), buffer[p, i])
             k = _large_binomial(rarer_z, buffer[n, i], rarer_p)
             buffer[out, i] = buffer[n, i] - k if flipped & (k != UNDECIDED) else k
-    if n_large < size:
+    if n_rare == size:
+        _rare_block(buffer, z, n, p, out, size)
+    elif n_large < size:
         _small_block(buffer, z, n, p, out, size)
     for j in range(size):
         i = np.uint64(j)
@@ -176,7 +193,7 @@ def binomial_block(buffer, z, n, p, out, size):
         for j in range(size):
             i = np.uint64(j)
             if buffer[out, i] == UNDECIDED:
-                buffer[out, i] = exact_binomial(buffer[z, i], buffer[n, i], buffer[p, i])
+                buffer[out, i] = binomial_quantile(buffer[z, i], buffer[n, i], buffer[p, i])
 
 
 @inlined

@@ -29,6 +29,9 @@ from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import
 SMALL = 8.0
 """Means below are small."""
 
+RARE = 0.0625
+"""Where all means of a block are below, its few counts above zero are found one by one."""
+
 UNDECIDED = -1.0
 
 _MOST = np.float32(20.0)  # one in 4000 draws of the largest mean is above
@@ -125,6 +128,12 @@ def found(work, i):
     is_decided = (n == other) & (work[i + _TOTAL] >= work[i + _HIGH])
     k = np.float64(n)
     return k if is_decided else UNDECIDED
+
+
+@inlined
+def is_surely_zero(z, mean):
+    """Whether the count is zero because the mean, which no P(N > 0) exceeds, is below Φ(-z)."""
+    return single_normal_probability(-z) > mean + _ERROR
 
 
 @njit_internal

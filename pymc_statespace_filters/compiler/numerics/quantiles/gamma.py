@@ -87,7 +87,7 @@ _first_order, _orders = in_variables(LARGE[0], 1), in_variables(LARGE[1:], 2)
 def _large(z, a):
     """log(x), or `_UNDECIDED`, for a >= 8."""
     s, inverse = z / sqrt(a), 1.0 / a
-    y = log(a) + (s * _first_order(s) + inverse * _orders(inverse, s))
+    y = normal_log(a) + (s * _first_order(s) + inverse * _orders(inverse, s))
     return y if abs(s) < _STEEPEST else _UNDECIDED
 
 

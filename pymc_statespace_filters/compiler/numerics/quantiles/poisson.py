@@ -12,10 +12,12 @@ from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
 from pymc_statespace_filters.compiler.numerics.exponential import exp
 from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
 from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+    RARE,
     SMALL,
     UNDECIDED,
     add_upwards,
     found,
+    is_surely_zero,
     rows,
     small_quantile,
     start,
@@ -119,17 +121,28 @@ def _small_block(buffer, z, mean, out, size):
 
 
 @njit_internal
+def _rare_block(buffer, z, mean, out, size):
+    for j in range(size):
+        i = np.uint64(j)
+        is_zero = is_surely_zero(np.float32(buffer[z, i]), np.float32(buffer[mean, i]))
+        buffer[out, i] = 0.0 if is_zero else UNDECIDED
+
+
+@njit_internal
 def poisson_block(buffer, z, mean, out, size):
     """The quantiles of the rows ``z`` and ``mean`` of a buffer, into its row ``out``."""
-    n_large = n_undecided = 0
+    n_large = n_rare = n_undecided = 0
     for j in range(size):
         n_large += buffer[mean, np.uint64(j)] >= SMALL
+        n_rare += buffer[mean, np.uint64(j)] < RARE
     if n_large > 0:
         for j in range(size):
             i = np.uint64(j)
             m = buffer[mean, i]
             buffer[out, i] = _large_poisson(limited(buffer[z, i]), m if m > SMALL else SMALL)
-    if n_large < size:
+    if n_rare == size:
+        _rare_block(buffer, z, mean, out, size)
+    elif n_large < size:
         _small_block(buffer, z, mean, out, size)
     for j in range(size):
         i = np.uint64(j)
@@ -141,4 +154,4 @@ def poisson_block(buffer, z, mean, out, size):
         for j in range(size):
             i = np.uint64(j)
             if buffer[out, i] == UNDECIDED:
-                buffer[out, i] = exact_poisson(buffer[z, i], buffer[mean, i])
+                buffer[out, i] = poisson_quantile(buffer[z, i], buffer[mean, i])
