@@ -18,6 +18,7 @@ from pymc_statespace_filters.sampling.run import model_task
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from pymc_statespace_filters.sampling.target import target
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 
@@ -68,7 +69,7 @@ def test_a_cost_is_measured_on_arrays_that_live(models):
     task.prepare().density.bind = watched
     alive = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model_task, "evaluate", lambda density: alive.append(seen[-1]() is not None))
+        patch.setattr(target, "evaluate", lambda density: alive.append(seen[-1]() is not None))
         assert task.cost() > 0.0
     assert alive == [True] * 3
 

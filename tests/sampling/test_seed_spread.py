@@ -52,9 +52,9 @@ def test_interval_covers(draw):
 
 
 def test_estimates_without_spread_or_in_too_small_number():
-    assert spread_of(np.full(5, -2.0)) == (5, -2.0, 0.0, 0.0, 0.0, 0)
-    assert spread_of(np.array([-2.0, -3.0, -np.inf])) == (2, -np.inf, np.inf, 0.0, np.inf, 1)
-    assert spread_of(np.array([-2.0, -2.0, -2.0, -9.0]))[3:] == (0.0, np.inf, 0)
+    assert spread_of(np.full(5, -2.0)) == (5, -2.0, 0.0, 0.0, 0.0, 0, "")
+    assert spread_of(np.array([-2.0, -3.0, -np.inf])) == (2, -np.inf, np.inf, 0.0, np.inf, 1, "")
+    assert spread_of(np.array([-2.0, -2.0, -2.0, -9.0]))[3:] == (0.0, np.inf, 0, "")
 
 
 def test_each_row_of_seeds_is_one_evaluation():
