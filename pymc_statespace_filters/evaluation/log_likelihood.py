@@ -17,7 +17,8 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.panel import PanelLogLikelihood, single_records
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import CheckedPanel, checked_panel, panel_parameters
+from pymc_statespace_filters.system.panel import CheckedPanel, checked_panel
+from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_seed, checked_record
 

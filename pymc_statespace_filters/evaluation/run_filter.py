@@ -14,7 +14,8 @@ from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
 from pymc_statespace_filters.ops.panel import single_records
 from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import checked_panel, panel_parameters, row_coords
+from pymc_statespace_filters.system.panel import checked_panel, row_coords
+from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_at, check_seed, checked_record, rows_at
 

@@ -22,7 +22,8 @@ from pymc_statespace_filters.ops.panel import generators_of_records, single_reco
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import checked_panel, panel_parameters, row_coords
+from pymc_statespace_filters.system.panel import checked_panel, row_coords
+from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_inputs, check_system, steps_of
 

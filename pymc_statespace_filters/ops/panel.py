@@ -21,6 +21,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSy
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.protocol import PanelFilter
+from pymc_statespace_filters.filters.records import end_of_record, include_health, single_record
 from pymc_statespace_filters.ops.base import RECORD_INPUTS
 from pymc_statespace_filters.ops.likelihood import (
     LogLikelihood,
@@ -113,15 +114,6 @@ def _vectorize(op: PanelLogLikelihood, node: Apply, *inputs: Variable) -> list[V
 
 
 @jit
-def end_of_record(rows, first):
-    """The row behind the record that begins in row ``first``."""
-    last = first + 1
-    while last < rows.shape[0] and rows[last, RECORD] == rows[first, RECORD]:
-        last += 1
-    return last
-
-
-@jit
 def seed_of_record(seed, code):
     """The seed of a record's noise; that of the record with the code 0 is ``seed`` itself.
 
@@ -157,14 +149,6 @@ def generators_of_records(rng: np.random.Generator, codes: np.ndarray) -> list[n
     return [np.random.default_rng(seed_of_record(seed, code)) for code in codes]
 
 
-@jit
-def worst_health(health, of_record, first):
-    """Include the health of a record whose first row is ``first`` in that of its panel."""
-    health[0] = min(health[0], of_record[0])
-    if health[1] == NONE and of_record[1] != NONE:
-        health[1], health[2] = of_record[1], first + of_record[2]
-
-
 def _one_by_one(value: CompiledFunction) -> CompiledFunction:
     run = value.function
 
@@ -176,14 +160,11 @@ def _one_by_one(value: CompiledFunction) -> CompiledFunction:
         for record in range(theta.shape[0]):
             last = end_of_record(rows, first)
             terms[first:last], of_record = run(
-                theta[record].copy(),
-                rows[first:last, STEP].copy(),
-                observed[first:last],
-                inputs[rows[first, FIRST_INPUT] :],
+                *single_record(theta, rows, observed, inputs, record, first, last),
                 t0,
                 (seed_of_record(seed, rows[first, RECORD]), normals),
             )
-            worst_health(health, of_record, first)
+            include_health(health, of_record, first)
             first = last
         return terms, health
 
@@ -199,10 +180,7 @@ def _gradients_one_by_one(gradient: CompiledFunction) -> CompiledFunction:
         for record in range(theta.shape[0]):
             last = end_of_record(rows, first)
             theta_bar[record] = run(
-                theta[record].copy(),
-                rows[first:last, STEP].copy(),
-                observed[first:last],
-                inputs[rows[first, FIRST_INPUT] :],
+                *single_record(theta, rows, observed, inputs, record, first, last),
                 t0,
                 seed,
                 terms_bar[first:last],

@@ -16,10 +16,11 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import simulator
+from pymc_statespace_filters.filters.records import end_of_record, single_record
 from pymc_statespace_filters.ops.base import cache_key, check_panel, check_record
 from pymc_statespace_filters.ops.batch import vectorized
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.panel import PANEL_INPUTS, PanelLogLikelihood, end_of_record
+from pymc_statespace_filters.ops.panel import PANEL_INPUTS, PanelLogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import (
     PanelRV,
     StateSpaceRV,
@@ -88,8 +89,10 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
         first = 0
         for record in range(theta.shape[0]):
             last = end_of_record(rows, first)
-            steps, own = rows[first:last, STEP].copy(), forces[rows[first, FIRST_INPUT] :]
-            _, observations[first:last] = simulate(rng, theta[record].copy(), steps, own, t0)
+            own, steps, _, pushes = single_record(
+                theta, rows, observations, forces, record, first, last
+            )
+            _, observations[first:last] = simulate(rng, own, steps, pushes, t0)
             first = last
         return observations
 

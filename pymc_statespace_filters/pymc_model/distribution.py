@@ -23,8 +23,8 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import (
     SymbolicPanel,
     symbolic_panel,
-    symbolic_panel_parameters,
 )
+from pymc_statespace_filters.system.panel_parameters import symbolic_panel_parameters
 from pymc_statespace_filters.system.parameters import check_names, symbolic_parameters
 from pymc_statespace_filters.system.record import check_seed, symbolic_record
 

@@ -17,13 +17,11 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
-from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import check_finite, is_integer, shortened
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.parameters import check_complete, check_names, numbers
 from pymc_statespace_filters.system.record import (
     check_inputs,
     check_observed,
@@ -36,10 +34,6 @@ from pymc_statespace_filters.system.record import (
 RECORD, STEP, FIRST_INPUT = range(3)
 N_COLUMNS = 3
 
-_OTHER_NUMBER = (
-    "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
-    "records, change the parameter's dimension too"
-)
 # What comes before the messages of a single record's checks.
 _IN = "record {label!r}, whose first row is {first}: "
 
@@ -348,58 +342,3 @@ def _two_dimensional(inputs: Any, system: StateSpaceModel) -> TensorVariable:
     if not system.n_inputs or symbol.type.ndim != 2:
         raise inputs_of_other_shape(system, symbol.type)
     return symbol
-
-
-def panel_parameters(
-    system: StateSpaceModel, params: Mapping[str, Any], records: Records
-) -> np.ndarray:
-    """Parameter values (G, k): each shared, or with a leading dimension of records."""
-    check_names(system, params)
-    values = dict(system.defaults) | dict(params)
-    check_complete(system, values)
-    n_records, parts = len(records.labels), [np.zeros((len(records.labels), 0))]
-    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        part = numbers(name, values[name])
-        _check_shape(name, shape, part.shape, n_records)
-        whole = np.broadcast_to(part, (n_records, *shape))
-        parts.append(whole.reshape(n_records, -1))
-    return np.concatenate(parts, axis=1)
-
-
-def symbolic_panel_parameters(
-    system: StateSpaceModel,
-    values: Mapping[str, Any],
-    panel: SymbolicPanel,
-    others: Sequence[str],
-) -> TensorVariable:
-    """Parameter values, numbers or symbols, as a symbolic matrix (G, k)."""
-    check_complete(system, values, f"the model's variables are {sorted(others)}")
-    n_records = len(panel.records.labels)
-    parts: list[Any] = [np.zeros((n_records, 0))] if not system.parameters else []
-    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        value = values[name]
-        symbol = pt.as_tensor(value if isinstance(value, Variable) else numbers(name, value))
-        _check_shape(name, shape, symbol.type.shape, n_records)
-        size = int(np.prod(shape, dtype=int))
-        if symbol.type.ndim == len(shape):
-            part = pt.broadcast_to(symbol.reshape((1, size)), (panel.n_records, size))
-        else:
-            part = symbol.reshape((symbol.shape[0], size))
-            if isinstance(panel.n_records, Variable):
-                fits = pt.eq(symbol.shape[0], panel.n_records)
-                part = CheckAndRaise(ModelError, _OTHER_NUMBER.format(name=name))(part, fits)
-        parts.append(pt.cast(part, "float64"))
-    return pt.specify_shape(pt.concatenate(parts, axis=1), (None, system.n_theta))
-
-
-def _check_shape(name: str, shape: tuple[int, ...], found: tuple, n_records: int) -> None:
-    """Raise unless the shape is that of a shared parameter or one of each record."""
-    own = (n_records, *shape)
-    expected = shape if len(found) == len(shape) else own
-    if len(found) != len(expected) or any(
-        n is not None and n != m for n, m in zip(found, expected, strict=True)
-    ):
-        raise ModelError(
-            f"parameter {name!r} must have shape {shape} (one value for all records) or {own} (one "
-            f"for each of the {n_records} records), got {tuple(found)}"
-        )

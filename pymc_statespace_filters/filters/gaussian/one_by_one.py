@@ -11,7 +11,8 @@ from pymc_statespace_filters.filters.gaussian.recursion import (
     compile_value,
 )
 from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+from pymc_statespace_filters.filters.records import end_of_record, include_health, single_record
+from pymc_statespace_filters.system.panel import RECORD, STEP
 
 
 def compile_batch(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -37,16 +38,13 @@ def compile_panel(recursion: GaussianFilterFunctions) -> CompiledFunction:
         terms, health = np.empty(rows.shape[0]), np.array([np.inf, float(NONE), -1.0])
         last = 0
         for record in range(theta.shape[0]):
-            first, last = last, _end_of_record(rows, last)
+            first, last = last, end_of_record(rows, last)
             terms[first:last], of_record = run(
-                theta[record].copy(),
-                rows[first:last, STEP].copy(),
-                observed[first:last],
-                inputs[rows[first, FIRST_INPUT] :],
+                *single_record(theta, rows, observed, inputs, record, first, last),
                 t0,
                 seed,
             )
-            _include(health, of_record, first)
+            include_health(health, of_record, first)
         return terms, health
 
     return _compiled(panel, "panel one by one", value)
@@ -62,16 +60,13 @@ def compile_panel_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
         tape = np.empty((_n_taped(rows, 0, rows.shape[0]), size))
         last, end = 0, 0
         for record in range(theta.shape[0]):
-            first, last = last, _end_of_record(rows, last)
+            first, last = last, end_of_record(rows, last)
             terms[first:last], of_record, own = run(
-                theta[record].copy(),
-                rows[first:last, STEP].copy(),
-                observed[first:last],
-                inputs[rows[first, FIRST_INPUT] :],
+                *single_record(theta, rows, observed, inputs, record, first, last),
                 t0,
                 seed,
             )
-            _include(health, of_record, first)
+            include_health(health, of_record, first)
             tape[end : end + own.shape[0]] = own
             end += own.shape[0]
         return terms, health, tape[: end if health[1] == NONE else 0]
@@ -90,13 +85,10 @@ def compile_panel_pullback(recursion: GaussianFilterFunctions) -> CompiledFuncti
             return theta_bar
         last, end = 0, 0
         for record in range(theta.shape[0]):
-            first, last = last, _end_of_record(rows, last)
+            first, last = last, end_of_record(rows, last)
             begin, end = end, end + _n_taped(rows, first, last)
             theta_bar[record] = run(
-                theta[record].copy(),
-                rows[first:last, STEP].copy(),
-                observed[first:last],
-                inputs[rows[first, FIRST_INPUT] :],
+                *single_record(theta, rows, observed, inputs, record, first, last),
                 t0,
                 seed,
                 tape[begin:end],
@@ -108,15 +100,6 @@ def compile_panel_pullback(recursion: GaussianFilterFunctions) -> CompiledFuncti
 
 
 @jit
-def _end_of_record(rows, first):
-    """The row behind the record that begins in row ``first``."""
-    last = first + 1
-    while last < rows.shape[0] and rows[last, RECORD] == rows[first, RECORD]:
-        last += 1
-    return last
-
-
-@jit
 def _n_taped(rows, first, last):
     """The rows of the tapes of whole records: one for each of their steps and rows."""
     total = last - first
@@ -124,13 +107,6 @@ def _n_taped(rows, first, last):
         if row + 1 == last or rows[row + 1, RECORD] != rows[row, RECORD]:
             total += rows[row, STEP]
     return total
-
-
-@jit
-def _include(health, of_record, first):
-    """Keep the health of the first record that fails; its rows begin with ``first``."""
-    if health[1] == NONE and of_record[1] != NONE:
-        health[1], health[2] = of_record[1], first + of_record[2]
 
 
 def _compiled(function, what: str, part: CompiledFunction) -> CompiledFunction:

@@ -1,0 +1,33 @@
+"""The records of a panel one after the other in compiled loops; rows as in `system.panel`."""
+
+from pymc_statespace_filters.compiler.codegen.function_types import jit
+from pymc_statespace_filters.filters.outcomes import NONE
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+
+
+@jit
+def end_of_record(rows, first):
+    """The row behind the record that begins in row ``first``."""
+    last = first + 1
+    while last < rows.shape[0] and rows[last, RECORD] == rows[first, RECORD]:
+        last += 1
+    return last
+
+
+@jit
+def single_record(theta, rows, observed, inputs, record, first, last):
+    """Parameters, steps, data and inputs of the record in these rows, as a single one has them."""
+    return (
+        theta[record].copy(),
+        rows[first:last, STEP].copy(),
+        observed[first:last],
+        inputs[rows[first, FIRST_INPUT] :],
+    )
+
+
+@jit
+def include_health(health, of_record, first):
+    """Include the health of a record whose first row is ``first`` in that of its panel."""
+    health[0] = min(health[0], of_record[0])
+    if health[1] == NONE and of_record[1] != NONE:
+        health[1], health[2] = of_record[1], first + of_record[2]
