@@ -23,6 +23,7 @@ DATA = np.array([[0.1], [np.nan], [0.8], [-0.4], [0.9], [0.2]])
 A = np.array([0.9, -0.3, 0.5])
 RECORDS = records_of(LABELS)
 PARTICLES = psf.BootstrapPF(64)
+OWN_FORCES = {"a": FORCE[::-1].copy(), "b": FORCE, "c": 2 * FORCE}
 
 
 def model_of(filter=None, panel=LABELS, steps=STEPS, observed=DATA, own=3, **options):
@@ -70,7 +71,7 @@ def test_the_gradient_is_that_of_the_sum_for_own_and_for_shared_parameters():
 
 
 def test_each_record_has_the_noise_of_its_label():
-    terms = terms_of(model_of(PARTICLES, seed=3))
+    terms = terms_of(model_of(PARTICLES, seed=3, inputs=OWN_FORCES))
     for g, rows in enumerate(RECORDS.slices()):
         alone = psf.log_likelihood(
             FORCED,
@@ -78,7 +79,7 @@ def test_each_record_has_the_noise_of_its_label():
             {"a": A[g]},
             DATA[rows],
             steps=STEPS[rows],
-            inputs=FORCE,
+            inputs=OWN_FORCES[RECORDS.labels[g]],
             seed=int(seed_of_record(3, RECORDS.codes[g])),
         )
         np.testing.assert_array_equal(terms[rows], alone)
@@ -108,15 +109,14 @@ def test_the_noise_of_neighbouring_labels_and_seeds_differs():
 
 
 def test_own_inputs_are_those_of_the_record():
-    forces = {"a": FORCE[::-1].copy(), "b": FORCE, "c": 2 * FORCE}
     expected = np.concatenate(
         [
-            forced_terms(A[g], DATA[rows], STEPS[rows], forces[label])
+            forced_terms(A[g], DATA[rows], STEPS[rows], OWN_FORCES[label])
             for g, (label, rows) in enumerate(zip(RECORDS.labels, RECORDS.slices(), strict=True))
         ]
     )
-    np.testing.assert_allclose(terms_of(model_of(inputs=forces)), expected, rtol=1e-12)
-    shared = {label: pt.as_tensor(force) for label, force in forces.items()}
+    np.testing.assert_allclose(terms_of(model_of(inputs=OWN_FORCES)), expected, rtol=1e-12)
+    shared = {label: pt.as_tensor(force) for label, force in OWN_FORCES.items()}
     np.testing.assert_allclose(terms_of(model_of(inputs=shared)), expected, rtol=1e-12)
 
 
@@ -132,11 +132,13 @@ def test_the_first_rows_of_every_record_are_not_scored():
 
 
 def test_draws_are_simulations_of_each_record():
-    model = model_of(observed=None)
+    model = model_of(observed=None, inputs=OWN_FORCES)
     steady = pm.do(model, {"a": np.array([0.0, 0.5, 0.9])})
     draws = pm.draw(steady["d"], draws=4000, random_seed=1)[:, :, 0]
     # Without memory the state is the last force plus noise; sensor and process noise add up.
     np.testing.assert_allclose(draws[:, 1].mean(), FORCE[1], atol=0.08)  # 4 s.e.
+    recursion = 0.25 * FORCE[5] + 0.5 * FORCE[4] + FORCE[3]  # of record a: its forces are reversed
+    np.testing.assert_allclose(draws[:, 3].mean(), recursion, atol=0.09)
     np.testing.assert_allclose(draws[:, 1].var(), 1.5, atol=0.14)
     assert abs(np.corrcoef(draws[:, 4], draws[:, 5])[0, 1]) > 0.3
     assert abs(np.corrcoef(draws[:, 2], draws[:, 5])[0, 1]) < 0.07
@@ -236,6 +238,6 @@ def test_steps_half_as_long_are_those_of_every_record():
 
 
 def test_draws_are_the_same_in_every_mode():
-    variable = model_of(observed=None)["d"]
+    variable = model_of(observed=None, inputs=OWN_FORCES)["d"]
     draws = [pm.draw(variable, 2, random_seed=3, mode=mode) for mode in (None, "FAST_COMPILE")]
     np.testing.assert_array_equal(*draws)
