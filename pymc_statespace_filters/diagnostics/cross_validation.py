@@ -155,6 +155,11 @@ def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
     if len(variables) > 1:
         names = [variable.name for variable in variables]
         raise ModelError(f"var_name must be one of {names}, got None")
+    if variables[0].is_panel:
+        raise ModelError(
+            f"the panel {variables[0].name!r} has no common future to leave out: leave out records,"
+            " by az.loo after compute_log_likelihood"
+        )
     return variables[0]
 
 

@@ -1,11 +1,10 @@
 """Filter diagnostics: one-step-ahead predictions compared with the observations."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from pymc_statespace_filters.diagnostics.calibration import (
     coverage_of,
@@ -25,24 +24,21 @@ from pymc_statespace_filters.diagnostics.predictions import (
     calibration_of,
     laws_of,
 )
-from pymc_statespace_filters.diagnostics.truncated_data import observed_values
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.filters.protocol import HealthFilter
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
-from pymc_statespace_filters.states.groups import add_group
-from pymc_statespace_filters.states.variable import (
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import add_group, by_record, join_rows, row_coords
+from pymc_statespace_filters.states.record import (
+    Array,
+    RecordAtDraws,
     States,
     TermHealthAtDraws,
-    VariableAtDraws,
-    select_variables,
     simulate_observations,
 )
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.accumulators import inputs_of_user
 from pymc_statespace_filters.system.checks import check_random_seed
-
-Array = NDArray[np.float64]
 
 PROBS = (0.5, 0.9)  # of the prediction intervals
 PREDICTION_NOTE = (
@@ -165,109 +161,126 @@ def filter_diagnostics(
     parts = []
     for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
-        before = at_draws.states("predicted", at_draws.steps, rng, progressbar=progressbar)
-        health = _term_health(at_draws, before, rng, progressbar)
-        predicted = simulate_observations(
-            at_draws, before.drawn, at_draws.steps, at_draws.inputs(), rng
-        )
-        observed = observed_values(model, variable.name)
-        observed[: variable.score_from] = np.nan
-        laws = laws_of(at_draws, observed, before)
-        if laws is None:
-            calibration = calibration_by_rank(predicted, observed, rng)
-        else:
-            calibration = calibration_of(laws, observed)
-        part = _results_by_draw(variable, draws, at_draws, predicted, health)
-        part = part.merge(_results_by_time(variable, calibration))
-        parts.append(part.merge(_innovations(at_draws, observed, calibration)))
-        arguments_of = at_draws.arguments_of(health.seeds)
-        warn_about(variable.system, variable.filter, health.health, arguments_of)
+        records = zip(at_draws.records, at_draws.generators(rng), strict=True)
+        with at_draws.progress("predictions", enabled=progressbar, n_tasks=3):
+            found = [_of_record(record, own) for record, own in records]
+        part = _results_by_draw(at_draws, found)
+        observed = [one.record.scored for one in found]
+        part = part.merge(_results_by_row(variable, [one.calibration for one in found], observed))
+        part = part.merge(by_record(at_draws, [_results_by_record(one) for one in found]))
+        parts.append(part)
+        healths = [one.health for one in found]
+        at_draws.warn_about([one.health for one in healths], [one.seeds for one in healths])
     attrs = {"predictions": PREDICTION_NOTE}
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 
+class _Found(NamedTuple):
+    """What the predictions of a record say."""
+
+    record: RecordAtDraws
+    health: TermHealthAtDraws
+    predicted: Array
+    calibration: Calibration
+
+
+def _of_record(record: RecordAtDraws, rng: np.random.Generator) -> _Found:
+    before = record.states("predicted", record.steps, rng)
+    health = _term_health(record, before, rng)
+    predicted = simulate_observations(record, before.drawn, record.steps, record.inputs, rng)
+    laws = laws_of(record, before)
+    if laws is None:
+        calibration = calibration_by_rank(predicted, record.scored, rng)
+    else:
+        calibration = calibration_of(laws, record.scored)
+    return _Found(record, health, predicted, calibration)
+
+
 def _term_health(
-    at_draws: VariableAtDraws, before: States, rng: np.random.Generator, progressbar: bool
+    record: RecordAtDraws, before: States, rng: np.random.Generator
 ) -> TermHealthAtDraws:
     """Effective numbers behind the terms; of the filtered states if the filter does not tell."""
-    filter = at_draws.variable.filter
+    filter = record.variable.filter
     if isinstance(filter, HealthFilter):
-        return at_draws.term_health(rng, progressbar=progressbar)
-    states = before
-    if filter.noisy:
-        states = at_draws.states("filtered", at_draws.steps, rng, progressbar=progressbar)
-    return TermHealthAtDraws(states.n_effective, states.health, states.seeds)
+        return record.term_health(rng)
+    states = record.states("filtered", record.steps, rng) if filter.noisy else before
+    return TermHealthAtDraws(states.seeds, states.n_effective, states.health)
 
 
-def _results_by_draw(
-    variable: StateSpaceVariable,
-    draws: PosteriorDraws,
-    at_draws: VariableAtDraws,
-    predicted: Array,
-    health: TermHealthAtDraws,
-) -> xr.Dataset:
-    """Predictions and effective sample sizes of every draw; fractions of failed draws."""
+def _results_by_draw(at_draws: VariableAtDraws, found: list[_Found]) -> xr.Dataset:
+    """Predictions and effective sample sizes of every draw."""
+    variable = at_draws.variable
     name, (time, observable) = variable.name, variable.dims
-    smallest = np.fmin.reduce(health.n_effective, axis=1, initial=np.inf)
-    found = draws.dataset(
+    results = at_draws.draws.dataset(
         {
-            f"{name}_predicted": ((time, observable), predicted),
-            f"{name}_n_effective": ((time,), health.n_effective),
+            f"{name}_predicted": (
+                (time, observable),
+                join_rows([one.predicted for one in found]),
+            ),
+            f"{name}_n_effective": (
+                (time,),
+                join_rows([one.health.n_effective for one in found]),
+            ),
         },
         {
-            time: at_draws.times(at_draws.steps),
+            **row_coords(at_draws, [one.record.steps for one in found]),
             observable: list(variable.system.observables),
         },
     )
-    found[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
-    found[f"{name}_failed"] = np.mean(health.health[:, 1] != 0)
-    found[f"{name}_collapsed"] = np.mean(smallest < COLLAPSED)
-    return found
+    results[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
+    return results
 
 
-def _results_by_time(variable: StateSpaceVariable, calibration: Calibration) -> xr.Dataset:
-    """PIT values and residuals of the observations, their coverage and tests."""
-    name, dims = variable.name, variable.dims
-    pit, residual = calibration.pit, calibration.residual
-    coverage = np.array([coverage_of(pit, prob) for prob in PROBS])
-    uniformity = [uniformity_of(column) for column in pit.T]
-    whiteness = [whiteness_of(column) for column in residual.T]
+def _results_by_row(
+    variable: StateSpaceVariable, calibrations: list[Calibration], observed: list[Array]
+) -> xr.Dataset:
+    """PIT values, residuals and innovations of the observations."""
+    name, (time, observable) = variable.name, variable.dims
+    bis = f"{observable}_bis"
+    rows = Calibration(*map(np.concatenate, zip(*calibrations, strict=True)))
     return xr.Dataset(
         {
-            f"{name}_pit": (dims, pit),
-            f"{name}_residual": (dims, residual),
-            f"{name}_clipped": (dims, calibration.clipped),
-            f"{name}_coverage": (("interval", dims[1]), coverage),
-            f"{name}_uniformity": (dims[1:], uniformity),
-            f"{name}_whiteness": (dims[1:], whiteness),
+            f"{name}_pit": (variable.dims, rows.pit),
+            f"{name}_residual": (variable.dims, rows.residual),
+            f"{name}_clipped": (variable.dims, rows.clipped),
+            f"{name}_innovation": (variable.dims, np.concatenate(observed) - rows.mean),
+            f"{name}_innovation_cov": ((time, observable, bis), rows.cov),
         },
-        coords={"interval": list(PROBS)},
+        coords={bis: list(variable.system.observables)},
     )
 
 
-def _innovations(
-    at_draws: VariableAtDraws, observed: Array, calibration: Calibration
-) -> xr.Dataset:
-    """Innovations, their covariance, and what they correlate with."""
-    variable = at_draws.variable
-    name, (time, observable), system = variable.name, variable.dims, variable.system
-    innovation, bis = observed - calibration.mean, f"{observable}_bis"
-    z, lags = standardised(innovation, calibration.cov), lags_of(len(observed))
-    found = xr.Dataset(
+def _results_by_record(found: _Found) -> xr.Dataset:
+    """What the observations of a record say together: coverage, tests, correlations, failures."""
+    record, calibration = found.record, found.calibration
+    name, (_, observable), system = (
+        record.variable.name, record.variable.dims, record.variable.system
+    )  # fmt: skip
+    pit, residual = calibration.pit, calibration.residual
+    innovation = record.scored - calibration.mean
+    z, lags = standardised(innovation, calibration.cov), lags_of(len(innovation))
+    smallest = np.fmin.reduce(found.health.n_effective, axis=1, initial=np.inf)
+    results = xr.Dataset(
         {
-            f"{name}_innovation": ((time, observable), innovation),
-            f"{name}_innovation_cov": ((time, observable, bis), calibration.cov),
+            f"{name}_coverage": (
+                ("interval", observable),
+                np.array([coverage_of(pit, prob) for prob in PROBS]),
+            ),
+            f"{name}_uniformity": ((observable,), [uniformity_of(column) for column in pit.T]),
+            f"{name}_whiteness": ((observable,), [whiteness_of(column) for column in residual.T]),
             f"{name}_autocorrelation": (("lag", observable), autocorrelation_of(z, lags)),
+            f"{name}_failed": np.mean(found.health.health[:, 1] != 0),
+            f"{name}_collapsed": np.mean(smallest < COLLAPSED),
         },
-        coords={"lag": lags, bis: list(system.observables)},
+        coords={"interval": list(PROBS), "lag": lags, observable: list(system.observables)},
     )
     if not system.n_inputs:
-        return found
+        return results
     # The mean over the draws, where inputs depend on them.
-    given = inputs_of_user(system, at_draws.inputs())
-    inputs = inputs_before(given.mean(axis=0), at_draws.steps)
+    given = inputs_of_user(system, record.inputs)
+    inputs = inputs_before(given.mean(axis=0), record.steps)
     past = np.insert(lags, 0, 0)
-    return found.assign(
+    return results.assign(
         {
             f"{name}_input_correlation": (
                 ("input_lag", "input", observable),

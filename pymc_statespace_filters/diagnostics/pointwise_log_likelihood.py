@@ -2,19 +2,24 @@
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, terms_of
 from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
-from pymc_statespace_filters.states.groups import add_group
+from pymc_statespace_filters.states.groups import add_group, row_coords
+from pymc_statespace_filters.states.record import Array, Graphs
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
     "log p(d_j | d_1 .. d_{j-1}, theta): each term is conditional on all earlier observations. "
     "Leave-one-out cross-validation (az.loo) is invalid with such terms, because later terms "
     "depend on the observation left out; use leave_future_out."
+)
+
+OF_RECORDS = (
+    "log p(record | theta): the sum of the terms of each record of the panel. Leave-one-out "
+    "cross-validation (az.loo) leaves out whole records."
 )
 
 
@@ -33,6 +38,10 @@ def compute_log_likelihood(
     ``az.compare`` of DataTrees, is invalid with them, because the terms of later observations
     depend on the observation that is left out. ArviZ does not warn; ``elpd_i`` of its pointwise
     result has the attribute ``terms``, which says so.
+
+    The terms of a **panel** are summed by record. With these sums ``az.loo`` leaves out whole
+    records, and is valid: records are independent given the parameters. Records with parameters of
+    their own often determine them alone; then the weights are unreliable, and Pareto k says so.
 
     The likelihood by a particle or ensemble filter is an estimate that depends on a noise seed.
     `sample_dram` stores the seed of each draw, and with it the terms add up to the estimate by
@@ -54,7 +63,8 @@ def compute_log_likelihood(
     xarray.DataTree
         With the group ``log_likelihood``: for a variable "d" its terms ``d`` (chain, draw, d_time),
         0 for an observation that is entirely missing or before ``score_from``, -inf from a failure
-        of the filter on. The attribute ``terms`` says that they are sequential.
+        of the filter on. The attribute ``terms`` says that they are sequential. For a panel, the
+        log-likelihood of every record, ``d`` (chain, draw, d_record).
 
     Raises
     ------
@@ -88,7 +98,9 @@ def compute_log_likelihood(
     draws = select_draws(idata, None)
     found = xr.merge(
         [
-            sequential_terms(model, variable, draws, progressbar=progressbar).to_dataset()
+            (_terms_of_records if variable.is_panel else sequential_terms)(
+                model, variable, draws, progressbar=progressbar
+            ).to_dataset()
             for variable in select_variables(model, var_name)
         ]
     )
@@ -105,29 +117,53 @@ def sequential_terms(
     *,
     progressbar: bool = False,
 ) -> xr.DataArray:
-    """The terms (chain, draw, time) of one variable at draws, with the noise of each.
+    """The terms (chain, draw, time) of one variable without a panel, with the noise of each draw.
 
     They are evaluated at the stored, constrained values, so that the estimates of the chain are
     reproduced to the last digit.
     """
-    name, noisy = variable.name, variable.filter.noisy
-    if noisy and draws.noise_moved:
-        raise ModelError(
-            f"the noise of {name!r} was moved along the chain (correlation), so that no seed "
-            "reproduces the estimates of these draws: sample without correlation"
-        )
     at_draws = VariableAtDraws(model, variable, draws)
-    seeds = draws.stored_seeds(name) if noisy else None
+    name, (record,) = variable.name, at_draws.records
+    (terms,) = _terms(at_draws, progressbar)
+    coords = row_coords(at_draws, [record.steps])
+    found = draws.dataset({name: (variable.dims[:1], terms)}, coords)[name]
+    return found.assign_attrs(terms=SEQUENTIAL)
+
+
+def _terms_of_records(
+    model: pm.Model, variable: StateSpaceVariable, draws: PosteriorDraws, *, progressbar: bool
+) -> xr.DataArray:
+    """The log-likelihood (chain, draw, record) of every record of a panel."""
+    at_draws = VariableAtDraws(model, variable, draws)
+    name, dim = variable.name, f"{variable.name}_record"
+    sums = np.stack([terms.sum(axis=1) for terms in _terms(at_draws, progressbar)], axis=1)
+    labels = [record.label for record in at_draws.records]
+    found = draws.dataset({name: ((dim,), sums)}, {dim: labels})[name]
+    return found.assign_attrs(terms=OF_RECORDS)
+
+
+def _terms(at_draws: VariableAtDraws, progressbar: bool) -> list[Array]:
+    """The terms (draws, J) of every record; 0 where they are not scored."""
+    variable = at_draws.variable
+    if variable.filter.noisy and at_draws.draws.noise_moved:
+        raise ModelError(
+            f"the noise of {variable.name!r} was moved along the chain (correlation), so that no "
+            "seed reproduces the estimates of these draws: sample without correlation"
+        )
+    seeds = at_draws.stored_seeds
     if seeds is None:  # use the model's seed; a deterministic filter ignores it
         held = variable.seed.eval(mode="FAST_COMPILE")
-        seeds = np.full(np.prod(draws.shape), held, dtype=np.int64)
-    seed = pt.lscalar("seed")
-    node = model[name].owner
-    with_seed = node.clone_with_new_inputs([*node.inputs[:-1], seed]).default_output()
-    graph = pm.logp(with_seed, variable.observed, warn_rvs=False)
-    (terms,) = at_draws.evaluate(
-        [graph], {seed: seeds}, task=f"terms of {name}", progressbar=progressbar
-    )
-    time = variable.dims[0]
-    found = draws.dataset({name: ((time,), terms)}, {time: at_draws.times(at_draws.steps)})[name]
-    return found.assign_attrs(terms=SEQUENTIAL)
+        seeds = np.full(at_draws.n_draws, held, dtype=np.int64)
+    found = []
+    with at_draws.progress(f"terms of {variable.name}", enabled=progressbar):
+        for record in at_draws.records:
+            evaluated = record.evaluate(_log_likelihood, seeds=record.noise_of(seeds))
+            assert evaluated is not None
+            (terms,) = evaluated
+            terms[:, : variable.score_from] = 0.0
+            found.append(terms)
+    return found
+
+
+def _log_likelihood(variable: StateSpaceVariable) -> Graphs:
+    return Graphs([terms_of(variable)])

@@ -13,9 +13,8 @@ from pymc_statespace_filters.pymc_model.prediction_graphs import (
     gaussian_predictions,
     observations_given,
 )
-from pymc_statespace_filters.states.variable import States, VariableAtDraws
-
-Array = NDArray[np.float64]
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws, States
 
 # Fewer draws than this behind the probability of a tail, and one of them decides it.
 _LEAST_DRAWS = 3.0
@@ -52,27 +51,40 @@ class Calibration(NamedTuple):
     cov: Array
 
 
-def laws_of(at_draws: VariableAtDraws, observed: Array, before: States) -> Laws | None:
+def laws_of(record: RecordAtDraws, before: States) -> Laws | None:
     """The laws of the observations: the filter's if it knows them, else those given drawn states.
 
     The states are drawn ``before`` the observation. None where its noise is not Gaussian.
     """
-    variable = at_draws.variable
-    if variable.system.equations.observation is None:
+    if record.variable.system.equations.observation is None:
         return None
-    seed = pt.lscalar("seed")
-    with_seed = variable._replace(seed=seed)
-    if (graphs := exact_predictions(with_seed)) is not None:
-        mean, cov, log_below, log_above = at_draws.evaluate(graphs, {seed: before.seeds})
+    seeds, observed = before.seeds, record.scored
+    if (found := record.evaluate(_exact, seeds=seeds)) is not None:
+        mean, cov, log_below, log_above = found
         return Laws(mean, cov, log_below, log_above, known=True)
-    if (graphs := gaussian_predictions(with_seed)) is not None:
-        terms, mean, cov = at_draws.evaluate(graphs, {seed: before.seeds})
+    if (found := record.evaluate(_gaussian, seeds=seeds)) is not None:
+        terms, mean, cov = found
         if _give_terms(mean, cov, observed, terms):
             return Laws(mean, cov, *_tails(mean, cov, observed), known=True)
-    x = pt.dmatrix("x")
-    drawn = {seed: before.seeds, x: before.drawn}
-    mean, cov = at_draws.evaluate(observations_given(with_seed, x), drawn)
+    found = record.evaluate(_given_states, seeds=seeds, drawn=[before.drawn])
+    assert found is not None
+    mean, cov = found
     return Laws(mean, cov, *_tails(mean, cov, observed), known=False)
+
+
+def _exact(variable: StateSpaceVariable) -> Graphs | None:
+    graphs = exact_predictions(variable)
+    return None if graphs is None else Graphs(graphs)
+
+
+def _gaussian(variable: StateSpaceVariable) -> Graphs | None:
+    graphs = gaussian_predictions(variable)
+    return None if graphs is None else Graphs(graphs)
+
+
+def _given_states(variable: StateSpaceVariable) -> Graphs:
+    x = pt.dmatrix("x")
+    return Graphs(observations_given(variable, x), [x])
 
 
 def calibration_of(laws: Laws, observed: Array) -> Calibration:

@@ -17,8 +17,9 @@ from pymc_statespace_filters.compiler.lowering.observation_sampler import (
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into
+from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.ops.panel import generators_of_records, single_records
+from pymc_statespace_filters.ops.panel import single_records
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel

@@ -19,6 +19,7 @@ from pytensor.tensor.rewriting.basic import register_specialize
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
 from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.protocol import PanelFilter
 from pymc_statespace_filters.filters.records import end_of_record, include_health, single_record
@@ -113,21 +114,6 @@ def _vectorize(op: PanelLogLikelihood, node: Apply, *inputs: Variable) -> list[V
     return Blockwise(op)(*inputs, return_list=True)
 
 
-@jit
-def seed_of_record(seed, code):
-    """The seed of a record's noise; that of the record with the code 0 is ``seed`` itself.
-
-    The finaliser of MurmurHash3 (A. Appleby) maps 0 to 0 and neighbouring codes far apart.
-    """
-    bits = np.uint64(code)
-    bits ^= bits >> np.uint64(33)
-    bits *= np.uint64(0xFF51AFD7ED558CCD)
-    bits ^= bits >> np.uint64(33)
-    bits *= np.uint64(0xC4CEB9FE1A85EC53)
-    bits ^= bits >> np.uint64(33)
-    return np.int64((np.uint64(seed) + bits) & np.uint64(0x7FFFFFFFFFFFFFFF))
-
-
 def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
     """Steps, observed, inputs, t0 and seed of every record, as a single one takes them."""
     records = table.records
@@ -141,12 +127,6 @@ def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
         )
         for rows, code in zip(records.slices(), records.codes, strict=True)
     ]
-
-
-def generators_of_records(rng: np.random.Generator, codes: np.ndarray) -> list[np.random.Generator]:
-    """A generator for each record, which depends on ``rng`` and on the code of the record alone."""
-    seed = rng.integers(np.iinfo(np.int64).max)
-    return [np.random.default_rng(seed_of_record(seed, code)) for code in codes]
 
 
 def _one_by_one(value: CompiledFunction) -> CompiledFunction:

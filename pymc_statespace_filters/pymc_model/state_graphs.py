@@ -11,6 +11,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
 from pymc_statespace_filters.ops.base import check_system_and_filter
 from pymc_statespace_filters.ops.diagnostics import TermHealth
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -77,6 +78,12 @@ def states_of(
     record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
     operation = States(variable.system, variable.filter, moment)
     return operation(variable.theta, *record, rows, draw_seed, return_list=True)
+
+
+def terms_of(variable: StateSpaceVariable) -> TensorVariable:
+    """The terms of a likelihood estimate."""
+    record = (variable.steps, variable.observed, variable.inputs, variable.t0, variable.seed)
+    return LogLikelihood(variable.system, variable.filter)(variable.theta, *record)[0]
 
 
 def term_health_of(variable: StateSpaceVariable) -> Sequence[TensorVariable]:

@@ -44,12 +44,21 @@ class PosteriorDraws:
             )
         return values.reshape(-1, *shape)
 
-    def stored_seeds(self, name: str) -> NDArray[np.int64] | None:
-        """The noise seed of the likelihood estimate of every draw; None if none is stored."""
+    def stored_seeds(self, name: str, n_records: int) -> NDArray[np.int64] | None:
+        """The noise seed of the likelihood estimate of every draw; None if none is stored.
+
+        (draws,), or (draws, G) where each of the records of a panel keeps its own.
+        """
         stored = f"{name}_seed"
         if self.noise_moved or stored not in self.stats:
             return None
-        return self.stats[stored].transpose(*SAMPLE_DIMS).values.ravel().astype(np.int64)
+        seeds = self.stats[stored].transpose(*SAMPLE_DIMS, ...).values.astype(np.int64)
+        if seeds.ndim > 2 and seeds.shape[2] != n_records:
+            raise ModelError(
+                f"idata has noise seeds of {seeds.shape[2]} records of {name!r}, of which the model"
+                f" has {n_records}: use the model of these draws, or drop sample_stats from idata"
+            )
+        return seeds.reshape(-1, *seeds.shape[2:])
 
     def dataset(self, variables: dict[str, tuple], coords: dict[str, Any]) -> xr.Dataset:
         """Reshape arrays (draws, ...) to (chain, draw, ...), given their further dimensions."""

@@ -6,10 +6,9 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, smoothing_method
 from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.groups import add_group, join_rows, row_coords, state_dims
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed
 from pymc_statespace_filters.system.record import check_at, rows_at
@@ -176,23 +175,31 @@ def _add_states(
     parts = []
     for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
-        rows = rows_at(at, at_draws.steps)
-        states = at_draws.states(moment, rows, rng, progressbar=progressbar)
+        steps = [rows_at(at, record.steps) for record in at_draws.records]
+        with at_draws.progress("states", enabled=progressbar):
+            states = [
+                record.states(moment, rows, own)
+                for rows, record, own in zip(
+                    steps, at_draws.records, at_draws.generators(rng), strict=True
+                )
+            ]
+        _, mean, sd, drawn, n_effective, _ = zip(*states, strict=True)
         name, system = variable.name, variable.system
         time, state = variable.dims[0], dims[name]
         part = draws.dataset(
             {
-                f"{name}_states": ((time, state), states.drawn),
-                f"{name}_mean": ((time, state), states.mean),
-                f"{name}_sd": ((time, state), states.sd),
-                f"{name}_n_effective": ((time,), states.n_effective),
+                f"{name}_states": ((time, state), join_rows(drawn)),
+                f"{name}_mean": ((time, state), join_rows(mean)),
+                f"{name}_sd": ((time, state), join_rows(sd)),
+                f"{name}_n_effective": ((time,), join_rows(n_effective)),
             },
-            {time: at_draws.times(rows), state: list(system.states)},
+            {**row_coords(at_draws, steps), state: list(system.states)},
         )
         part[f"{name}_states"].attrs = {"filter": repr(variable.filter)}
         if moment == "smoothed":
             part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)
-        arguments_of = at_draws.arguments_of(states.seeds)
-        warn_about(system, variable.filter, states.health, arguments_of, stacklevel=4)
+        at_draws.warn_about(
+            [one.health for one in states], [one.seeds for one in states], stacklevel=5
+        )
     return add_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

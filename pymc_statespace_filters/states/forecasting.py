@@ -4,21 +4,18 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.evaluation.simulate import continuation
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import add_group, state_dims
+from pymc_statespace_filters.states.groups import add_group, join_rows, row_coords, state_dims
+from pymc_statespace_filters.states.record import Array, RecordAtDraws
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.record import check_inputs, steps_of
-
-Array = NDArray[np.float64]
+from pymc_statespace_filters.system.record import steps_of
 
 
 def forecast(
@@ -100,64 +97,70 @@ def forecast(
     for variable in select_variables(model, var_name, filter):
         name, system, (time, observable) = variable.name, variable.system, variable.dims
         at_draws = VariableAtDraws(model, variable, draws)
-        last = at_draws.steps[-1:]
-        future = _future_steps(n_steps, steps, times, int(last[0]), at_draws)
-        observations = np.concatenate([at_draws.steps, future])
+        future = [_future_steps(n_steps, steps, times, record) for record in at_draws.records]
+        observations = [
+            np.concatenate([record.steps, rows])
+            for record, rows in zip(at_draws.records, future, strict=True)
+        ]
         if inputs is not None:
-            rows = pt.as_tensor(check_inputs(inputs, system, observations))
-            at_draws = VariableAtDraws(model, variable._replace(inputs=rows), draws)
-        input_rows = at_draws.inputs_until(observations)
-        initial = at_draws.states("filtered", last, rng, progressbar=progressbar)
-        paths, simulated = _simulate(
-            at_draws, initial.drawn[:, 0], int(last[0]), future, input_rows, rng
-        )
+            at_draws = at_draws.with_inputs(inputs, observations)
+        initial, paths, simulated = [], [], []
+        with at_draws.progress("states", enabled=progressbar):
+            for rows, all_rows, record, own in zip(
+                future, observations, at_draws.records, at_draws.generators(rng), strict=True
+            ):
+                input_rows = record.inputs_until(all_rows)
+                initial.append(record.states("filtered", record.steps[-1:], own))
+                path, seen = _simulate(record, initial[-1].drawn[:, 0], rows, input_rows, own)
+                paths.append(path)
+                simulated.append(seen)
         parts.append(
             draws.dataset(
                 {
-                    name: ((time, observable), simulated),
-                    f"{name}_states": ((time, dims[name]), paths),
+                    name: ((time, observable), join_rows(simulated)),
+                    f"{name}_states": ((time, dims[name]), join_rows(paths)),
                 },
                 {
-                    time: at_draws.times(future),
+                    **row_coords(at_draws, future),
                     dims[name]: list(system.states),
                     observable: list(system.observables),
                 },
             )
         )
-        warn_about(system, variable.filter, initial.health, at_draws.arguments_of(initial.seeds))
+        at_draws.warn_about([one.health for one in initial], [one.seeds for one in initial])
     return add_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 
 def _future_steps(
-    n_steps: int | None, steps: Any, times: Any, last: int, at_draws: VariableAtDraws
+    n_steps: int | None, steps: Any, times: Any, record: RecordAtDraws
 ) -> NDArray[np.int64]:
     """The steps to predict."""
+    last = int(record.steps[-1])
     if sum(given is not None for given in (n_steps, steps, times)) != 1:
         raise ModelError("give exactly one of n_steps, steps and times")
     if n_steps is not None:
         if not is_integer(n_steps) or n_steps < 1:
             raise ModelError(f"n_steps must be an integer of at least 1, got {n_steps!r}")
         return np.arange(last + 1, last + 1 + n_steps)
-    future = steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
+    future = steps_of(steps, times, record.variable.system.dt, record.t0)
     if future[0] <= last:
         raise ModelError(
-            f"steps must be after the last observation, at step {last}, got {future[0]}: for "
-            "earlier states use filtered_states or smoothed_states"
+            f"{record.prefix}steps must be after the last observation, at step {last}, got "
+            f"{future[0]}: for earlier states use filtered_states or smoothed_states"
         )
     return future
 
 
 def _simulate(
-    at_draws: VariableAtDraws,
+    record: RecordAtDraws,
     initial: Array,
-    first: int,
     future: NDArray[np.int64],
     rows: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Simulate states (draws, R, n) and observations (draws, R, p) from states (draws, n)."""
-    system, t0 = at_draws.variable.system, at_draws.t0
-    theta, simulate = at_draws.parameters(), continuation(system).function
+    system, t0, first = record.variable.system, record.t0, int(record.steps[-1])
+    theta, simulate = record.theta, continuation(system).function
     paths = np.full((len(initial), future.size, system.n), np.nan)
     observed = np.full((len(initial), future.size, system.p), np.nan)
     for i in np.flatnonzero(np.isfinite(initial).all(axis=1)):

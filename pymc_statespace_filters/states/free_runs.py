@@ -1,6 +1,7 @@
 """Free runs: simulations at draws of the posterior that see no observation."""
 
 import warnings
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,19 +13,20 @@ from numpy.typing import NDArray
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.evaluation.simulate import simulator
 from pymc_statespace_filters.parallel.cpu_affinity import available_cores
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, observed_variables
-from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
-from pymc_statespace_filters.states.groups import add_group, state_dims
-from pymc_statespace_filters.states.prediction_errors import prediction_errors
-from pymc_statespace_filters.states.variable import (
-    VariableAtDraws,
-    select_variables,
-    simulate_observations,
+from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.states.draws import select_draws
+from pymc_statespace_filters.states.groups import (
+    add_group,
+    by_record,
+    join_rows,
+    row_coords,
+    state_dims,
 )
+from pymc_statespace_filters.states.prediction_errors import prediction_errors
+from pymc_statespace_filters.states.record import Array, RecordAtDraws, simulate_observations
+from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_flag, check_random_seed
-from pymc_statespace_filters.system.record import check_inputs, check_observed, steps_of
-
-Array = NDArray[np.float64]
+from pymc_statespace_filters.system.record import check_observed, steps_of
 
 
 def free_run(
@@ -128,6 +130,11 @@ def free_run(
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
     variables = select_variables(model, var_name)
+    if panels := [v.name for v in variables if v.is_panel and observed is not None]:
+        raise ModelError(
+            f"observed must be None for a panel such as {panels[0]!r}: each record is compared with"
+            " its own data"
+        )
     if observed is not None and len(variables) > 1:
         raise ModelError(
             "observed must be that of one variable: give var_name, one of "
@@ -139,50 +146,61 @@ def free_run(
     parts = []
     for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
-        at = _steps(at_draws, steps, times)
-        record = _record(variable, observed, at) if is_compared else None
-        rows = _input_rows(at_draws, inputs, at)
-        paths, seen = _simulate(at_draws, at, rows, with_noise, draws.shape[0], rng)
-        _warn_of_failed_runs(variable.name, paths)
-        part = _predictions(draws, variable, dims[variable.name], at_draws.times(at), paths, seen)
-        if record is not None:
-            measured = seen if with_noise else simulate_observations(at_draws, paths, at, rows, rng)
-            part = part.merge(prediction_errors(part[variable.name], measured, record))
+        at = [_steps(record, steps, times) for record in at_draws.records]
+        if inputs is not None:
+            at_draws = at_draws.with_inputs(inputs, at)
+        name, (time, observable) = variable.name, variable.dims
+        names: dict[str, Any] = {observable: list(variable.system.observables)}
+        paths, seen, errors = [], [], []
+        for rows, record, own in zip(at, at_draws.records, at_draws.generators(rng), strict=True):
+            measured = _measured(record, observed, rows) if is_compared else None
+            # A copy: the simulator would be compiled again for arrays of another layout.
+            input_rows = np.array(record.inputs_until(rows), order="C")
+            path, values = _simulate(record, rows, input_rows, with_noise, draws.shape[0], own)
+            paths.append(path)
+            seen.append(values)
+            if measured is not None:
+                noisy = (
+                    values
+                    if with_noise
+                    else simulate_observations(record, path, rows, input_rows, own)
+                )
+                predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
+                errors.append(prediction_errors(predicted, noisy, measured))
+        _warn_of_failed_runs(name, paths)
+        state = dims[name]
+        part = draws.dataset(
+            {
+                name: ((time, observable), join_rows(seen)),
+                f"{name}_states": ((time, state), join_rows(paths)),
+            },
+            {**row_coords(at_draws, at), **names, state: list(variable.system.states)},
+        )
+        if errors:
+            part = part.merge(by_record(at_draws, errors))
         parts.append(part)
     attrs = {"noise": int(with_noise)}  # netCDF has no truth values
     return add_group(idata, "free_run", xr.merge(parts), attrs, extend_inferencedata)
 
 
-def _steps(at_draws: VariableAtDraws, steps: Any, times: Any) -> NDArray[np.int64]:
+def _steps(record: RecordAtDraws, steps: Any, times: Any) -> NDArray[np.int64]:
     """The steps to predict, those of the record by default."""
     if steps is None and times is None:
-        return np.array(at_draws.steps)
+        return np.array(record.steps)
     if steps is not None and times is not None:
         raise ModelError("give at most one of steps and times, got both")
-    return steps_of(steps, times, at_draws.variable.system.dt, at_draws.t0)
+    return steps_of(steps, times, record.variable.system.dt, record.t0)
 
 
-def _record(variable: StateSpaceVariable, observed: Any, steps: NDArray[np.int64]) -> Array:
+def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) -> Array:
     """The measurements (R, p) to compare with: those given, else those of the model."""
     if observed is None:
-        record = np.array(variable.observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
-        record[: variable.score_from] = np.nan
-        return record
-    return check_observed(observed, variable.system, steps.size)
-
-
-def _input_rows(at_draws: VariableAtDraws, inputs: Any, steps: NDArray[np.int64]) -> Array:
-    """The inputs (draws or 1, rows, n_input_columns)."""
-    if inputs is None:
-        rows = at_draws.inputs_until(steps)
-    else:
-        rows = check_inputs(inputs, at_draws.variable.system, steps)[None]
-    # A copy: the simulator would be compiled again for arrays of another layout.
-    return np.array(rows, order="C")
+        return record.scored
+    return check_observed(observed, record.variable.system, steps.size)
 
 
 def _simulate(
-    at_draws: VariableAtDraws,
+    record: RecordAtDraws,
     steps: NDArray[np.int64],
     rows: Array,
     noise: bool,
@@ -193,7 +211,7 @@ def _simulate(
 
     NaN for a draw with a number that is not finite.
     """
-    system, t0, theta = at_draws.variable.system, at_draws.t0, at_draws.parameters()
+    system, t0, theta = record.variable.system, record.t0, record.theta
     run = simulator(system, noise).function
     paths = np.empty((len(theta), steps.size, system.n))
     seen = np.empty((len(theta), steps.size, system.p))
@@ -214,28 +232,15 @@ def _simulate(
     return paths, seen
 
 
-def _warn_of_failed_runs(name: str, paths: Array) -> None:
-    failed = np.isnan(paths).any(axis=(1, 2))
+def _warn_of_failed_runs(name: str, paths: Sequence[Array]) -> None:
+    """Warn of the runs (draws, R, n) of every record that have NaN."""
+    failed = np.concatenate([np.isnan(path).any(axis=(1, 2)) for path in paths])
     if failed.any():
+        runs = "draws" if len(paths) == 1 else "draws and records"
         warnings.warn(
             f"the free run of {name!r} leaves the finite numbers at {failed.sum()} of "
-            f"{failed.size} draws, where the model is unstable: their predictions are NaN, and no "
+            f"{failed.size} {runs}, where the model is unstable: their predictions are NaN, and no "
             "error or coverage counts them",
             FilterWarning,
             stacklevel=3,
         )
-
-
-def _predictions(
-    draws: PosteriorDraws,
-    variable: StateSpaceVariable,
-    state: str,
-    times: Array,
-    paths: Array,
-    seen: Array,
-) -> xr.Dataset:
-    name, system, (time, observable) = variable.name, variable.system, variable.dims
-    return draws.dataset(
-        {name: ((time, observable), seen), f"{name}_states": ((time, state), paths)},
-        {time: times, state: list(system.states), observable: list(system.observables)},
-    )

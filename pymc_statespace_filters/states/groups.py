@@ -1,11 +1,15 @@
-"""Dimension names and DataTree groups of states."""
+"""Dimensions, coordinates and DataTree groups of states."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.states.record import Array
+from pymc_statespace_filters.states.variable import VariableAtDraws
 
 
 def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
@@ -16,6 +20,43 @@ def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     return {
         v.name: "state" if v.system.states == lists[0] else f"{v.name}_state" for v in variables
     }
+
+
+def row_coords(at_draws: VariableAtDraws, steps: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
+    """Coordinates of the rows of a result, given the steps of each record.
+
+    Without a panel they are times. The rows of a panel have record and time as further coordinates.
+    """
+    name, dim = at_draws.variable.name, at_draws.variable.dims[0]
+    pairs = list(zip(at_draws.records, steps, strict=True))
+    times = np.concatenate([record.times(rows) for record, rows in pairs])
+    if not at_draws.variable.is_panel:
+        return {dim: times}
+    labels = np.repeat(
+        np.array([record.label for record in at_draws.records]), [len(rows) for rows in steps]
+    )
+    return {
+        dim: np.arange(times.size),
+        f"{name}_panel": (dim, labels),
+        f"{name}_time": (dim, times),
+    }
+
+
+def by_record(at_draws: VariableAtDraws, parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Join results that each record has one of, along a dimension of records if it is a panel.
+
+    Where their coordinates differ, as lags of records of different lengths, NaN fills the gaps.
+    """
+    if not at_draws.variable.is_panel:
+        return parts[0]
+    dim = f"{at_draws.variable.name}_record"
+    labels = xr.DataArray([record.label for record in at_draws.records], dims=dim, name=dim)
+    return xr.concat(parts, labels, data_vars="all", coords="minimal", join="outer")
+
+
+def join_rows(parts: Sequence[Array]) -> Array:
+    """The rows of all records (draws, R, ...), one after the other."""
+    return np.concatenate(parts, axis=1)
 
 
 def add_group(

@@ -1,7 +1,9 @@
-"""A state-space variable at draws of the posterior: parameters, inputs, and estimated states."""
+"""A state-space variable at draws of the posterior: graphs of it, compiled once for all records."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -13,57 +15,34 @@ from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.simulate import observer
+from pymc_statespace_filters.evaluation.filter_warnings import warn_about
 from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.inspection import panel_variables
 from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
-    states_of,
-    term_health_of,
     with_other_filter,
 )
 from pymc_statespace_filters.states.draws import PosteriorDraws
-from pymc_statespace_filters.system.accumulators import (
-    inputs_of_user,
-    n_input_rows,
-    with_resets,
-)
-
-Array = NDArray[np.float64]
-
-
-class States(NamedTuple):
-    """Mean, sd and a draw of the state (draws, R, n), and effective sample size (draws, R).
-
-    ``health`` (draws, 3) are the outcomes of the filter, with the noise of ``seeds`` (draws,).
-    """
-
-    mean: Array
-    sd: Array
-    drawn: Array
-    n_effective: Array
-    health: Array
-    seeds: NDArray[np.int64]
-
-
-class TermHealthAtDraws(NamedTuple):
-    """Effective number behind every term (draws, J), and what `States` says of it."""
-
-    n_effective: Array
-    health: Array
-    seeds: NDArray[np.int64]
+from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, inputs_by_record
+from pymc_statespace_filters.system.record import check_inputs
 
 
 class VariableAtDraws:
-    """Evaluate graphs of one variable at draws of its model's posterior."""
+    """One variable at draws of its model's posterior, as a sequence of records.
+
+    A variable without a panel is one record. ``on_progress`` is called with the number of
+    evaluations, of a draw and a record each, since its last call.
+    """
 
     def __init__(
         self, model: pm.Model, variable: StateSpaceVariable, draws: PosteriorDraws
     ) -> None:
-        self.variable = variable
-        self._draws = draws
+        self._model, self.variable, self.draws = model, variable, draws
+        self.on_progress: Callable[[int], None] = lambda count: None
+        self._compiled: dict[Hashable, Any] = {}
         # Stop at variables of the model: free ones are replaced by their draws.
         known = set(ancestors([variable.theta, variable.inputs], blockers=model.basic_RVs))
         free = [rv for rv in model.free_RVs if rv in known]
@@ -75,129 +54,191 @@ class VariableAtDraws:
         self._replaced |= {
             rv: pt.cast(symbol, rv.dtype) for rv, symbol in zip(free, self._symbols, strict=True)
         }
-        steps, t0 = pytensor.function([], [variable.steps, variable.t0], mode="FAST_COMPILE")()
-        self.steps, self.t0 = np.asarray(steps, dtype=np.int64), float(t0)
+        self._record, self._record_inputs = _one_record(variable)
+        self.records = self._find_records()
 
-    def times(self, rows: NDArray[np.int64]) -> Array:
-        """Times of the given steps."""
-        return np.asarray(self.t0 + rows * self.variable.system.dt, dtype=np.float64)
+    @property
+    def n_draws(self) -> int:
+        """Number of draws, of all chains."""
+        return int(np.prod(self.draws.shape))
 
-    def parameters(self) -> Array:
-        """Flat parameters at every draw, (draws, k)."""
-        return self._interpret(self.variable.theta)
+    @cached_property
+    def stored_seeds(self) -> NDArray[np.int64] | None:
+        """The seeds of the estimates of each draw; None where none are stored or read."""
+        variable = self.variable
+        if not variable.filter.noisy:
+            return None
+        return self.draws.stored_seeds(variable.name, len(self.records))
 
+    @cached_property
+    def theta(self) -> Array:
+        """Flat parameters of every record at every draw, (draws, G, k)."""
+        theta = self._interpret(self.variable.theta)
+        return theta if self.variable.is_panel else theta[:, None]
+
+    @cached_property
     def inputs(self) -> Array:
-        """Input rows at every draw, (draws or 1, rows, n_input_columns)."""
+        """Input rows of all records at every draw, (draws or 1, rows, n_input_columns)."""
         graph = self.variable.inputs
         if set(self._replaced) & set(ancestors([graph])):
             return self._interpret(graph)
         return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
 
-    def inputs_until(self, steps: NDArray[np.int64]) -> Array:
-        """The same, for observations at `steps` instead; checked to have the rows they need."""
-        system = self.variable.system
-        rows = inputs_of_user(system, self.inputs())
-        if len(rows[0]) < n_input_rows(system, steps) and system.n_inputs:
-            raise ModelError(
-                f"the model's inputs end after {len(rows[0])} rows, and step {steps[-1]} needs "
-                f"{n_input_rows(system, steps)}: give inputs= for all steps, from step 0 on"
+    def with_inputs(self, inputs: Any, steps: Sequence[NDArray[np.int64]]) -> "VariableAtDraws":
+        """The same with other inputs, for observations at `steps` of every record."""
+        variable, system = self.variable, self.variable.system
+        if variable.is_panel:
+            labels, codes = zip(
+                *((record.label, record.code) for record in self.records), strict=True
             )
-        return with_resets(system, rows, steps)
+            rows, firsts = inputs_by_record(inputs, system, labels, codes, steps)
+            table = variable.steps.eval(mode="FAST_COMPILE")
+            table[:, FIRST_INPUT] = np.repeat(firsts, [len(r.steps) for r in self.records])
+            changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
+        else:
+            rows = check_inputs(inputs, system, steps[0])
+            changed = variable._replace(inputs=pt.as_tensor(rows))
+        return VariableAtDraws(self._model, changed, self.draws)
 
-    def _interpret(self, graph: Variable) -> Array:
-        # Microseconds for each draw: machine code would take longer to compile than it saves.
-        with pytensor.config.change_flags(mode="FAST_COMPILE"):
-            return self.evaluate([graph], {})[0]
+    def generators(self, rng: np.random.Generator) -> list[np.random.Generator]:
+        """A generator for each record, which does not depend on the other records."""
+        if not self.variable.is_panel:
+            return [rng]
+        return generators_of_records(rng, np.array([record.code for record in self.records]))
 
-    def states(
-        self, moment: str, rows: NDArray[np.int64], rng: np.random.Generator, *, progressbar: bool
-    ) -> States:
-        """States at steps `rows`, with the noise of each draw's likelihood estimate.
-
-        Fresh noise is used where no seed is stored.
-        """
-        seed, draw_seed, row_steps = pt.lscalar("seed"), pt.lscalar("draw_seed"), pt.lvector("rows")
-        graphs = states_of(self.variable._replace(seed=seed), moment, row_steps, draw_seed)
-        drawn = {seed: self._seeds(rng), draw_seed: self._fresh_seeds(rng)}
-        mean, sd, state, n_effective, health = self.evaluate(
-            graphs, drawn, {row_steps: rows}, progressbar=progressbar
-        )
-        return States(mean, sd, state, n_effective, health, drawn[seed])
-
-    def term_health(self, rng: np.random.Generator, *, progressbar: bool) -> TermHealthAtDraws:
-        """How many members are behind every term, with the noise of each draw's estimate."""
-        seed, seeds = pt.lscalar("seed"), self._seeds(rng)
-        graphs = term_health_of(self.variable._replace(seed=seed))
-        n_effective, health = self.evaluate(
-            graphs, {seed: seeds}, task="health", progressbar=progressbar
-        )
-        return TermHealthAtDraws(n_effective, health, seeds)
-
-    def arguments_of(self, seeds: NDArray[np.int64]) -> Callable[[int], tuple[Any, ...]]:
-        """The function of a draw's number: all inputs of a likelihood with the noise of ``seeds``.
-
-        They are evaluated when it is called.
-        """
-
-        def arguments(i: int) -> tuple[Any, ...]:
-            rows = self.inputs()
-            observed = self.variable.observed.eval(mode="FAST_COMPILE")
-            inputs = rows[i if len(rows) > 1 else 0]
-            return self.parameters()[i], self.steps, observed, inputs, self.t0, seeds[i]
-
-        return arguments
-
-    def _seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The seed of each draw's estimate; a fresh one where none is stored or read."""
-        stored = (
-            self._draws.stored_seeds(self.variable.name) if self.variable.filter.noisy else None
-        )
-        return self._fresh_seeds(rng) if stored is None else stored
-
-    def _fresh_seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        return rng.integers(np.iinfo(np.int64).max, size=int(np.prod(self._draws.shape)))
+    @contextmanager
+    def progress(self, task: str, *, enabled: bool, n_tasks: int = 1) -> Iterator[None]:
+        """Show a bar that counts the evaluations of ``n_tasks`` graphs of every record."""
+        with row_progress(self, enabled=enabled) as begin:
+            begin(task, n_tasks * self.n_draws * len(self.records))
+            yield
 
     def evaluate(
         self,
-        graphs: Sequence[Variable],
-        drawn: Mapping[Variable, np.ndarray],
-        constant: Mapping[Variable, np.ndarray] | None = None,
+        record: RecordAtDraws,
+        build: Callable[..., Graphs | None],
+        settings: tuple[Hashable, ...],
+        seeds: NDArray[np.int64],
+        drawn: Sequence[np.ndarray] = (),
+        constant: Sequence[np.ndarray] = (),
+    ) -> list[Array] | None:
+        """The graphs ``build(variable, *settings)`` at every draw, with the noise of ``seeds``.
+
+        They are compiled once, whatever the number of records. None if there are none.
+        """
+        if (key := (build, *settings)) not in self._compiled:
+            graphs = build(self._record, *settings)
+            self._compiled[key] = (
+                None
+                if graphs is None
+                else self._compile(
+                    graphs.outputs,
+                    [self._record.seed, *graphs.drawn, *self._record_inputs, *graphs.constant],
+                )
+            )
+        if (function := self._compiled[key]) is None:
+            return None
+        return self._call(function, [seeds, *drawn], [*_which(record), *constant])
+
+    def warn_about(
+        self,
+        health: Sequence[Array],
+        seeds: Sequence[NDArray[np.int64]],
         *,
-        task: str = "states",
-        progressbar: bool = False,
-    ) -> list[Array]:
-        """Evaluate graphs at every draw; `drawn` inputs vary over draws, `constant` ones do not."""
-        constant = constant or {}
-        bound = clone_replace(list(graphs), self._replaced)
+        stacklevel: int = 4,
+    ) -> None:
+        """Warn of failures and of collapse, given health (draws, 3) and seeds of every record."""
+
+        def arguments_of(i: int) -> tuple[Any, ...]:
+            number, draw = divmod(i, self.n_draws)
+            return self.records[number].arguments(draw, seeds[number][draw])
+
+        warn_about(
+            self.variable.system,
+            self.variable.filter,
+            np.concatenate(health),
+            arguments_of,
+            stacklevel=stacklevel,
+        )
+
+    def _compile(self, outputs: Sequence[Variable], inputs: Sequence[Variable]) -> Any:
+        bound = clone_replace(list(outputs), self._replaced)
         # The index of the draw makes sure that there is at least one varying input.
-        inputs = [pt.lscalar("number"), *self._symbols, *drawn, *constant]
-        function = pytensor.function(inputs, bound, on_unused_input="ignore", trust_input=True)
-        columns = [np.arange(np.prod(self._draws.shape)), *self._columns, *drawn.values()]
-        calls = ParallelMap(function, [column[0] for column in columns], list(constant.values()))
-        with row_progress(calls, enabled=progressbar) as begin:
-            begin(task, len(columns[0]))
-            results = calls(*columns)
+        all_inputs = [pt.lscalar("number"), *self._symbols, *inputs]
+        return pytensor.function(all_inputs, bound, on_unused_input="ignore", trust_input=True)
+
+    def _call(
+        self, function: Any, drawn: Sequence[np.ndarray], constant: Sequence[np.ndarray]
+    ) -> list[Array]:
+        columns = [np.arange(self.n_draws), *self._columns, *drawn]
+        calls = ParallelMap(function, [column[0] for column in columns], constant)
+        calls.on_progress = self.on_progress
+        results = calls(*columns)
         ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
         parts = np.split(results, ends, axis=1)
         return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
 
+    def _interpret(self, graph: Variable) -> Array:
+        # Microseconds for each draw: machine code would take longer to compile than it saves.
+        with pytensor.config.change_flags(mode="FAST_COMPILE"):
+            return self._call(self._compile([graph], []), [], [])[0]
 
-def simulate_observations(
-    at_draws: VariableAtDraws,
-    states: Array,
-    steps: NDArray[np.int64],
-    rows: Array,
-    rng: np.random.Generator,
-) -> Array:
-    """Simulate an observation (draws, R, p) of each state (draws, R, n); NaN where that is NaN."""
-    system, theta = at_draws.variable.system, at_draws.parameters()
-    observe = observer(system).function
-    simulated = np.full((*states.shape[:2], system.p), np.nan)
-    for i, path in enumerate(states):
-        known = np.isfinite(path).all(axis=1)
-        inputs = rows[i if len(rows) > 1 else 0]
-        simulated[i, known] = observe(rng, theta[i], path[known], steps[known], inputs, at_draws.t0)
-    return simulated
+    def _find_records(self) -> list[RecordAtDraws]:
+        """The records, from the current data of the model."""
+        variable = self.variable
+        symbols = [variable.steps, variable.observed, variable.t0]
+        steps, observed, t0 = pytensor.function([], symbols, mode="FAST_COMPILE")()
+        observed = np.array(observed, dtype=np.float64)
+        if not variable.is_panel:
+            return [RecordAtDraws(self, 0, None, None, steps, observed, float(t0))]
+        codes = steps[:, RECORD]
+        starts = np.flatnonzero(np.diff(codes, prepend=codes[0] + 1))
+        labels = self._model.coords.get(f"{variable.name}_record", ())
+        if len(labels) != len(starts):  # other rows were set
+            labels = codes[starts].tolist()
+        first_inputs, n_rows = steps[starts, FIRST_INPUT], self.inputs.shape[1]
+        # All records share all rows, or have their own, one stretch below the other.
+        ends = np.append(first_inputs[1:], n_rows) if first_inputs.any() else n_rows + 0 * starts
+        return [
+            RecordAtDraws(
+                self,
+                number,
+                int(codes[rows[0]]),
+                labels[number],
+                steps[rows, STEP].copy(),
+                observed[rows],
+                float(t0),
+                slice(int(first_inputs[number]), int(ends[number])),
+            )
+            for number, rows in enumerate(np.split(np.arange(len(codes)), starts[1:]))
+        ]
+
+
+def _one_record(variable: StateSpaceVariable) -> tuple[StateSpaceVariable, list[Variable]]:
+    """One record of a variable, with a symbol as seed; and the inputs that tell which record."""
+    seed = pt.lscalar("seed")
+    if not variable.is_panel:
+        return variable._replace(seed=seed), []
+    number, first, end = pt.lscalar("record"), pt.lscalar("first_input"), pt.lscalar("end")
+    steps, observed = pt.lvector("steps"), pt.dmatrix("observed")
+    record = variable._replace(
+        theta=variable.theta[number],
+        steps=steps,
+        observed=observed,
+        inputs=variable.inputs[first:end],
+        seed=seed,
+    )
+    return record, [number, steps, observed, first, end]
+
+
+def _which(record: RecordAtDraws) -> list[np.ndarray]:
+    """The values of the inputs of `_one_record`."""
+    if record.code is None:
+        return []
+    ends = record.input_rows.start, record.input_rows.stop
+    return [
+        np.asarray(record.number), record.steps, record.observed, *map(np.asarray, ends)
+    ]  # fmt: skip
 
 
 def select_variables(
@@ -210,9 +251,4 @@ def select_variables(
     if name is not None and name not in list(found):  # `in found` fails for unhashable names
         raise ModelError(f"var_name must be one of {list(found)}, got {name!r}")
     chosen = list(found.values()) if name is None else [found[name]]
-    if panels := [variable.name for variable in chosen if variable.name in panel_variables(model)]:
-        raise ModelError(
-            f"the panel {panels[0]!r} has no such results: make a model of one record, or give the "
-            "var_name of a variable without a panel"
-        )
     return chosen if filter is None else [with_other_filter(v, filter) for v in chosen]

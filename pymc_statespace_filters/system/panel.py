@@ -306,6 +306,20 @@ def _inputs(
     return np.concatenate(parts), _first_rows([len(part) for part in parts])
 
 
+def inputs_by_record(
+    inputs: Any,
+    system: StateSpaceModel,
+    labels: Sequence[Any],
+    codes: Sequence[int],
+    steps: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """All rows of inputs, and the first of each record (G,), for observations at other steps."""
+    starts = np.concatenate([[0], np.cumsum([len(rows) for rows in steps])])
+    records = Records(list(labels), starts, np.array(codes))
+    rows, first_inputs = _inputs(inputs, system, records, np.concatenate(steps))
+    return rows, np.zeros(len(labels), np.int64) if first_inputs is None else first_inputs
+
+
 def _first_rows(lengths: Sequence[int]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype("int64")
 

@@ -7,12 +7,12 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.posterior.observed_data import (
     observation_count,
     scalar_count,
 )
-from pymc_statespace_filters.ops.panel import seed_of_record
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
 from pymc_statespace_filters.system.panel import records_of
 from tests.small_systems import FORCE, FORCED, forced_terms

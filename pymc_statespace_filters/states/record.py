@@ -1,0 +1,200 @@
+"""One record of a state-space variable at draws of the posterior: its parameters and states."""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
+
+from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evaluation.simulate import observer
+from pymc_statespace_filters.pymc_model.state_graphs import (
+    StateSpaceVariable,
+    states_of,
+    term_health_of,
+)
+from pymc_statespace_filters.system.accumulators import (
+    inputs_of_user,
+    n_input_rows,
+    with_resets,
+)
+
+if TYPE_CHECKING:
+    from pymc_statespace_filters.states.variable import VariableAtDraws
+
+Array = NDArray[np.float64]
+
+
+class Graphs(NamedTuple):
+    """Graphs of one record, and the inputs that they have beside those of the variable.
+
+    ``drawn`` inputs differ from draw to draw, ``constant`` ones do not.
+    """
+
+    outputs: Sequence[Variable]
+    drawn: Sequence[Variable] = ()
+    constant: Sequence[Variable] = ()
+
+
+class States(NamedTuple):
+    """Mean, sd and a draw of the state (draws, R, n), and effective sample size (draws, R).
+
+    ``health`` (draws, 3) are the outcomes of the filter, with the noise of ``seeds`` (draws,).
+    """
+
+    seeds: NDArray[np.int64]
+    mean: Array
+    sd: Array
+    drawn: Array
+    n_effective: Array
+    health: Array
+
+
+class TermHealthAtDraws(NamedTuple):
+    """Effective number behind every term (draws, J), and what `States` says of it."""
+
+    seeds: NDArray[np.int64]
+    n_effective: Array
+    health: Array
+
+
+@dataclass(frozen=True)
+class RecordAtDraws:
+    """The record ``number`` of a variable, with its steps (J,) and data (J, p).
+
+    ``code`` is what its noise depends on beside the seed, and ``input_rows`` which of the
+    variable's inputs it has; ``code`` and ``label`` are None for a variable without a panel.
+    """
+
+    at_draws: "VariableAtDraws"
+    number: int
+    code: int | None
+    label: Any
+    steps: NDArray[np.int64]
+    observed: Array
+    t0: float
+    input_rows: slice = slice(None)
+
+    @property
+    def variable(self) -> StateSpaceVariable:
+        """The variable, whose graphs are those of all its records."""
+        return self.at_draws.variable
+
+    @property
+    def scored(self) -> Array:
+        """The data (J, p), missing in the rows without a term in the log-density."""
+        scored = self.observed.copy()
+        scored[: self.variable.score_from] = np.nan
+        return scored
+
+    @property
+    def theta(self) -> Array:
+        """Flat parameters at every draw, (draws, k)."""
+        return self.at_draws.theta[:, self.number]
+
+    @property
+    def inputs(self) -> Array:
+        """Input rows at every draw, (draws or 1, rows, n_input_columns)."""
+        return self.at_draws.inputs[:, self.input_rows]
+
+    def times(self, rows: NDArray[np.int64]) -> Array:
+        """Times of the given steps."""
+        return np.asarray(self.t0 + rows * self.variable.system.dt, dtype=np.float64)
+
+    def inputs_until(self, steps: NDArray[np.int64]) -> Array:
+        """The inputs for observations at `steps` instead; checked to have the rows they need."""
+        system = self.variable.system
+        rows = inputs_of_user(system, self.inputs)
+        if len(rows[0]) < n_input_rows(system, steps) and system.n_inputs:
+            raise ModelError(
+                f"{self.prefix}the model's inputs end after {len(rows[0])} rows, and step "
+                f"{steps[-1]} needs {n_input_rows(system, steps)}: give inputs= for all steps, "
+                "from step 0 on"
+            )
+        return with_resets(system, rows, steps)
+
+    @property
+    def prefix(self) -> str:
+        """What a message about this record begins with."""
+        return "" if self.code is None else f"record {self.label!r}: "
+
+    def states(self, moment: str, rows: NDArray[np.int64], rng: np.random.Generator) -> States:
+        """States at steps `rows`, with the noise of each draw's likelihood estimate.
+
+        Fresh noise is used where no seed is stored.
+        """
+        seeds, draw_seeds = self._seeds(rng), self._fresh_seeds(rng)
+        found = self.evaluate(_states, moment, seeds=seeds, drawn=[draw_seeds], constant=[rows])
+        assert found is not None
+        return States(seeds, *found)
+
+    def term_health(self, rng: np.random.Generator) -> TermHealthAtDraws:
+        """How many members are behind every term, with the noise of each draw's estimate."""
+        seeds = self._seeds(rng)
+        found = self.evaluate(_term_health, seeds=seeds)
+        assert found is not None
+        return TermHealthAtDraws(seeds, *found)
+
+    def evaluate(
+        self,
+        build: Callable[..., Graphs | None],
+        *settings: Hashable,
+        seeds: NDArray[np.int64],
+        drawn: Sequence[np.ndarray] = (),
+        constant: Sequence[np.ndarray] = (),
+    ) -> list[Array] | None:
+        """The graphs ``build(variable, *settings)`` at every draw: see `VariableAtDraws`."""
+        return self.at_draws.evaluate(self, build, settings, seeds, drawn, constant)
+
+    def arguments(self, i: int, seed: np.int64) -> tuple[Any, ...]:
+        """All inputs of a likelihood at a draw, with the noise of ``seed``."""
+        inputs = self.inputs[i if len(self.inputs) > 1 else 0]
+        return self.theta[i], self.steps, self.observed, inputs, self.t0, seed
+
+    def noise_of(self, seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The seeds of the record's noise, given those of the variable's (draws,) or (draws, G)."""
+        if self.code is None:
+            return seeds
+        of_variable = seeds[:, self.number] if seeds.ndim == 2 else seeds
+        return np.array([seed_of_record(seed, self.code) for seed in of_variable], dtype=np.int64)
+
+    def _seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The seed of each draw's estimate; a fresh one where none is stored or read."""
+        stored = self.at_draws.stored_seeds
+        return self._fresh_seeds(rng) if stored is None else self.noise_of(stored)
+
+    def _fresh_seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        return rng.integers(np.iinfo(np.int64).max, size=self.at_draws.n_draws)
+
+
+def _states(variable: StateSpaceVariable, moment: str) -> Graphs:
+    rows, draw_seed = pt.lvector("rows"), pt.lscalar("draw_seed")
+    return Graphs(states_of(variable, moment, rows, draw_seed), [draw_seed], [rows])
+
+
+def _term_health(variable: StateSpaceVariable) -> Graphs:
+    return Graphs(term_health_of(variable))
+
+
+def simulate_observations(
+    record: RecordAtDraws,
+    states: Array,
+    steps: NDArray[np.int64],
+    rows: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Simulate an observation (draws, R, p) of each state (draws, R, n); NaN where that is NaN."""
+    system = record.variable.system
+    observe = observer(system).function
+    simulated = np.full((*states.shape[:2], system.p), np.nan)
+    for i, path in enumerate(states):
+        known = np.isfinite(path).all(axis=1)
+        inputs = rows[i if len(rows) > 1 else 0]
+        simulated[i, known] = observe(
+            rng, record.theta[i], path[known], steps[known], inputs, record.t0
+        )
+    return simulated
