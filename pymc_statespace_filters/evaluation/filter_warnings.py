@@ -2,7 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 type Arguments = tuple[Any, ...]
 
-_MOST_LISTED = 8  # observations
+_MOST_LISTED = 8  # observations, or records
 _N_SEEDS = 5  # at which a collapsed estimate is repeated, to say how noisy it is
 
 
@@ -35,14 +35,17 @@ def warn_about(
     health: np.ndarray,
     arguments_of: Callable[[int], Arguments],
     *,
+    labels: Sequence[Any] | None = None,
     stacklevel: int = 3,
 ) -> None:
     """Warn once of failures and once of collapse in some evaluations, given their health (n, 3).
 
     ``arguments_of(i)`` are the inputs (theta, steps, observed, inputs, t0, seed) of evaluation i,
-    which is repeated if its particles were the fewest.
+    which is repeated if its particles were the fewest. ``labels`` are those of the records of a
+    panel; the evaluations of one come before those of the next, and are as many.
     """
     failed = health[:, 1] != 0
+    of_each = None if labels is None else np.arange(len(health)) // (len(health) // len(labels))
     if failed.any():
         reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
         listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
@@ -50,8 +53,8 @@ def warn_about(
             listed += "; in process_dist a rate below 0, a probability above 1 or a size that is "
             listed += "not a whole number is drawn as NaN"
         warnings.warn(
-            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations: "
-            f"{listed}",
+            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations"
+            f"{_named(labels, of_each, failed)}: {listed}",
             FilterWarning,
             stacklevel=stacklevel,
         )
@@ -61,12 +64,22 @@ def warn_about(
         worst = int(np.argmin(smallest))
         warnings.warn(
             f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
-            f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations (smallest effective "
+            f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations"
+            f"{_named(labels, of_each, collapsed)} (smallest effective "
             f"number {smallest[worst]:.3g}). {_extent(system, filter, arguments_of(worst))}. "
             f"{collapse_remedy(compile_system(system), filter)}",
             FilterWarning,
             stacklevel=stacklevel,
         )
+
+
+def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> str:
+    """The records of the chosen evaluations."""
+    if labels is None:
+        return ""
+    found = [labels[number] for number in np.unique(of_each[chosen])]
+    listed = ", ".join(map(repr, found[:_MOST_LISTED])) + ", .." * (len(found) > _MOST_LISTED)
+    return f", of {'record' if len(found) == 1 else 'records'} {listed}"
 
 
 def warn_of_choice(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:

@@ -158,7 +158,8 @@ def _warn_of_records(
     evaluate = evaluator(LogLikelihood(system, filter))
     arguments = [(theta[g], *record) for g, record in enumerate(single_records(table, seed))]
     health = np.array([evaluate(*each)[1] for each in arguments])
-    warn_about(system, filter, health, lambda g: arguments[g], stacklevel=5)
+    labels = table.records.labels
+    warn_about(system, filter, health, lambda g: arguments[g], labels=labels, stacklevel=5)
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:

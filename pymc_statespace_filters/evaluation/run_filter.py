@@ -124,7 +124,13 @@ def run_filter(
     rows = [rows_at(at, own) for own in at_steps]
     runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
     terms, health, *states = (list(parts) for parts in zip(*runs, strict=True))
-    warn_about(system, filter, np.array(health), lambda i: arguments[i])
+    warn_about(
+        system,
+        filter,
+        np.array(health),
+        lambda i: arguments[i],
+        labels=None if panel is None else table.records.labels,
+    )
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
     dataset = _dataset(system, row_dim, *map(np.concatenate, states))
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))

@@ -158,6 +158,7 @@ class VariableAtDraws:
             self.variable.filter,
             np.concatenate(health),
             arguments_of,
+            labels=[one.label for one in self.records] if self.variable.is_panel else None,
             stacklevel=stacklevel,
         )
 
