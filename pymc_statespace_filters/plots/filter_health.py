@@ -27,6 +27,7 @@ from pymc_statespace_filters.plots.marks import (
     point_size,
     points,
 )
+from pymc_statespace_filters.plots.panels import one_record
 from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
@@ -45,6 +46,7 @@ def plot_filter_health(
     idata: xr.DataTree,
     *,
     var_name: str | None = None,
+    record: Any = None,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
@@ -75,6 +77,8 @@ def plot_filter_health(
         With the group ``filter_diagnostics``.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
+    record : label, optional
+        The record of a panel, which has a figure of its own.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -120,6 +124,8 @@ def plot_filter_health(
     """
     _, results = group_of(idata, "filter_diagnostics")
     name = variable_of(results, var_name, "_residual")
+    idata = one_record(idata, "filter_diagnostics", name, record)
+    results = idata["filter_diagnostics"].to_dataset()
     residual, pit = (
         rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
         for kind in ("residual", "pit")

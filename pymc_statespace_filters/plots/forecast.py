@@ -23,6 +23,7 @@ from pymc_statespace_filters.plots.marks import (
     point_size,
     points,
 )
+from pymc_statespace_filters.plots.panels import several_records
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     data_of,
@@ -45,6 +46,7 @@ def plot_forecast(
     *,
     group: str | None = None,
     var_name: str | None = None,
+    records: Any = None,
     truth: Any = None,
     n_past: int | None = None,
     transform: Callable[[Any], Any] | Mapping[str, Callable[[Any], Any]] | None = None,
@@ -57,7 +59,8 @@ def plot_forecast(
     Bands contain 50 % and 90 % of the draws of a group, after the last observation (`forecast`) or
     beside the observations (a free run). Those of a forecast include the uncertainty of parameters
     and states, the process noise and the observation noise. A vertical line marks the last
-    observation. Units are taken from the results as in `plot_states`.
+    observation. Of a panel, each record has panels of its own. Units are taken from the results as
+    in `plot_states`.
 
     Parameters
     ----------
@@ -67,6 +70,8 @@ def plot_forecast(
         The group with the predicted observations; by default the first of these that is there.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
+    records : label or sequence of labels, optional
+        The records of a panel to show; by default the first twelve.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
         The actual observations: an array of shape (number of predictions, number of observables); a
         DataArray with a dimension ``observable`` and another whose coordinate is time; or the
@@ -121,8 +126,12 @@ def plot_forecast(
     """
     if n_past is not None:
         check_count("n_past", n_past, 0)
-    _, results = group_of(idata, *((group,) if group else GROUPS))
+    group, results = group_of(idata, *((group,) if group else GROUPS))
     name = variable_of(_predicted(results), var_name)
+    facets = several_records(idata, group, name, name, records)
+    if facets is not None:
+        idata, truth = facets.idata, facets.truth(truth, "observations")
+        results, transform = idata[group].to_dataset(), facets.mapping(transform)
     draws = rename_last_dims(results[name], "time", "observable")
     record = data_of(idata, name)
     observables = [str(observable) for observable in draws["observable"].values]
@@ -137,9 +146,17 @@ def plot_forecast(
     observed = _observed_at(draws, truth, record) if errors else None
 
     data = draws.to_dataset(name="observations")
-    collection = canvas_over_time(data, "observable", backend=backend, pc_kwargs=pc_kwargs)
-    at_one_time = data.sizes["time"] == 1
+    collection = canvas_over_time(
+        data,
+        "observable",
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        panels_in_line=1 if facets is None else facets.panels_in_line,
+    )
     quantiles = over_draws(data)
+    at_one_time = int(quantiles["observations"].count("time").max()) == 1
+    if facets is not None and not at_one_time:  # over the times of other records
+        quantiles = quantiles.interpolate_na("time")
     if observed is not None:
         labels = [f"error of {label}" for label in labels]
         median = quantiles.sel(quantile=0.5, drop=True)
@@ -163,7 +180,7 @@ def plot_forecast(
 def _predicted(results: xr.Dataset) -> xr.Dataset:
     """Return the predicted observations of each variable: (chain, draw, time, observable)."""
     names = [str(name) for name in results if results[name].ndim == len(SAMPLE_DIMS) + 2]
-    return results[[name for name in names if not name.endswith("_states")]]
+    return results[[name for name in names if not name.endswith(("_states", "_rmse_of_draws"))]]
 
 
 def _shown(record: xr.DataArray, draws: xr.DataArray, n_past: int | None) -> xr.DataArray:
@@ -182,9 +199,13 @@ def _mark_end(
     collection: PlotCollection, record: xr.DataArray, draws: xr.DataArray
 ) -> dict[str, dict[str, Any]]:
     """Draw a line at the last observation if predictions follow; return its legend entry."""
-    if record["time"][-1] >= draws["time"][-1]:
+    end, last = (
+        array["time"].where(array.notnull()).max([dim for dim in array.dims if dim != "observable"])
+        for array in (record, draws)
+    )
+    end = end.reindex(observable=draws["observable"]).where(end < last)
+    if not end.notnull().any():
         return {}
-    end = record["time"][-1].expand_dims(observable=draws["observable"]).drop_vars("time")
     collection.map(vline, "end", data=end.to_dataset(name="end"), **END)
     return {"end of record": END}
 

@@ -27,18 +27,24 @@ WIDTHS = {90: 1.0, 50: 3.5}  # of bars
 
 
 def canvas_over_time(
-    data: xr.Dataset, dim: str, *, backend: str | None, pc_kwargs: Mapping[str, Any]
+    data: xr.Dataset,
+    dim: str,
+    *,
+    backend: str | None,
+    pc_kwargs: Mapping[str, Any],
+    panels_in_line: int = 1,
 ) -> PlotCollection:
-    """Make a figure with one panel per entry of `dim`, below each other."""
+    """Make a figure with one panel per entry of `dim`, so many beside each other."""
     n_panels = data.sizes[dim]
+    n_lines = -(-n_panels // panels_in_line)
     return canvas(
         data,
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={},
-        size=(7.0, 1.3 + 2.0 * n_panels**0.9),
+        size=(7.0 if panels_in_line == 1 else 3.6 * panels_in_line, 1.3 + 2.0 * n_lines**0.9),
         n_panels=n_panels,
-        panels_in_line=1,
+        panels_in_line=panels_in_line,
         cols=[dim],
     )
 

@@ -21,8 +21,10 @@ from pymc_statespace_filters.plots.marks import (
     points_xy,
     thin_draws,
 )
+from pymc_statespace_filters.plots.panels import one_record
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
+    name_of_states,
     select_names,
     states_of,
     truth_of,
@@ -37,6 +39,7 @@ def plot_phase(
     *,
     group: str | None = None,
     var_name: str | None = None,
+    record: Any = None,
     truth: Any = None,
     n_draws: int = 20,
     backend: str | None = None,
@@ -58,6 +61,8 @@ def plot_phase(
         By default the smoothed states if there are any.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
+    record : label, optional
+        The record of a panel, which has a figure of its own.
     truth : xarray.DataArray, xarray.Dataset or pair of array_like, optional
         The result of `simulate` (if x and y are names of states), or the true x and y over time.
     n_draws : int
@@ -98,7 +103,9 @@ def plot_phase(
     >>> loop.savefig("loop.png")  # doctest: +SKIP
     """
     check_count("n_draws", n_draws, 0)
-    _, states, _, are_paths = states_of(idata, group, var_name)
+    group, name = name_of_states(idata, group, var_name)
+    idata = one_record(idata, group, name, record)
+    _, states, _, are_paths = states_of(idata, group, name)
     both = [_quantity("x", x, states), _quantity("y", y, states)]
     sizes = [dict(quantity.sizes) for quantity in both]
     if sizes[0] != sizes[1]:

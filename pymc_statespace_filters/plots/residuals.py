@@ -15,6 +15,7 @@ from pymc_statespace_filters.plots.axes import few_ticks, label_x, time_label, u
 from pymc_statespace_filters.plots.canvas import band, canvas, interval
 from pymc_statespace_filters.plots.legend import add_legend
 from pymc_statespace_filters.plots.marks import bars, point_size, points, points_xy
+from pymc_statespace_filters.plots.panels import one_record
 from pymc_statespace_filters.plots.results import (
     SAMPLE_DIMS,
     data_of,
@@ -35,6 +36,7 @@ def plot_residuals(
     idata: xr.DataTree,
     *,
     var_name: str | None = None,
+    record: Any = None,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
@@ -58,6 +60,8 @@ def plot_residuals(
         With the group ``filter_diagnostics``.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
+    record : label, optional
+        The record of a panel, which has a figure of its own.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -106,8 +110,9 @@ def plot_residuals(
             "psf.filter_diagnostics(idata, model) again"
         )
     name = variable_of(results, var_name, "_innovation")
-    record = data_of(idata, name)
-    found = _innovations(results, name, record)
+    idata = one_record(idata, "filter_diagnostics", name, record)
+    results, data = idata["filter_diagnostics"].to_dataset(), data_of(idata, name)
+    found = _innovations(results, name, data)
     panels = _panels(results, name, found)
     n_columns = found.z.sizes["observable"]
     width = WIDTH_ALONE if n_columns == 1 else WIDTH * n_columns
@@ -124,10 +129,10 @@ def plot_residuals(
     _draw_points(collection, panels)
     _draw_correlations(collection, panels, found.z)
     predicted = [
-        f"predicted {with_unit(str(one), unit_of(one, found.z, record))}"
+        f"predicted {with_unit(str(one), unit_of(one, found.z, data))}"
         for one in found.z["observable"].values
     ]
-    _label_panels(collection, panels, predicted, time_label(found.z, record))
+    _label_panels(collection, panels, predicted, time_label(found.z, data))
     add_legend(collection, {"95 % if the model is right": {**EXPECTED, "width": 8}}, n_columns > 1)
     return collection
 

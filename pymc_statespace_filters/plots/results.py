@@ -61,11 +61,17 @@ class States(NamedTuple):
     are_paths: bool  # joint paths at every step, which may be drawn as lines
 
 
-def states_of(idata: Any, group: str | None, var_name: str | None) -> States:
-    """Read the states of a group, by default the smoothed ones if there are any."""
+def name_of_states(idata: Any, group: str | None, var_name: str | None) -> tuple[str, str]:
+    """Return the group, by default the smoothed states if there are any, and the variable."""
     groups = ("smoothed_states", "filtered_states") if group is None else (group,)
     group, results = group_of(idata, *groups)
-    name = variable_of(results, var_name, "_states")
+    return group, variable_of(results, var_name, "_states")
+
+
+def states_of(idata: Any, group: str | None, var_name: str | None) -> States:
+    """Read the states of a group, by default the smoothed ones if there are any."""
+    group, name = name_of_states(idata, group, var_name)
+    results = idata[group].to_dataset()
     draws = rename_last_dims(results[f"{name}_states"], "time", "state")
     at_observations = results.attrs.get("at") == "observations"
     return States(name, draws, at_observations, group != "filtered_states" and not at_observations)

@@ -25,9 +25,11 @@ from pymc_statespace_filters.plots.marks import (
     points,
     thin_draws,
 )
+from pymc_statespace_filters.plots.panels import several_records
 from pymc_statespace_filters.plots.results import (
     data_of,
     measured_by,
+    name_of_states,
     observations_of,
     select_names,
     states_of,
@@ -49,6 +51,7 @@ def plot_states(
     *,
     group: str | None = None,
     var_name: str | None = None,
+    records: Any = None,
     states: str | Sequence[str] | None = None,
     observables: Mapping[str, str] | None = None,
     truth: Any = None,
@@ -66,6 +69,8 @@ def plot_states(
     The path of `simulate` is shown as a line, and each observable that is no state in a panel of
     its own.
 
+    Of a panel, each record has panels of its own.
+
     Axes have units if the results have them in ``attrs["units"]``: of the variable or of its last
     coordinate, as a text, a list or a mapping from names; and of the coordinate of time.
 
@@ -77,6 +82,8 @@ def plot_states(
         By default the smoothed states if there are any.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
+    records : label or sequence of labels, optional
+        The records of a panel to show; by default the first twelve.
     states : str or sequence of str, optional
         Names of the states to show; all by default.
     observables : mapping of str to str, optional
@@ -85,7 +92,7 @@ def plot_states(
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
         The result of `simulate`; a DataArray with a dimension ``state`` and another whose
         coordinate is time; or an array of shape (number of times, number of states). It is shown
-        within the range of times of the states.
+        within the range of times of the states. Of a panel, the result of `simulate`.
     n_draws : int
         Number of draws to show beside the bands: as lines for smoothed states at every step, as
         points for filtered states and for states at observation times only.
@@ -129,6 +136,13 @@ def plot_states(
     if isinstance(idata, xr.Dataset):
         refuse_without_draws(group=group, var_name=var_name, truth=truth, n_draws=n_draws or None)
         return draw_simulation(idata, states, observables, transform, backend, pc_kwargs)
+    group, name = name_of_states(idata, group, var_name)
+    facets = several_records(idata, group, name, f"{name}_states", records)
+    if facets is not None:
+        names = [str(state) for state in states_of(idata, group, name).draws["state"].values]
+        idata, truth = facets.idata, facets.truth(truth, "states")
+        states = facets.names(states, names)
+        observables, transform = facets.mapping(observables, True), facets.mapping(transform)
     name, draws, at_observations, are_paths = states_of(idata, group, var_name)
     all_states = [str(state) for state in draws["state"].values]
     shown = select_names("states", states, all_states)
@@ -138,10 +152,18 @@ def plot_states(
     true = None if truth is None else _truth(truth, draws, functions, shown)
 
     data = transformed(draws.sel(state=shown), "state", functions).to_dataset(name="states")
-    collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
+    collection = canvas_over_time(
+        data,
+        "state",
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        panels_in_line=1 if facets is None else facets.panels_in_line,
+    )
     # Bands below the points, lines above them.
     as_bars = at_observations and data.sizes["time"] <= FEW
     quantiles = over_draws(data)
+    if facets is not None and not as_bars:  # over the times of other records
+        quantiles = quantiles.interpolate_na("time")
     bands = (draw_bars if as_bars else draw_bands)(collection, quantiles)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths else (points, DOTS)

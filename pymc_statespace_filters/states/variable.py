@@ -112,6 +112,7 @@ class VariableAtDraws:
         with row_progress(self, enabled=enabled) as begin:
             begin(task, n_tasks * self.n_draws * len(self.records))
             yield
+            begin("", 0)  # fills the bar, if there were fewer
 
     def evaluate(
         self,

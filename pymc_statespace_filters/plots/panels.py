@@ -1,0 +1,175 @@
+"""Records of a panel as plots take them: each as results of a variable without a panel."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.plots.axes import unit_of
+from pymc_statespace_filters.plots.results import group_of, select_names
+
+MOST_RECORDS = 12  # that a figure shows unless others are chosen
+RECORDS_IN_LINE = 3
+
+
+def labels_of(results: xr.Dataset, name: str) -> list[Any] | None:
+    """Return the labels of the records of a variable in a group; None if it is no panel."""
+    if (labels := results.coords.get(f"{name}_panel")) is None:
+        return None
+    return list(dict.fromkeys(labels.values.tolist()))
+
+
+def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.DataTree:
+    """Return a group and the data of one record of a panel, over its own times.
+
+    A variable without a panel is left as it is.
+    """
+    _, results = group_of(idata, group)
+    labels = labels_of(results, name)
+    if labels is None:
+        if record is not None:
+            raise ModelError(f"record must be None, because {name!r} is no panel, got {record!r}")
+        return idata
+    if record not in labels:
+        raise ModelError(f"record must be a label of the panel, one of {labels}, got {record!r}")
+    found = {group: _rows_of(results, name, record)}
+    if (data := _data_of(idata, name, labels)) is not None:
+        found["observed_data"] = _rows_of(data, name, record)
+    if "sample_stats" in idata.children:
+        found["sample_stats"] = idata["sample_stats"].to_dataset()
+    return xr.DataTree.from_dict(found)
+
+
+class Facets(NamedTuple):
+    """Several records of a panel as one, whose names are "record: name"; times are those of all.
+
+    ``n_names`` is the number of names of a record. Where a record has no row, there is NaN.
+    """
+
+    idata: xr.DataTree
+    labels: list[Any]
+    n_names: int
+
+    def names(self, chosen: str | Sequence[str] | None, of_record: Sequence[str]) -> list[str]:
+        """The chosen names of every record, one record after the other."""
+        names = select_names("states", chosen, of_record)
+        return [named(label, name) for label in self.labels for name in names]
+
+    def mapping(self, given: Any, are_names: bool = False) -> Any:
+        """A user's mapping from names, with an entry for each record; others as they are."""
+        if not isinstance(given, Mapping):
+            return given
+        return {
+            named(label, name): named(label, value) if are_names else value
+            for label in self.labels
+            for name, value in given.items()
+        }
+
+    def truth(self, truth: Any, simulated: str) -> xr.DataArray | None:
+        """A result of `simulate` with a panel, with the names of every record."""
+        if truth is None:
+            return None
+        rows = {"states": "", "observations": "obs_"}[simulated]
+        if not isinstance(truth, xr.Dataset) or f"{rows}record" not in truth.coords:
+            raise ModelError("truth of a panel must be the result of psf.simulate(..., panel=...)")
+        found = truth[simulated]
+        of_rows = found[f"{rows}record"].values
+        parts = [
+            _over_times(found.isel({found.dims[0]: of_rows == label}), f"{rows}time")
+            for label in self.labels
+        ]
+        return _side_by_side(parts, self.labels)
+
+    @property
+    def panels_in_line(self) -> int:
+        """How many panels of the figure are beside each other."""
+        return self.n_names if self.n_names > 1 else min(RECORDS_IN_LINE, len(self.labels))
+
+
+def several_records(
+    idata: xr.DataTree, group: str, name: str, variable: str, records: Any
+) -> Facets | None:
+    """Return records of a panel as facets of the group's array ``variable``; None without one."""
+    _, results = group_of(idata, group)
+    labels = labels_of(results, name)
+    if labels is None:
+        if records is not None:
+            raise ModelError(f"records must be None, because {name!r} is no panel, got {records!r}")
+        return None
+    chosen = _chosen(records, labels)
+    trees = [one_record(idata, group, name, label) for label in chosen]
+    of_group = [tree[group].to_dataset()[variable] for tree in trees]
+    found = {group: _side_by_side(of_group, chosen).to_dataset(name=variable)}
+    found[group].attrs = results.attrs
+    if "observed_data" in trees[0].children:
+        of_data = [tree["observed_data"].to_dataset()[name] for tree in trees]
+        found["observed_data"] = _side_by_side(of_data, chosen).to_dataset(name=name)
+    return Facets(xr.DataTree.from_dict(found), chosen, of_group[0].shape[-1])
+
+
+def _chosen(records: Any, labels: list[Any]) -> list[Any]:
+    if records is None:
+        return labels[:MOST_RECORDS]
+    is_list = isinstance(records, Iterable) and not isinstance(records, str)
+    chosen = list(records) if is_list else [records]
+    if not chosen or set(chosen) - set(labels):
+        raise ModelError(f"records must be labels of the panel, among {labels}, got {records!r}")
+    return chosen
+
+
+def named(label: Any, name: str) -> str:
+    """Return the name of a state or an observable of a record."""
+    return f"{label}: {name}"
+
+
+def _over_times(array: xr.DataArray, time: str) -> xr.DataArray:
+    """Give the rows, the first dimension, their times as only coordinate."""
+    times, dim = array[time].values, array.dims[0]
+    kept = array.drop_vars([name for name, c in array.coords.items() if dim in c.dims])
+    return kept.rename({dim: "time"}).assign_coords(time=times)
+
+
+def _rows_of(results: xr.Dataset, name: str, record: Any) -> xr.Dataset:
+    """Select the rows and the results of one record."""
+    (dim,) = results[f"{name}_panel"].dims
+    found = results.isel({dim: results[f"{name}_panel"].values == record})
+    of_records = f"{name}_record"
+    if of_records in found.dims:
+        found = found.sel({of_records: record}, drop=True)
+    times = found[f"{name}_time"]
+    found = found.drop_vars([dim, f"{name}_panel", f"{name}_time"])
+    found = found.rename({dim: f"{name}_time"})
+    return found.assign_coords({f"{name}_time": (f"{name}_time", times.values, times.attrs)})
+
+
+def _data_of(idata: xr.DataTree, name: str, labels: Sequence[Any]) -> xr.Dataset | None:
+    """Return the observations with record and time of each row, if idata has these."""
+    if "observed_data" not in idata.children or "constant_data" not in idata.children:
+        return None
+    data, known = idata["observed_data"].to_dataset(), idata["constant_data"].to_dataset()
+    if not {f"{name}_panel", f"{name}_time"} <= set(known) or name not in data:
+        return None
+    row = data[name].dims[0]
+    of_rows = known[f"{name}_panel"].values
+    if isinstance(labels[0], str):  # their data are numbers of records
+        of_rows = np.array(labels)[of_rows]
+    times = known[f"{name}_time"]
+    return data[[name]].assign_coords(
+        {f"{name}_panel": (row, of_rows), f"{name}_time": (row, times.values, times.attrs)}
+    )
+
+
+def _side_by_side(parts: Sequence[xr.DataArray], labels: Sequence[Any]) -> xr.DataArray:
+    """Join arrays of records along their last dimension, with the names of each record."""
+    dim = parts[0].dims[-1]
+    names = [str(name) for name in parts[0][dim].values]
+    renamed = [
+        part.assign_coords({dim: [named(label, name) for name in names]})
+        for label, part in zip(labels, parts, strict=True)
+    ]
+    joined = xr.concat(renamed, dim, join="outer", combine_attrs="override")
+    units = {name: unit for name in names if (unit := unit_of(name, parts[0])) is not None}
+    joined.attrs["units"] = {named(label, n): u for label in labels for n, u in units.items()}
+    return joined
