@@ -112,6 +112,7 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
     prepare, initialise, propagate, observe = (part.function for part in parts)
     normals = _standard_normals if noise else _zeros
     dt, n, n_start, m, p = system.dt, system.n, compiled.n_start, compiled.m, system.p
+    n_theta = system.n_theta
 
     def simulate(rng, theta, steps, inputs, t0):
         c = prepare(theta)
@@ -119,7 +120,10 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
         states = np.empty((n_steps + 1, n))
         observations = np.empty((steps.size, p))
         x = np.empty((n, 1))
-        initialise(c, normals(rng, n_start), x)
+        if noise:
+            initialise(c, normals(rng, n_start), x)
+        else:  # by the mean itself: the covariance may be infinite
+            copy_into(x[:, 0], c[n_theta : n_theta + n])
         j = 0
         for k in range(n_steps + 1):
             copy_into(states[k], x[:, 0])

@@ -22,7 +22,8 @@ FAILURES: dict[int, str] = {
     ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
     NO_PROCESS_NOISE: "the process noise vanished where the state may be",
     GRID_TOO_LARGE: "the grid would need more than 8192 points, for the noise or the sensor is so "
-    "fine beside the spread of the state, or the equations are so far from smooth",
+    "fine beside the spread of the state, or the equations are so far from smooth; a larger "
+    "tolerance, such as GridFilter(tolerance=1e-3), needs fewer",
     OUT_OF_MEMORY: "there was not enough memory for the members",
 }
 

@@ -241,7 +241,8 @@ class StateSpaceModel:
         if transition is None:
             return self
         steps = {"transition": transition, "gaussian_transition": None}
-        return self._with_equations(steps)._with(discrete_noise=False)
+        # Of an infinite variance even the root is large: its square, in a sum of noises, overflows.
+        return self._with_equations(steps)._with(discrete_noise=False, keeps_noises=True)
 
     @cached_property
     def gaussian(self) -> "StateSpaceModel":

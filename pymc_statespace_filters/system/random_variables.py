@@ -95,8 +95,8 @@ def _entries(equation: Equation, values: Values) -> list[TensorVariable]:
         symbol = entry if isinstance(entry, TensorVariable) else as_symbol(equation.role, entry)
         if symbol.type.ndim > 1:
             raise ModelError(
-                f"{equation.role} must return scalar or vector distributions, got {symbol} of "
-                f"{symbol.type.ndim} dimensions"
+                f"{equation.role} must return scalar or vector distributions, got one of "
+                f"{symbol.type.ndim} dimensions; write one distribution for each vector"
             )
         symbols.append(symbol)
     return symbols

@@ -22,7 +22,7 @@ def system(step=lambda x, a: a * x, **changes):
 
 def drift(function, dt=0.05):
     return system(
-        transition=psf.EulerMaruyama(lambda x: function(x[0]), 0.5, dt), process_noise=None
+        transition=psf.EulerMaruyama(lambda x: function(x[0]), 0.5, dt=dt), process_noise=None
     )
 
 

@@ -9,7 +9,9 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 
 def system(diffusion, dt=0.25, substeps=1):
     return psf.StateSpaceModel(
-        transition=psf.EulerMaruyama(lambda x, a: [a * x[1], -x[0]], diffusion, dt, substeps),
+        transition=psf.EulerMaruyama(
+            lambda x, a: [a * x[1], -x[0]], diffusion, dt=dt, substeps=substeps
+        ),
         observation=lambda x: [x[0]],
         observation_noise=[[1.0]],
         initial_mean=[1.0, 2.0],

@@ -4,6 +4,7 @@ import re
 import warnings
 
 import numpy as np
+import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
@@ -75,6 +76,40 @@ def test_the_gradient_of_an_explosion_is_finite():
             DOUBLE_WELL_SYSTEM, KNOWN | dict(zip(PARAMETERS, point, strict=True))
         )
         assert np.isfinite(gradient(theta, *rest)).all()
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()], ids=lambda f: type(f).__name__)
+def test_a_covariance_that_no_observation_depends_on_must_exist(filter):
+    """Its NaN stay in the state that nobody observes; members and particles fail there."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + q[0], 0.8 * x[1] + q[1]],
+        process_dist=lambda r: [pm.MvNormal.dist(np.zeros(2), pt.stacklists([[1.0, r], [r, 1.0]]))],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.1]],
+        initial_mean=[0.0, 0.0],
+        initial_cov=np.eye(2),
+    )
+    record = {"observed": [0.5, np.nan, -0.3], "steps": [0, 1, 2]}
+    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 2"):
+        terms = psf.log_likelihood(system, filter, {"r": [0.5, 2.0]}, **record)
+    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 1"):
+        alone = psf.log_likelihood(system, filter, {"r": 2.0}, **record)
+    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 1"):
+        run = psf.run_filter(system, filter, {"r": 2.0}, **record)
+    panel = {
+        "panel": [0, 0, 0, 1, 1, 1],
+        "steps": [0, 1, 2] * 2,
+        "observed": [0.5, np.nan, -0.3] * 2,
+    }
+    with pm.Model() as model:
+        pm.Normal("r", shape=2)
+        psf.StateSpace("d", system, filter, **panel)
+    good, bad = (model.compile_dlogp()({"r": r}) for r in ([0.5, 0.4], [0.5, 2.0]))
+    assert np.isfinite(bad).all()
+    assert good[0] == bad[0]
+    assert np.isfinite(terms[0]).all()
+    for failed in (terms[1], alone, run["log_likelihood"].values):
+        np.testing.assert_array_equal(failed == -np.inf, [False, False, True])
 
 
 @pytest.mark.parametrize("filter", FILTERS[1:3], ids=lambda f: type(f).__name__)

@@ -166,6 +166,34 @@ def test_heavy_tails():
     check_mean_likelihood(system, {"nu": 2.5}, record, exact, n_particles=50)
 
 
+@pytest.mark.parametrize(
+    ("law", "mean"),
+    [
+        (lambda nu: pm.StudentT.dist(nu=nu, mu=0.4, sigma=0.3), 0.4),
+        (lambda nu: pm.InverseGamma.dist(alpha=nu, beta=0.2), 0.4),
+    ],
+)
+def test_no_normal_variable_has_an_infinite_variance(law, mean):
+    """Filters that need one fail; a path without noise follows the mean, which is finite."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [0.5 * x[0] + q[0]],
+        process_dist=lambda nu: [law(nu)],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.25]],
+        initial_dist=lambda nu: [law(nu)],
+    )
+    record = {"observed": [0.5, 1.0], "steps": [1, 2]}
+    for filter in (psf.EKF(), psf.UKF(), psf.IPLF(), psf.EnKF(20)):
+        with pytest.warns(psf.FilterWarning, match="-inf in 2 of 3"):
+            terms = psf.log_likelihood(system, filter, {"nu": [2.1, 2.0, 1.5]}, **record)
+        assert np.isfinite(terms[0]).all()
+        assert (terms[1:] == -np.inf).all()
+    path = psf.simulate(system, {"nu": 1.5}, steps=[2], noise=False)["states"].values[:, 0]
+    np.testing.assert_allclose(path, [mean, 1.5 * mean, 1.75 * mean])
+    exact = psf.log_likelihood(system, psf.BootstrapPF(1000), {"nu": 1.5}, **record, seed=1)
+    assert np.isfinite(exact).all()
+
+
 def immigration(observation_noise=1.0):
     return psf.StateSpaceModel(
         transition=lambda x, q: [x[0] - q[0] + q[1]],

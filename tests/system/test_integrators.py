@@ -132,7 +132,7 @@ def test_an_undamped_oscillator_gains_no_energy_in_100_000_steps():
     start, end = after(psf.SemiImplicitEuler(oscillator, dt=0.1, velocities=["speed"]), 100_000)
     assert (np.abs(end / start - 1) < 0.1).all()
     assert (np.abs(end / start - 1) > 0.001).any()
-    start, end = after(psf.EulerMaruyama(oscillator, np.zeros((2, 1)), 0.1), 1000)
+    start, end = after(psf.EulerMaruyama(oscillator, np.zeros((2, 1)), 0.1, 1), 1000)
     np.testing.assert_allclose(end, 1.01**1000 * start, rtol=1e-9)
 
 
@@ -523,11 +523,11 @@ BAD = {
         "diffusion must not depend on the state x in LocalLinearization",
     ),
     "no diffusion": (
-        lambda: psf.Milstein(pull, None, dt=0.1),
-        "diffusion must be .* in Milstein, got None; RungeKutta4 and SemiImplicitEuler treat",
+        lambda: psf.Milstein(pull, dt=0.1),
+        "diffusion must be .* in Milstein, got None; RungeKutta4, .* treat equations without",
     ),
     "no diffusion of Euler": (
-        lambda: psf.EulerMaruyama(pull, None, 0.1),
+        lambda: psf.EulerMaruyama(pull, dt=0.1),
         "diffusion must be .* in EulerMaruyama, got None",
     ),
     "Levy areas": (
@@ -575,7 +575,7 @@ BAD = {
         lambda: psf.ExactLinear(lambda x: [[x[0]]], [[1.0]], dt=0.1),
         "A: the argument name 'x' is reserved",
     ),
-    "no B": (lambda: psf.ExactLinear([[1.0]], None, dt=0.1), "B must be a matrix .*got None"),
+    "no B": (lambda: psf.ExactLinear([[1.0]], dt=0.1), "B must be a matrix .*got None; B of zeros"),
     "offset too long": (
         lambda: system_of(psf.ExactLinear(np.eye(2), np.eye(2), dt=0.1, offset=[1.0] * 3)),
         r"offset must have shape \(2,\), got \(3,\)",

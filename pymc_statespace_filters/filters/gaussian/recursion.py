@@ -134,7 +134,8 @@ def _compile_forward(
     parameters, start, predict, update = (part.function for part in parts.values())
     valid = covariance_check(recursion.system)
     has_valid_covariances = valid.function
-    dt, is_finite = recursion.system.dt, all_finite(recursion.system.n)
+    dt, has_finite_mean = recursion.system.dt, all_finite(recursion.system.n)
+    is_finite = all_finite(recursion.size)
     new, save, result = tape.new, tape.save, tape.result
 
     def forward(theta, steps, observed, inputs, t0, seed):
@@ -158,11 +159,12 @@ def _compile_forward(
             if is_missing(observed, j):
                 terms[j] = 0.0
                 continue
-            finite = is_finite(s)
+            has_mean, finite = has_finite_mean(s), is_finite(s)
             s, terms[j] = update(c, inputs, k, t0 + k * dt, observed[j], s)
-            if not np.isfinite(terms[j]):
+            # A state that no observation depends on may be NaN where the term is finite.
+            if not (finite and np.isfinite(terms[j])):
                 terms[j:] = -np.inf
-                health[1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
+                health[1] = COVARIANCE_NOT_POSITIVE if has_mean else NO_FINITE_MEMBER
                 health[2] = j
                 break
         return result(terms, health, states, row, s)

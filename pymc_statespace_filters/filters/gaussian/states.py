@@ -141,15 +141,16 @@ def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
                     after[k, i] = s[i]
                 s = predict(c, inputs, k, t0 + k * dt, s, Z, k)
                 k += 1
-            finite = True
+            has_mean = finite = True
             for i in range(size):
                 before[j, i] = s[i]
-                finite &= i >= n or np.isfinite(s[i])
+                finite &= np.isfinite(s[i])
+                has_mean &= i >= n or np.isfinite(s[i])
             if is_missing(observed, j):
                 continue
             s, term = update(c, inputs, k, t0 + k * dt, observed[j], s, Z, k)
-            if not np.isfinite(term):
-                health[1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
+            if not (finite and np.isfinite(term)):
+                health[1] = COVARIANCE_NOT_POSITIVE if has_mean else NO_FINITE_MEMBER
                 health[2] = j
                 return before, after, k, health
         for i in range(size):

@@ -27,6 +27,9 @@ from pymc_statespace_filters.system.quantiles import (
 Moments = tuple[Any, Any]
 
 
+_SD_OF_INFINITE_VARIANCE = pt.constant(1e200, dtype="float64")
+
+
 class Domain(NamedTuple):
     """Which values a parameter may have, in words and as a condition on arrays and symbols."""
 
@@ -87,11 +90,13 @@ class ScalarLaw:
 def root(variance: Any) -> TensorVariable:
     """The standard deviation, with a finite derivative at a variance of zero; zero below it.
 
-    A Kalman update may leave a negative count, and so a negative variance.
+    A Kalman update may leave a negative count, and so a negative variance. An infinite variance
+    gives a number whose square overflows: a filter fails, and without noise the mean stays.
     """
     variance = pt.as_tensor(variance)
-    is_positive = variance > 0
-    return pt.switch(is_positive, pt.sqrt(pt.switch(is_positive, variance, 1.0)), 0.0)
+    has_none = variance <= 0
+    sd = pt.minimum(pt.sqrt(pt.switch(has_none, 1.0, variance)), _SD_OF_INFINITE_VARIANCE)
+    return pt.switch(has_none, 0.0, sd)
 
 
 def _negative_binomial(n, p):
@@ -123,8 +128,8 @@ def _geometric_draw(z, p):
 
 
 def _inverse_gamma(a, b):
-    mean = b / (a - 1)
-    return mean, pt.switch(a > 2, mean**2 / (a - 2), float("nan"))
+    mean = pt.switch(a > 1, b / (a - 1), np.inf)
+    return mean, pt.switch(a > 2, mean**2 / (a - 2), np.inf)
 
 
 def _laplace_draw(z, mu, b):
@@ -142,7 +147,7 @@ def _log_normal(mu, sigma):
 
 
 def _student_t(nu, mu, sigma):
-    return mu, pt.switch(nu > 2, sigma**2 * nu / (nu - 2), float("nan"))
+    return mu, pt.switch(nu > 2, sigma**2 * nu / (nu - 2), np.inf)
 
 
 def _student_t_draw(z, z_scale, nu, mu, sigma):

@@ -33,6 +33,7 @@ class EulerMaruyama(SubstepIntegrator):
     diffusion : callable or array_like, shape (n, m)
         ``G(x, u, t, ...)``, one row per state and one column per independent Wiener process, per
         square root of time. Correlated noises share columns. One state and one noise: a scalar.
+        It must be given: other integrators treat equations without noise.
     dt : float
         Length of one step, in the time unit of the drift.
     substeps : int
@@ -48,8 +49,8 @@ class EulerMaruyama(SubstepIntegrator):
     """
 
     drift: Callable
-    diffusion: Any
-    dt: float
+    diffusion: Any = None
+    dt: float = None  # type: ignore[assignment]  # behind a default, but it must be given
     substeps: int = 1
 
     def __post_init__(self) -> None:

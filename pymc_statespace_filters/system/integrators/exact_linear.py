@@ -62,7 +62,7 @@ class ExactLinear:
     """
 
     A: Any
-    B: Any
+    B: Any = None
     _: KW_ONLY
     dt: float
     offset: Any = None
@@ -74,7 +74,10 @@ class ExactLinear:
                 object.__setattr__(self, name, _constant(name, value))
         for name in ("A", "B"):
             if getattr(self, name) is None:
-                raise ModelError(f"{name} must be a matrix or a function of parameters, got None")
+                raise ModelError(
+                    f"{name} must be a matrix or a function of parameters, got None; B of zeros, "
+                    "shape (n, 1), is an equation without noise"
+                )
         _ = self.equations  # checks the functions
 
     @property

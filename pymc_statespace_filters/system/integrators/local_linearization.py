@@ -1,7 +1,7 @@
 """Local linearization: exact steps of the tangent of an equation, for stiff equations."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ class LocalLinearization(SubstepIntegrator):
     drift : callable
         ``f(x, u, t, ...)`` as for `EulerMaruyama`; it is held at the start of a substep as a
         function of time.
-    diffusion : callable or array_like, shape (n, m), or None
+    diffusion : callable or array_like, shape (n, m), optional
         ``G(u, t, ...)``, which must not depend on the state. None is an ordinary differential
         equation.
     dt : float
@@ -56,14 +56,15 @@ class LocalLinearization(SubstepIntegrator):
     >>> import pymc_statespace_filters as psf
     >>> def relaxation(x, mu):
     ...     return [x[1], mu * (1 - x[0] ** 2) * x[1] - x[0]]
-    >>> psf.LocalLinearization(relaxation, None, dt=0.1).refined().substeps
+    >>> psf.LocalLinearization(relaxation, dt=0.1).refined().substeps
     2
     """
 
     drift: Callable
-    diffusion: Any
-    dt: float = field(kw_only=True)
-    substeps: int = field(default=1, kw_only=True)
+    diffusion: Any = None
+    _: KW_ONLY
+    dt: float
+    substeps: int = 1
 
     def noise_size(self, values: Values) -> int:
         """Number of standard normals of a step: one per state and substep."""

@@ -1,7 +1,7 @@
 """Milstein steps, for noise that depends on the state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class Milstein(SubstepIntegrator):
     drift : callable
         ``f(x, u, t, ...)`` as for `EulerMaruyama`.
     diffusion : callable or array_like, shape (n, m)
-        ``G(x, u, t, ...)`` as for `EulerMaruyama`.
+        ``G(x, u, t, ...)`` as for `EulerMaruyama`, which must be given.
     dt : float
         Length of one step, in the time unit of the drift.
     substeps : int
@@ -72,9 +72,10 @@ class Milstein(SubstepIntegrator):
     """
 
     drift: Callable
-    diffusion: Any
-    dt: float = field(kw_only=True)
-    substeps: int = field(default=1, kw_only=True)
+    diffusion: Any = None
+    _: KW_ONLY
+    dt: float
+    substeps: int = 1
 
     def __post_init__(self) -> None:
         check_needed(self.diffusion, "Milstein")

@@ -77,7 +77,7 @@ class RungeKutta4(SubstepIntegrator):
         Those of the Runge-Kutta step, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24, do not tell z: each
         belongs to a slow decay, and to a fast one near the limit of stability.
         """
-        return EulerMaruyama(self.drift, _no_noise, self.dt / self.substeps)
+        return EulerMaruyama(self.drift, _no_noise, dt=self.dt / self.substeps)
 
     def is_stable_at(self, eigenvalues: NDArray[np.complex128]) -> NDArray[np.bool_]:
         """Whether no eigenvalue 1 + z of `examined_step` has an absolute z above 1.6.

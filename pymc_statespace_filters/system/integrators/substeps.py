@@ -97,5 +97,5 @@ def check_needed(diffusion: Any, integrator: str) -> None:
     if diffusion is None:
         raise ModelError(
             f"diffusion must be a function or a matrix of numbers in {integrator}, got None; "
-            "RungeKutta4 and SemiImplicitEuler treat equations without noise"
+            "RungeKutta4, SemiImplicitEuler and LocalLinearization treat equations without noise"
         )

@@ -112,7 +112,7 @@ def _forward(
             last = states[n_steps * size :]
             if _observe(lanes, group, panel, data, k, d, seen, out):
                 call(f.update, W, n_lanes, last, forces[n_steps * force_size :], t0, dt, k, 1)
-                n_alive -= _store_terms(f.n, lanes, group, last, seen, term, out, of_records)
+                n_alive -= _store_terms(f.n, lanes, group, last[:size], seen, term, out, of_records)
                 last = last[size:]
             copy(last, s)
 
@@ -156,8 +156,15 @@ def _observe(lanes, records, rows, observed, k, d, seen, terms):
 
 @njit_internal
 def _store_terms(n, lanes, records, s, seen, term, terms, health):
-    """Store the finite terms of an update; return how many records have none and fail there."""
+    """Store the finite terms of an update; return how many records have none and fail there.
+
+    ``s`` are the states before it.
+    """
     n_failed = 0
+    # A state that no observation depends on may be NaN where the term is finite.
+    for i in range(s.size // LANES):
+        for lane in range(LANES):
+            term[lane] += 0.0 * s[i * LANES + lane]
     for lane in range(records.shape[0]):
         if seen[lane] == 0.0:
             continue
@@ -168,7 +175,7 @@ def _store_terms(n, lanes, records, s, seen, term, terms, health):
         lanes[ALIVE, lane] = 0
         n_failed += 1
         finite = True
-        for i in range(n):  # such an update leaves the state as it is
+        for i in range(n):
             finite &= np.isfinite(s[i * LANES + lane])
         health[point, 1] = COVARIANCE_NOT_POSITIVE if finite else NO_FINITE_MEMBER
         health[point, 2] = j
