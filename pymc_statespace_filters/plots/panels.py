@@ -139,7 +139,7 @@ def _rows_of(results: xr.Dataset, name: str, record: Any) -> xr.Dataset:
     if of_records in found.dims:
         found = found.sel({of_records: record}, drop=True)
     times = found[f"{name}_time"]
-    found = found.drop_vars([dim, f"{name}_panel", f"{name}_time"])
+    found = found.drop_vars([dim, f"{name}_panel", f"{name}_time"], errors="ignore")
     found = found.rename({dim: f"{name}_time"})
     return found.assign_coords({f"{name}_time": (f"{name}_time", times.values, times.attrs)})
 

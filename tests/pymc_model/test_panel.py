@@ -1,5 +1,6 @@
 """`StateSpace(panel=)`: the log-density, gradient and draws of many records in one variable."""
 
+import arviz as az
 import cloudpickle
 import numpy as np
 import pymc as pm
@@ -241,3 +242,22 @@ def test_draws_are_the_same_in_every_mode():
     variable = model_of(observed=None, inputs=OWN_FORCES)["d"]
     draws = [pm.draw(variable, 2, random_seed=3, mode=mode) for mode in (None, "FAST_COMPILE")]
     np.testing.assert_array_equal(*draws)
+
+
+def test_a_record_never_seen_has_parameters_of_the_population():
+    """Its mean and variance at step 1 by hand, within 5 standard errors of 8000 draws."""
+    mu = 0.6
+    idata = az.from_dict({"posterior": {"mu": np.full((4, 2000), mu)}})
+    with pm.Model():
+        population = pm.Flat("mu")
+        a = pm.Normal("new_a", population, 0.5)
+        psf.StateSpace("new", FORCED, psf.EKF(), steps=[1], inputs=FORCE, params={"a": a})
+        found = pm.sample_posterior_predictive(
+            idata, var_names=["new"], predictions=True, random_seed=1, progressbar=False
+        )
+    drawn = found["predictions"]["new"].values.ravel()
+    # x1 = a x0 + u0 + q, seen with noise: E[a^2] times 1, and 1 and 0.5.
+    variance = mu**2 + 0.25 + 1.0 + 0.5
+    fourth = 3 * ((mu**4 + 6 * mu**2 * 0.25 + 3 * 0.0625) + 2 * 1.5 * (mu**2 + 0.25) + 2.25)
+    assert abs(drawn.mean() - FORCE[0]) < 5 * np.sqrt(variance / drawn.size)
+    assert abs(drawn.var() - variance) < 5 * np.sqrt((fourth - variance**2) / drawn.size)

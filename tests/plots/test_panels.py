@@ -1,0 +1,160 @@
+"""Plots of a panel: records side by side, or one of them, as results without a panel."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pymc_statespace_filters import (
+    plot_filter_health,
+    plot_forecast,
+    plot_phase,
+    plot_residuals,
+    plot_states,
+)
+from pymc_statespace_filters.errors import ModelError
+
+LABELS, LENGTHS = ["A", "B"], [3, 5]
+OF_ROWS = np.repeat(LABELS, LENGTHS)
+TIMES = np.concatenate([[1.0, 2.0, 4.0], [0.5, 1.0, 3.0, 4.0, 6.0]])
+RNG = np.random.default_rng(1)
+DRAWN = np.arange(8.0) + RNG.normal(scale=0.1, size=(2, 50, 8))
+DATA = np.arange(8.0)
+ROWS = {"d_panel": ("d_obs", OF_ROWS), "d_time": ("d_obs", TIMES)}
+
+
+def a_tree(group, variable, values, dims, last, names=("level",), **attrs):
+    results = xr.Dataset({variable: (dims, values)}, coords={**ROWS, last: list(names)})
+    observed = xr.Dataset(
+        {"d": (("d_obs", "observable"), DATA[:, None])}, coords={"observable": ["level"]}
+    )
+    # Labels that are texts are stored as numbers of records.
+    constant = xr.Dataset(
+        {"d_panel": ("d_obs", np.repeat([0, 1], LENGTHS)), "d_time": ("d_obs", TIMES)}
+    )
+    return xr.DataTree.from_dict(
+        {group: results.assign_attrs(attrs), "observed_data": observed, "constant_data": constant}
+    )
+
+
+@pytest.fixture
+def states():
+    dims = ("chain", "draw", "d_obs", "state")
+    return a_tree("smoothed_states", "d_states", DRAWN[..., None], dims, "state", at="observations")
+
+
+def drawn_points(collection, visual, **where):
+    return collection.get_viz(visual, **where).get_offsets().data
+
+
+def test_each_record_has_a_panel_with_its_own_data(states):
+    collection = plot_states(states, backend="matplotlib")
+    assert list(collection.viz["plot"]["state"].values) == ["A: level", "B: level"]
+    for label in LABELS:
+        points = drawn_points(collection, "data", state=f"{label}: level")
+        rows = label == OF_ROWS
+        np.testing.assert_array_equal(points, np.stack([TIMES[rows], DATA[rows]], axis=1))
+
+
+def test_chosen_records_in_their_order(states):
+    collection = plot_states(states, records="B", backend="none")
+    assert list(collection.viz["plot"]["state"].values) == ["B: level"]
+    collection = plot_states(
+        states, records=["B", "A"], backend="none", transform={"level": np.exp}
+    )
+    assert list(collection.viz["plot"]["state"].values) == ["B: level", "A: level"]
+
+
+def test_no_more_than_twelve_records_unless_they_are_named():
+    labels = [f"r{i}" for i in range(15)]
+    results = xr.Dataset(
+        {"d_states": (("chain", "draw", "d_obs", "state"), RNG.normal(size=(2, 20, 30, 1)))},
+        coords={
+            "d_panel": ("d_obs", np.repeat(labels, 2)),
+            "d_time": ("d_obs", np.tile([0.0, 1.0], 15)),
+            "state": ["x"],
+        },
+        attrs={"at": "steps"},
+    )
+    idata = xr.DataTree.from_dict({"smoothed_states": results})
+    assert plot_states(idata, backend="none").viz["plot"].sizes["state"] == 12
+    assert plot_states(idata, records=labels, backend="none").viz["plot"].sizes["state"] == 15
+
+
+def test_a_line_does_not_break_at_the_times_of_other_records():
+    dims = ("chain", "draw", "d_obs", "observable")
+    idata = a_tree("free_run", "d", DRAWN[..., None], dims, "observable")
+    collection = plot_forecast(idata, backend="matplotlib")
+    line = collection.get_viz("median", observable="A: level")
+    x, y = line.get_xdata(), line.get_ydata()
+    known = np.isfinite(y)
+    np.testing.assert_array_equal(np.flatnonzero(known), np.arange(1, 5))  # 1, 2, 3 and 4
+    np.testing.assert_allclose(y[known][[0, 1, 3]], np.median(DRAWN, axis=(0, 1))[:3])
+    assert x[known].tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_forecast_begins_at_the_end_of_its_record():
+    dims = ("chain", "draw", "d_obs", "observable")
+    idata = a_tree("predictions", "d", DRAWN[..., None], dims, "observable")
+    later = idata["predictions"].to_dataset()
+    later["d_time"] = ("d_obs", TIMES + np.repeat([4.0, 6.0], LENGTHS))
+    idata["predictions"] = xr.DataTree(later)
+    collection = plot_forecast(idata, backend="matplotlib")
+    ends = [
+        collection.get_viz("end", observable=f"{label}: level").get_xdata()[0] for label in LABELS
+    ]
+    assert ends == [4.0, 6.0]
+
+
+def test_the_truth_of_a_panel_is_its_simulation(states):
+    simulated = xr.Dataset(
+        {"states": (("row", "state"), DATA[:, None])},
+        coords={"record": ("row", OF_ROWS), "time": ("row", TIMES), "state": ["level"]},
+    )
+    collection = plot_states(states, truth=simulated, backend="matplotlib")
+    line = collection.get_viz("truth", state="A: level")
+    known = np.isfinite(line.get_ydata())
+    np.testing.assert_array_equal(line.get_ydata()[known], DATA[:3])
+    with pytest.raises(ModelError, match=r"truth of a panel must be the result of psf.simulate"):
+        plot_states(states, truth=DATA, backend="none")
+
+
+@pytest.fixture
+def diagnostics():
+    dims, by_record = ("d_obs", "observable"), ("d_record", "lag", "observable")
+    residual = RNG.normal(size=(8, 1))
+    idata = a_tree("filter_diagnostics", "d_residual", residual, dims, "observable")
+    found = idata["filter_diagnostics"].to_dataset()
+    found["d_pit"] = dims, RNG.uniform(size=(8, 1))
+    found["d_innovation"] = dims, residual
+    found["d_innovation_cov"] = (*dims, "observable_bis"), np.ones((8, 1, 1))
+    found["d_autocorrelation"] = by_record, RNG.uniform(-0.2, 0.2, (2, 2, 1))
+    found["d_predicted"] = ("chain", "draw", *dims), DRAWN[..., None]
+    found["d_n_effective"] = ("chain", "draw", "d_obs"), np.full((2, 50, 8), np.inf)
+    idata["filter_diagnostics"] = xr.DataTree(found.assign_coords(d_record=LABELS, lag=[1, 2]))
+    return idata
+
+
+@pytest.mark.parametrize("plot", [plot_filter_health, plot_residuals])
+def test_diagnostics_of_one_record(plot, diagnostics):
+    collection = plot(diagnostics, record="B", backend="matplotlib")
+    name = "residual" if plot is plot_filter_health else "innovation"
+    points = drawn_points(collection, "seen", var_name=name, observable="level")
+    expected = diagnostics["filter_diagnostics"]["d_residual"].values[3:, 0]
+    np.testing.assert_array_equal(points[:, 1], expected)
+    np.testing.assert_array_equal(points[:, 0], TIMES[3:])
+    with pytest.raises(ModelError, match=r"record must be a label .* \['A', 'B'\], got None"):
+        plot(diagnostics, backend="none")
+
+
+def test_what_is_refused(states):
+    with pytest.raises(ModelError, match=r"records must be labels .* got \['C'\]"):
+        plot_states(states, records=["C"], backend="none")
+    alone = xr.Dataset(
+        {"d_states": (("chain", "draw", "d_time", "state"), DRAWN[..., None])},
+        coords={"d_time": np.arange(8.0), "state": ["level"]},
+    )
+    alone = xr.DataTree.from_dict({"smoothed_states": alone})
+    with pytest.raises(ModelError, match="records must be None, because 'd' is no panel"):
+        plot_states(alone, records=["A"], backend="none")
+    with pytest.raises(ModelError, match="record must be None, because 'd' is no panel"):
+        plot_phase(alone, "level", "level", record="A", backend="none")
