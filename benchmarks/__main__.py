@@ -4,7 +4,7 @@
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
 writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
 package; these parts have a file of their own, and the tables of the others stay as they are. So
-have ``--only ode``, ``epidemic``, ``panel`` and ``panel_sampling``.
+have ``--only ode``, ``epidemic``, ``panel``, ``panel_sampling`` and ``panel_evidence``.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from benchmarks import (
     noise,
     ode,
     panel,
+    panel_evidence,
     panel_sampling,
     report,
     sampling,
@@ -55,6 +56,7 @@ PARTS = {
     "noise": lambda peers: noise.noise(),
     "cold": lambda peers: cold.cold(),
     "demo": lambda peers: demo.demo(),
+    "panel_evidence": lambda peers: panel_evidence.panel_evidence(),
     "panel_sampling": lambda peers: panel_sampling.panel_sampling(),
     "integrators": lambda peers: integrators.integrators(),
 }

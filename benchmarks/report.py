@@ -13,6 +13,7 @@ from benchmarks.demo import Demo
 from benchmarks.growth import Curve
 from benchmarks.measure import FOLDER, ROOT, Row
 from benchmarks.noise import Noise, Normals
+from benchmarks.panel_evidence import PanelEvidence
 from benchmarks.panel_sampling import PanelChain
 from benchmarks.ratios import ratios
 from benchmarks.sampling import Chains
@@ -39,6 +40,8 @@ def write(parts: list[str]) -> str:
     kept = {part: json.loads((FOLDER / f"{part}.json").read_text()) for part in parts}
     if found := kept.pop("integrators", None):
         write_integrators(found["rows"])
+    if found := kept.pop("panel_evidence", None):
+        write_panel_evidence(found["rows"])
     own = {part: k for part, k in kept.items() if part in OWN}
     separate = {part: k for part, k in kept.items() if part in SEPARATE}
     compared = {part: k for part, k in kept.items() if part not in OWN | SEPARATE}
@@ -99,6 +102,22 @@ def write_own(kept: dict[str, dict]) -> str:
     text = "\n".join(sections)
     (TARGET / "benchmarks_own.inc").write_text(text)
     return text
+
+
+def write_panel_evidence(rows: list[dict]) -> None:
+    """Write the table of the page on panels, a line for each estimate."""
+    lines = [
+        [
+            str(r.n_parameters),
+            f"`{r.estimator}`",
+            f"{r.error:.3f}",
+            f"{r.se:.3f}",
+            seconds(r.seconds),
+        ]
+        for r in (PanelEvidence(**row) for row in rows)
+    ]
+    head = ["parameters", "estimator", "error (nats)", "standard error", "time"]
+    (TARGET / "panel_evidence.inc").write_text(table(head, lines))
 
 
 def write_integrators(rows: list[dict]) -> None:

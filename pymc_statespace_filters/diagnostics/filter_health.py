@@ -111,6 +111,9 @@ def filter_diagnostics(
         * ``d_failed``, ``d_collapsed``: the fraction of draws at which the filter failed, and at
           which fewer than 3 effective particles decided some term.
 
+        Of a panel the dimension of the rows is d_obs, with the coordinates ``d_panel`` and
+        ``d_time``; correlations, coverage, p-values and fractions have the dimension d_record.
+
         `plot_filter_health` plots the group. ArviZ plots the PIT alone by
         ``az.plot_ecdf_pit(idata, var_names="d_pit", group="filter_diagnostics",
         sample_dims=["d_time"])`` if no observation is missing.

@@ -129,9 +129,8 @@ def plot_forecast(
     group, results = group_of(idata, *((group,) if group else GROUPS))
     name = variable_of(_predicted(results), var_name)
     facets = several_records(idata, group, name, name, records)
-    if facets is not None:
-        idata, truth = facets.idata, facets.truth(truth, "observations")
-        results, transform = idata[group].to_dataset(), facets.mapping(transform)
+    idata, truth = facets.idata, facets.truth(truth, "observations")
+    results, transform = idata[group].to_dataset(), facets.mapping(transform)
     draws = rename_last_dims(results[name], "time", "observable")
     record = data_of(idata, name)
     observables = [str(observable) for observable in draws["observable"].values]
@@ -147,16 +146,10 @@ def plot_forecast(
 
     data = draws.to_dataset(name="observations")
     collection = canvas_over_time(
-        data,
-        "observable",
-        backend=backend,
-        pc_kwargs=pc_kwargs,
-        panels_in_line=1 if facets is None else facets.panels_in_line,
+        data, "observable", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
     )
-    quantiles = over_draws(data)
-    at_one_time = int(quantiles["observations"].count("time").max()) == 1
-    if facets is not None and not at_one_time:  # over the times of other records
-        quantiles = quantiles.interpolate_na("time")
+    at_one_time = int(data["observations"].notnull().any(SAMPLE_DIMS).sum("time").max()) == 1
+    quantiles = over_draws(data) if at_one_time else facets.connected(over_draws(data))
     if observed is not None:
         labels = [f"error of {label}" for label in labels]
         median = quantiles.sel(quantile=0.5, drop=True)

@@ -29,10 +29,10 @@ WIDTHS = {90: 1.0, 50: 3.5}  # of bars
 def canvas_over_time(
     data: xr.Dataset,
     dim: str,
+    panels_in_line: int,
     *,
     backend: str | None,
     pc_kwargs: Mapping[str, Any],
-    panels_in_line: int = 1,
 ) -> PlotCollection:
     """Make a figure with one panel per entry of `dim`, so many beside each other."""
     n_panels = data.sizes[dim]

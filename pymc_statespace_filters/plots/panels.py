@@ -8,17 +8,10 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.plots.axes import unit_of
-from pymc_statespace_filters.plots.results import group_of, select_names
+from pymc_statespace_filters.plots.results import group_of
 
 MOST_RECORDS = 12  # that a figure shows unless others are chosen
 RECORDS_IN_LINE = 3
-
-
-def labels_of(results: xr.Dataset, name: str) -> list[Any] | None:
-    """Return the labels of the records of a variable in a group; None if it is no panel."""
-    if (labels := results.coords.get(f"{name}_panel")) is None:
-        return None
-    return list(dict.fromkeys(labels.values.tolist()))
 
 
 def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.DataTree:
@@ -27,10 +20,7 @@ def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.Dat
     A variable without a panel is left as it is.
     """
     _, results = group_of(idata, group)
-    labels = labels_of(results, name)
-    if labels is None:
-        if record is not None:
-            raise ModelError(f"record must be None, because {name!r} is no panel, got {record!r}")
+    if (labels := _labels_for(results, name, "record", record)) is None:
         return idata
     if record not in labels:
         raise ModelError(f"record must be a label of the panel, one of {labels}, got {record!r}")
@@ -45,59 +35,61 @@ def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.Dat
 class Facets(NamedTuple):
     """Several records of a panel as one, whose names are "record: name"; times are those of all.
 
-    ``n_names`` is the number of names of a record. Where a record has no row, there is NaN.
+    Where a record has no row, there is NaN. A variable without a panel is left as it is: it has no
+    ``labels``.
     """
 
     idata: xr.DataTree
     labels: list[Any]
-    n_names: int
+    panels_in_line: int
 
-    def names(self, chosen: str | Sequence[str] | None, of_record: Sequence[str]) -> list[str]:
+    def names(self, chosen: str | Sequence[str] | None) -> list[str] | str | Sequence[str] | None:
         """The chosen names of every record, one record after the other."""
-        names = select_names("states", chosen, of_record)
+        if not self.labels or chosen is None:
+            return chosen
+        names = [chosen] if isinstance(chosen, str) else chosen
         return [named(label, name) for label in self.labels for name in names]
 
-    def mapping(self, given: Any, are_names: bool = False) -> Any:
+    def mapping(self, given: Any, *, to_names: bool = False) -> Any:
         """A user's mapping from names, with an entry for each record; others as they are."""
-        if not isinstance(given, Mapping):
+        if not self.labels or not isinstance(given, Mapping):
             return given
         return {
-            named(label, name): named(label, value) if are_names else value
+            named(label, name): named(label, value) if to_names else value
             for label in self.labels
             for name, value in given.items()
         }
 
-    def truth(self, truth: Any, simulated: str) -> xr.DataArray | None:
+    def truth(self, truth: Any, simulated: str) -> Any:
         """A result of `simulate` with a panel, with the names of every record."""
-        if truth is None:
-            return None
-        rows = {"states": "", "observations": "obs_"}[simulated]
-        if not isinstance(truth, xr.Dataset) or f"{rows}record" not in truth.coords:
+        if not self.labels or truth is None:
+            return truth
+        if not (isinstance(truth, xr.Dataset) and "record" in truth.coords):
             raise ModelError("truth of a panel must be the result of psf.simulate(..., panel=...)")
-        found = truth[simulated]
-        of_rows = found[f"{rows}record"].values
-        parts = [
-            _over_times(found.isel({found.dims[0]: of_rows == label}), f"{rows}time")
-            for label in self.labels
-        ]
-        return _side_by_side(parts, self.labels)
+        return self.simulated(truth, simulated)
 
-    @property
-    def panels_in_line(self) -> int:
-        """How many panels of the figure are beside each other."""
-        return self.n_names if self.n_names > 1 else min(RECORDS_IN_LINE, len(self.labels))
+    def simulated(self, results: xr.Dataset, variable: str) -> xr.DataArray:
+        """States or observations of `simulate` over time, with the names of every record."""
+        prefix = {"states": "", "observations": "obs_"}[variable]
+        found, time = results[variable], f"{prefix}time"
+        if not self.labels:
+            return _over_times(found, time)
+        of_rows = found[f"{prefix}record"].values
+        rows = [found.isel({found.dims[0]: of_rows == label}) for label in self.labels]
+        return _side_by_side([_over_times(own, time) for own in rows], self.labels)
+
+    def connected(self, quantiles: xr.Dataset) -> xr.Dataset:
+        """Quantiles without gaps at the times of other records."""
+        return quantiles.interpolate_na("time") if self.labels else quantiles
 
 
 def several_records(
     idata: xr.DataTree, group: str, name: str, variable: str, records: Any
-) -> Facets | None:
-    """Return records of a panel as facets of the group's array ``variable``; None without one."""
+) -> Facets:
+    """Return records of a panel as facets of the group's array ``variable``."""
     _, results = group_of(idata, group)
-    labels = labels_of(results, name)
-    if labels is None:
-        if records is not None:
-            raise ModelError(f"records must be None, because {name!r} is no panel, got {records!r}")
-        return None
+    if (labels := _labels_for(results, name, "records", records)) is None:
+        return Facets(idata, [], 1)
     chosen = _chosen(records, labels)
     trees = [one_record(idata, group, name, label) for label in chosen]
     of_group = [tree[group].to_dataset()[variable] for tree in trees]
@@ -106,7 +98,31 @@ def several_records(
     if "observed_data" in trees[0].children:
         of_data = [tree["observed_data"].to_dataset()[name] for tree in trees]
         found["observed_data"] = _side_by_side(of_data, chosen).to_dataset(name=name)
-    return Facets(xr.DataTree.from_dict(found), chosen, of_group[0].shape[-1])
+    return Facets(xr.DataTree.from_dict(found), chosen, _in_line(chosen, of_group[0].shape[-1]))
+
+
+def facets_of_simulation(simulated: xr.Dataset, records: Any) -> Facets:
+    """Return the records of a result of `simulate` as facets, which have no draws."""
+    if "record" not in simulated.coords:
+        if records is not None:
+            raise ModelError(f"records must be None without a panel, got {records!r}")
+        return Facets(xr.DataTree(), [], 1)
+    chosen = _chosen(records, list(dict.fromkeys(simulated["record"].values.tolist())))
+    return Facets(xr.DataTree(), chosen, _in_line(chosen, simulated.sizes["state"]))
+
+
+def _in_line(labels: Sequence[Any], n_names: int) -> int:
+    """How many panels of a figure are beside each other: those of a record, or some records."""
+    return n_names if n_names > 1 else min(RECORDS_IN_LINE, len(labels))
+
+
+def _labels_for(results: xr.Dataset, name: str, argument: str, given: Any) -> list[Any] | None:
+    """Return the labels of a panel; None without one, where nothing may be given."""
+    if (labels := results.coords.get(f"{name}_panel")) is not None:
+        return list(dict.fromkeys(labels.values.tolist()))
+    if given is not None:
+        raise ModelError(f"{argument} must be None, because {name!r} is no panel, got {given!r}")
+    return None
 
 
 def _chosen(records: Any, labels: list[Any]) -> list[Any]:
@@ -114,7 +130,7 @@ def _chosen(records: Any, labels: list[Any]) -> list[Any]:
         return labels[:MOST_RECORDS]
     is_list = isinstance(records, Iterable) and not isinstance(records, str)
     chosen = list(records) if is_list else [records]
-    if not chosen or set(chosen) - set(labels):
+    if not chosen or any(label not in labels for label in chosen):
         raise ModelError(f"records must be labels of the panel, among {labels}, got {records!r}")
     return chosen
 
@@ -126,9 +142,9 @@ def named(label: Any, name: str) -> str:
 
 def _over_times(array: xr.DataArray, time: str) -> xr.DataArray:
     """Give the rows, the first dimension, their times as only coordinate."""
-    times, dim = array[time].values, array.dims[0]
+    times, dim = array[time], array.dims[0]
     kept = array.drop_vars([name for name, c in array.coords.items() if dim in c.dims])
-    return kept.rename({dim: "time"}).assign_coords(time=times)
+    return kept.rename({dim: "time"}).assign_coords(time=("time", times.values, times.attrs))
 
 
 def _rows_of(results: xr.Dataset, name: str, record: Any) -> xr.Dataset:

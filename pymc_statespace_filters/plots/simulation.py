@@ -11,6 +11,7 @@ from pymc_statespace_filters.plots.axes import label_axes, time_label
 from pymc_statespace_filters.plots.canvas import curve
 from pymc_statespace_filters.plots.legend import add_legend
 from pymc_statespace_filters.plots.marks import DRAWS, canvas_over_time, draw_data
+from pymc_statespace_filters.plots.panels import facets_of_simulation
 from pymc_statespace_filters.plots.results import measured_by, observations_of, select_names
 from pymc_statespace_filters.plots.transforms import (
     axis_label,
@@ -30,6 +31,7 @@ def refuse_without_draws(**given: Any) -> None:
 
 def draw_simulation(
     simulated: xr.Dataset,
+    records: Any,
     states: str | Sequence[str] | None,
     observables: Mapping[str, str] | None,
     transform: Any,
@@ -42,10 +44,10 @@ def draw_simulation(
             "idata must be a DataTree of draws or a result of simulate, got a Dataset of "
             f"{[str(name) for name in simulated]}"
         )
-    path, record = simulated["states"], simulated["observations"]
-    path = path.assign_coords(step=path["time"].variable).drop_vars("time").rename(step="time")
-    record = record.assign_coords(obs=record["obs_time"].variable).drop_vars("obs_time")
-    record = record.rename(obs="time")
+    facets = facets_of_simulation(simulated, records)
+    path, record = (facets.simulated(simulated, name) for name in ("states", "observations"))
+    states, transform = facets.names(states), facets.mapping(transform)
+    observables = facets.mapping(observables, to_names=True)
     all_states, seen = ([str(n) for n in a[a.dims[-1]].values] for a in (path, record))
     measured = measured_by(observables, all_states, seen)
     shown = select_names("states", states, all_states)
@@ -60,7 +62,9 @@ def draw_simulation(
     path = transformed(path, "state", functions)
     record = transformed(record, "observable", of_record(transform, functions))
     data = path.reindex(state=panels).to_dataset(name="path")
-    collection = canvas_over_time(data, "state", backend=backend, pc_kwargs=pc_kwargs)
+    collection = canvas_over_time(
+        data, "state", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
+    )
     legend = {}
     if set(measured) & set(panels):
         legend = draw_data(collection, observations_of(record, measured, panels))

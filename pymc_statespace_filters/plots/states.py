@@ -135,15 +135,13 @@ def plot_states(
     check_count("n_draws", n_draws, 0)
     if isinstance(idata, xr.Dataset):
         refuse_without_draws(group=group, var_name=var_name, truth=truth, n_draws=n_draws or None)
-        return draw_simulation(idata, states, observables, transform, backend, pc_kwargs)
+        return draw_simulation(idata, records, states, observables, transform, backend, pc_kwargs)
     group, name = name_of_states(idata, group, var_name)
     facets = several_records(idata, group, name, f"{name}_states", records)
-    if facets is not None:
-        names = [str(state) for state in states_of(idata, group, name).draws["state"].values]
-        idata, truth = facets.idata, facets.truth(truth, "states")
-        states = facets.names(states, names)
-        observables, transform = facets.mapping(observables, True), facets.mapping(transform)
-    name, draws, at_observations, are_paths = states_of(idata, group, var_name)
+    idata, truth, states = facets.idata, facets.truth(truth, "states"), facets.names(states)
+    observables = facets.mapping(observables, to_names=True)
+    transform = facets.mapping(transform)
+    _, draws, at_observations, are_paths = states_of(idata, group, name)
     all_states = [str(state) for state in draws["state"].values]
     shown = select_names("states", states, all_states)
     record, measured = _record(idata, name, observables, all_states)
@@ -153,17 +151,11 @@ def plot_states(
 
     data = transformed(draws.sel(state=shown), "state", functions).to_dataset(name="states")
     collection = canvas_over_time(
-        data,
-        "state",
-        backend=backend,
-        pc_kwargs=pc_kwargs,
-        panels_in_line=1 if facets is None else facets.panels_in_line,
+        data, "state", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
     )
     # Bands below the points, lines above them.
     as_bars = at_observations and data.sizes["time"] <= FEW
-    quantiles = over_draws(data)
-    if facets is not None and not as_bars:  # over the times of other records
-        quantiles = quantiles.interpolate_na("time")
+    quantiles = over_draws(data) if as_bars else facets.connected(over_draws(data))
     bands = (draw_bars if as_bars else draw_bands)(collection, quantiles)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths else (points, DOTS)

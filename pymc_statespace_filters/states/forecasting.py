@@ -50,14 +50,16 @@ def forecast(
         Times after the last observation, on the grid ``t0 + k * dt``.
     inputs : array_like, shape (rows, n_inputs), optional
         Inputs from step 0 on, past and future, row k during step k; required if those of the model
-        end before the last step.
+        end before the last step. Of a panel also an array for each record, as in `StateSpace`.
 
     Returns
     -------
     xarray.DataTree
         With the group ``predictions``. For a variable "d": simulated observations ``d`` (chain,
         draw, d_time, observable), and the simulated path ``d_states`` (chain, draw, d_time, state).
-        NaN for a draw at which the filter failed.
+        NaN for a draw at which the filter failed. Of a panel the dimension is d_obs, with the
+        coordinates ``d_panel`` and ``d_time``: each record is predicted from its own end, at the
+        same `n_steps`, `steps` or `times`.
 
     Raises
     ------

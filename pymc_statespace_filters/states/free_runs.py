@@ -53,7 +53,8 @@ def free_run(
     idata, model, var_name, n_draws, random_seed, extend_inferencedata
         As in `filtered_states`.
     inputs : array_like, shape (rows, n_inputs), optional
-        Row k holds during step k; by default those of the model.
+        Row k holds during step k; by default those of the model. Of a panel also an array for
+        each record, as in `StateSpace`.
     steps : array_like of int, shape (R,), optional
         When to predict an observation, from step 0 of the simulation on; by default the steps of
         the variable's record. Accumulators sum from one of them to the next.
@@ -62,7 +63,7 @@ def free_run(
     observed : array_like, shape (R, p) or (R,), optional
         Measurements at these steps, to compare the predictions with; NaN where missing. By default
         the record of the model from ``score_from`` on, if the run has its inputs and steps, else
-        none.
+        none. A panel is compared with its own data alone.
     noise : bool
         Whether the initial state, process noise and measurement noise are drawn. By default none
         is: a run starts at the initial mean, and its observations are those of `simulate` with
@@ -83,6 +84,9 @@ def free_run(
         * ``d_coverage`` (interval, observable): the fraction of them inside the central
           intervals of 50 % and 90 % of the predicted measurements, at each time over all draws.
           These have measurement noise, also where ``d`` has none.
+
+        Of a panel the dimension of the rows is d_obs, with the coordinates ``d_panel`` and
+        ``d_time``, and each error has the dimension d_record.
 
     Raises
     ------

@@ -26,7 +26,9 @@ from pymc_statespace_filters.pymc_model.state_graphs import (
 )
 from pymc_statespace_filters.states.draws import PosteriorDraws
 from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, inputs_by_record
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+from pymc_statespace_filters.system.panel_inputs import panel_inputs
+from pymc_statespace_filters.system.panel_records import records_of
 from pymc_statespace_filters.system.record import check_inputs
 
 
@@ -88,12 +90,11 @@ class VariableAtDraws:
         """The same with other inputs, for observations at `steps` of every record."""
         variable, system = self.variable, self.variable.system
         if variable.is_panel:
-            labels, codes = zip(
-                *((record.label, record.code) for record in self.records), strict=True
-            )
-            rows, firsts = inputs_by_record(inputs, system, labels, codes, steps)
             table = variable.steps.eval(mode="FAST_COMPILE")
-            table[:, FIRST_INPUT] = np.repeat(firsts, [len(r.steps) for r in self.records])
+            own = [record.label for record in self.records]
+            records = records_of(table[:, RECORD])._replace(labels=own)
+            rows, firsts = panel_inputs(inputs, system, records, steps)
+            table[:, FIRST_INPUT] = 0 if firsts is None else firsts[records.of_rows()]
             changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
         else:
             rows = check_inputs(inputs, system, steps[0])
@@ -191,28 +192,33 @@ class VariableAtDraws:
         symbols = [variable.steps, variable.observed, variable.t0]
         steps, observed, t0 = pytensor.function([], symbols, mode="FAST_COMPILE")()
         observed = np.array(observed, dtype=np.float64)
+        if variable.score_from >= len(steps):
+            raise ModelError(
+                f"score_from of {variable.name!r} must be less than the number of observations, got"
+                f" {variable.score_from} of {len(steps)}"
+            )
         if not variable.is_panel:
             return [RecordAtDraws(self, 0, None, None, steps, observed, float(t0))]
-        codes = steps[:, RECORD]
-        starts = np.flatnonzero(np.diff(codes, prepend=codes[0] + 1))
+        records = records_of(steps[:, RECORD])
         labels = self._model.coords.get(f"{variable.name}_record", ())
-        if len(labels) != len(starts):  # other rows were set
-            labels = codes[starts].tolist()
-        first_inputs, n_rows = steps[starts, FIRST_INPUT], self.inputs.shape[1]
+        if len(labels) != len(records.labels):  # other rows were set
+            labels = records.labels
+        first_inputs, n_rows = steps[records.starts[:-1], FIRST_INPUT], self.inputs.shape[1]
         # All records share all rows, or have their own, one stretch below the other.
-        ends = np.append(first_inputs[1:], n_rows) if first_inputs.any() else n_rows + 0 * starts
+        is_shared = not first_inputs.any()
+        ends = [n_rows] * len(labels) if is_shared else [*first_inputs[1:], n_rows]
         return [
             RecordAtDraws(
                 self,
                 number,
-                int(codes[rows[0]]),
-                labels[number],
+                int(records.codes[number]),
+                label,
                 steps[rows, STEP].copy(),
                 observed[rows],
                 float(t0),
                 slice(int(first_inputs[number]), int(ends[number])),
             )
-            for number, rows in enumerate(np.split(np.arange(len(codes)), starts[1:]))
+            for number, (label, rows) in enumerate(zip(labels, records.slices(), strict=True))
         ]
 
 

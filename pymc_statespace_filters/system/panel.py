@@ -9,53 +9,24 @@ The code of a record is its label, or a hash of it if that is a text. The noise 
 on the seed and this code alone, so that it does not change when other records are added.
 """
 
-from collections.abc import Mapping, Sequence
-from hashlib import blake2b
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
-from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_finite, is_integer, shortened
+from pymc_statespace_filters.system.checks import check_finite
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.record import (
-    check_inputs,
-    check_observed,
-    check_steps,
-    inputs_of_other_shape,
-    steps_of,
-)
+from pymc_statespace_filters.system.panel_inputs import panel_inputs, symbolic_panel_inputs
+from pymc_statespace_filters.system.panel_records import Records, records_of
+from pymc_statespace_filters.system.record import check_observed, check_steps, steps_of
 
 # Columns of the rows of a panel.
 RECORD, STEP, FIRST_INPUT = range(3)
 N_COLUMNS = 3
-
-# What comes before the messages of a single record's checks.
-_IN = "record {label!r}, whose first row is {first}: "
-
-
-class Records(NamedTuple):
-    """The records of a panel, in the order of their rows.
-
-    ``labels`` has one label for each, ``starts`` (G + 1,) the first row of each and the number of
-    rows, ``codes`` (G,) what their noise depends on.
-    """
-
-    labels: list[Any]
-    starts: np.ndarray
-    codes: np.ndarray
-
-    def slices(self) -> list[slice]:
-        """The rows of each record."""
-        return [slice(*ends) for ends in zip(self.starts[:-1], self.starts[1:], strict=True)]
-
-    def of_rows(self) -> np.ndarray:
-        """The number of the record of each row, (J,)."""
-        return np.repeat(np.arange(len(self.labels)), np.diff(self.starts))
 
 
 class CheckedPanel(NamedTuple):
@@ -113,7 +84,7 @@ def checked_panel(
     records = records_of(panel)
     at = _steps(records, steps, times, system.dt, t0)
     data = _check_observed(observed, system, records)
-    forces, first_inputs = _inputs(inputs, system, records, at)
+    forces, first_inputs = panel_inputs(inputs, system, records, records.split(at))
     number = records.of_rows()
     begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
     rows = np.stack([records.codes[number], at, begin], axis=1)
@@ -143,7 +114,7 @@ def symbolic_panel(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
             " steps of each record, got pm.Data"
         )
-    forces, first_inputs = _symbolic_inputs(inputs, system, records, at)
+    forces, first_inputs = symbolic_panel_inputs(inputs, system, records, records.split(at))
     if isinstance(panel, Variable):
         codes: Any = pt.cast(panel, "int64")
         begins = pt.neq(codes[1:], codes[:-1])
@@ -164,65 +135,6 @@ def _current(value: Any) -> Any:
     return value.eval() if isinstance(value, Variable) else value
 
 
-def records_of(panel: Any) -> Records:
-    """Check the labels of all rows, of one record together, and find the records."""
-    labels = np.asarray(panel)
-    if labels.ndim != 1 or labels.size == 0:
-        raise ModelError(
-            f"panel must be a vector, the label of the record of each row, got {shortened(panel)}"
-        )
-    if labels.dtype.kind not in "iu":
-        labels = _integers_or_texts(labels)
-    has_texts = labels.dtype.kind == "O"
-    codes = np.array([_hash(text) for text in labels] if has_texts else labels, dtype=np.int64)
-    starts = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1], [True]]))
-    seen: dict[Any, int] = {}
-    for first in starts[:-1].tolist():
-        label = labels[first]
-        if label in seen:
-            raise ModelError(
-                f"panel must have the rows of a record together, got record {label!r} in row "
-                f"{seen[label]} and, behind others, in row {first}: sort the rows by record, then "
-                "by time"
-            )
-        seen[label] = first
-    found = [label.item() if isinstance(label, np.generic) else label for label in seen]
-    return Records(found, starts, codes[starts[:-1]])
-
-
-def _integers_or_texts(labels: np.ndarray) -> np.ndarray:
-    """Labels of one kind, integers or objects; tables hold integers also as floats and objects."""
-    if labels.dtype.kind == "f":
-        is_number = np.isfinite(labels) & (labels == np.round(labels))
-    else:
-        is_number = np.array([is_integer(label) for label in labels])
-    is_text = np.array([isinstance(label, str) and label != "" for label in labels])
-    if not (is_label := is_number if is_number.any() else is_text).all():
-        row = int(np.argmin(is_label))
-        raise ModelError(
-            f"panel must hold integers or texts, got {labels.tolist()[row]!r} in row {row}: every "
-            "row needs the label of its record"
-        )
-    return labels.astype("int64" if is_number.any() else object)
-
-
-def _hash(label: str) -> int:
-    """63 bits of a text, the same in every process."""
-    return int.from_bytes(blake2b(label.encode(), digest_size=8).digest()) >> 1
-
-
-def _each(records: Records) -> list[tuple[Any, slice]]:
-    return list(zip(records.labels, records.slices(), strict=True))
-
-
-def _of_record(label: Any, first: int, check: Any, *arguments: Any, **options: Any) -> Any:
-    """Check the part of one record; an error names the record and its first row."""
-    try:
-        return check(*arguments, **options)
-    except ModelError as error:
-        raise ModelError(_IN.format(label=label, first=first) + str(error)) from None
-
-
 def _steps(records: Records, steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
     """Steps of all rows; those of a record increase strictly."""
     if (steps is None) == (times is None):
@@ -235,12 +147,8 @@ def _steps(records: Records, steps: Any, times: Any, dt: float, t0: float) -> np
             f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
             f"{array.shape}"
         )
-    parts = [
-        _of_record(label, rows.start, check_steps, array[rows])
-        if times is None
-        else _of_record(label, rows.start, steps_of, None, array[rows], dt, t0)
-        for label, rows in _each(records)
-    ]
+    check = check_steps if times is None else lambda own: steps_of(None, own, dt, t0)
+    parts = records.check_each(check, records.split(array))
     return np.concatenate(parts)
 
 
@@ -260,99 +168,3 @@ def _symbolic_observed(observed: Any, system: StateSpaceModel, records: Records)
     if isinstance(observed, SharedVariable):
         _check_observed(observed.get_value(), system, records)
     return observed
-
-
-def _own_inputs(inputs: Any, records: Records) -> list[Any] | None:
-    """The inputs of each record, if they have their own: a mapping or a sequence of arrays."""
-    if isinstance(inputs, Mapping):
-        if list(inputs) != records.labels and set(inputs) != set(records.labels):
-            missing = [label for label in records.labels if label not in inputs]
-            raise ModelError(
-                f"inputs must have an array for each record, got none for {shortened(missing)}"
-                if missing
-                else f"inputs must have an array for each record, got others: {shortened(inputs)}"
-            )
-        return [inputs[label] for label in records.labels]
-    is_list = isinstance(inputs, list | tuple) and all(
-        isinstance(part, np.ndarray | Variable) and part.ndim for part in inputs
-    )
-    if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
-        return None
-    if len(inputs) != len(records.labels):
-        raise ModelError(
-            f"inputs must have an array for each of the {len(records.labels)} records, or one for "
-            f"all, got {len(inputs)}"
-        )
-    return list(inputs)
-
-
-def _inputs(
-    inputs: Any, system: StateSpaceModel, records: Records, steps: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """All rows of inputs, and the first row of each record; None if all share them."""
-    own = _own_inputs(inputs, records)
-    if own is None:
-        # The observations of one record do not reset the accumulators of another.
-        if not system.accumulators:
-            for label, rows in _each(records):
-                _of_record(label, rows.start, check_inputs, inputs, system, steps[rows])
-            longest = np.array([steps.max()])
-            return check_inputs(inputs, system, longest), None
-        own = [inputs] * len(records.labels)
-    parts = [
-        _of_record(label, rows.start, check_inputs, part, system, steps[rows])
-        for part, (label, rows) in zip(own, _each(records), strict=True)
-    ]
-    return np.concatenate(parts), _first_rows([len(part) for part in parts])
-
-
-def inputs_by_record(
-    inputs: Any,
-    system: StateSpaceModel,
-    labels: Sequence[Any],
-    codes: Sequence[int],
-    steps: Sequence[np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """All rows of inputs, and the first of each record (G,), for observations at other steps."""
-    starts = np.concatenate([[0], np.cumsum([len(rows) for rows in steps])])
-    records = Records(list(labels), starts, np.array(codes))
-    rows, first_inputs = _inputs(inputs, system, records, np.concatenate(steps))
-    return rows, np.zeros(len(labels), np.int64) if first_inputs is None else first_inputs
-
-
-def _first_rows(lengths: Sequence[int]) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype("int64")
-
-
-def _symbolic_inputs(
-    inputs: Any, system: StateSpaceModel, records: Records, steps: np.ndarray
-) -> tuple[Any, Any]:
-    own = _own_inputs(inputs, records)
-    parts = [inputs] if own is None else own
-    if not any(isinstance(part, Variable) for part in parts):
-        return _inputs(inputs, system, records, steps)
-    if system.accumulators:
-        raise ModelError(
-            "inputs must be numbers for a system with accumulators in a panel, got a symbol"
-        )
-    current = [
-        part.get_value() if isinstance(part, SharedVariable) else part
-        for part in parts
-        if isinstance(part, SharedVariable) or not isinstance(part, Variable)
-    ]
-    if len(current) == len(parts):
-        _inputs(current[0] if own is None else current, system, records, steps)
-    columns = [_two_dimensional(part, system) for part in parts]
-    if own is None:
-        return columns[0], None
-    lengths = pt.stack([column.shape[0] for column in columns])
-    return pt.concatenate(columns), pt.concatenate([[0], pt.cumsum(lengths)[:-1]])
-
-
-def _two_dimensional(inputs: Any, system: StateSpaceModel) -> TensorVariable:
-    symbol = pt.as_tensor(inputs)
-    if symbol.type.ndim == 1 and system.n_inputs == 1:
-        symbol = symbol[:, None]
-    if not system.n_inputs or symbol.type.ndim != 2:
-        raise inputs_of_other_shape(system, symbol.type)
-    return symbol

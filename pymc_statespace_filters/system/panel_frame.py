@@ -8,7 +8,7 @@ import pandas as pd
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import shortened
-from pymc_statespace_filters.system.panel import records_of
+from pymc_statespace_filters.system.panel_records import records_of
 from pymc_statespace_filters.system.record import nearest_steps
 
 

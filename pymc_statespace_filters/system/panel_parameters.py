@@ -11,7 +11,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import Records, SymbolicPanel
+from pymc_statespace_filters.system.panel import SymbolicPanel
+from pymc_statespace_filters.system.panel_records import Records
 from pymc_statespace_filters.system.parameters import check_complete, check_names, numbers
 
 _OTHER_NUMBER = (

@@ -77,6 +77,21 @@ def test_they_have_the_dimensions_and_coordinates_of_the_draws_and_the_record(id
     xr.testing.assert_equal(terms["chain"], idata["posterior"]["chain"])
 
 
+def test_rows_set_after_sampling_must_reach_the_scored_ones(idata):
+    with pm.Model() as model:
+        w = pm.Uniform("w", -0.5, 0.5, shape=2)
+        spread = pm.HalfNormal("spread", 1)
+        steps, observed = pm.Data("at", AT), pm.Data("y", np.nan_to_num(RECORD)[:, None])
+        psf.StateSpace(
+            "d", SYSTEM, psf.BootstrapPF(20), params={"phi": w.sum(), "spread": spread},
+            steps=steps, observed=observed, score_from=2,
+        )  # fmt: skip
+        new = {"at": [0, 2], "y": np.zeros((2, 1))}
+        pm.set_data(new, coords={"d_time": [0, 2]})
+    with pytest.raises(ModelError, match=r"score_from of 'd' must be less .* got 2 of 2"):
+        psf.compute_log_likelihood(idata, model)
+
+
 def test_they_say_that_they_are_sequential(terms, tmp_path):
     text = terms["d"].attrs["terms"]
     assert "d_1 .. d_{j-1}" in text

@@ -118,6 +118,36 @@ def test_the_truth_of_a_panel_is_its_simulation(states):
         plot_states(states, truth=DATA, backend="none")
 
 
+def test_a_simulated_panel_has_panels_of_its_records():
+    simulated = xr.Dataset(
+        {
+            "states": (("row", "state"), DATA[:, None]),
+            "observations": (("obs", "observable"), DATA[:, None] + 1.0),
+        },
+        coords={
+            "record": ("row", OF_ROWS),
+            "time": ("row", TIMES),
+            "obs_record": ("obs", OF_ROWS),
+            "obs_time": ("obs", TIMES),
+            "state": ["level"],
+            "observable": ["level"],
+        },
+    )
+    collection = plot_states(simulated, records=["B"], backend="matplotlib")
+    assert list(collection.viz["plot"]["state"].values) == ["B: level"]
+    np.testing.assert_array_equal(
+        collection.get_viz("path", state="B: level").get_ydata(), DATA[3:]
+    )
+    np.testing.assert_array_equal(
+        drawn_points(collection, "data", state="B: level")[:, 1], DATA[3:] + 1.0
+    )
+    with pytest.raises(ModelError, match=r"records must be None without a panel, got \['B'\]"):
+        plot_states(
+            simulated.isel(row=slice(3), obs=slice(3)).drop_vars(["record", "obs_record"]),
+            records=["B"],
+        )
+
+
 @pytest.fixture
 def diagnostics():
     dims, by_record = ("d_obs", "observable"), ("d_record", "lag", "observable")

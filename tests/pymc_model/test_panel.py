@@ -15,7 +15,7 @@ from pymc_statespace_filters.evidence.posterior.observed_data import (
     scalar_count,
 )
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
-from pymc_statespace_filters.system.panel import records_of
+from pymc_statespace_filters.system.panel_records import records_of
 from tests.small_systems import FORCE, FORCED, forced_terms
 
 LABELS = np.array(["b", "b", "b", "a", "c", "c"])

@@ -8,7 +8,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.panel import records_of
+from pymc_statespace_filters.system.panel_records import records_of
 from tests.small_systems import FORCED
 from tests.states.models import EKF, posterior
 

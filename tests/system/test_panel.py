@@ -10,9 +10,9 @@ from pymc_statespace_filters.system.panel import (
     RECORD,
     STEP,
     checked_panel,
-    records_of,
 )
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
+from pymc_statespace_filters.system.panel_records import records_of
 from tests.small_systems import FORCE, FORCED, PAIR, forced
 
 LABELS = ["b", "b", "a", "c", "c"]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytensor
@@ -164,10 +165,11 @@ def between_extensions(
     of_many: bool,
 ) -> CompiledFunction:
     """A function that returns the cotangent of its first argument, as a function of theta."""
-    extended, pulled_back, function = extension.function, pullback.function, compiled.function
+    extended, function = extension.function, compiled.function
+    pulled_back = _zero_of_zeros(pullback)
 
     def at_one(theta, *others):
-        return pulled_back(np.concatenate((theta, function(extended(theta), *others))))
+        return pulled_back(theta, function(extended(theta), *others))
 
     def at_many(theta, *others):
         points = np.empty((theta.shape[0], extended(theta[0].copy()).size))
@@ -175,12 +177,28 @@ def between_extensions(
             points[i] = extended(theta[i].copy())
         bars, theta_bars = function(points, *others), np.empty(theta.shape)
         for i in range(theta.shape[0]):
-            theta_bars[i] = pulled_back(np.concatenate((theta[i], bars[i])))
+            theta_bars[i] = pulled_back(theta[i], bars[i])
         return theta_bars
 
     key = key_of(f"between extensions {of_many}", extension.key, pullback.key, compiled.key)
     made = jit(at_many if of_many else at_one, compiled.large)
     return CompiledFunction(made, key, compiled.large)
+
+
+def _zero_of_zeros(pullback: CompiledFunction) -> Any:
+    """`pull_back`, but zeros where there is nothing to pull back, as after a failure.
+
+    The constant of a failure may be NaN, which times zero is NaN.
+    """
+    pulled_back = pullback.function
+
+    @jit
+    def function(theta, bar):
+        if not bar.any():
+            return np.zeros(theta.size)
+        return pulled_back(np.concatenate((theta, bar)))
+
+    return function
 
 
 def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVariable]:
