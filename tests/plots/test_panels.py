@@ -172,6 +172,11 @@ def test_diagnostics_of_one_record(plot, diagnostics):
     expected = diagnostics["filter_diagnostics"]["d_residual"].values[3:, 0]
     np.testing.assert_array_equal(points[:, 1], expected)
     np.testing.assert_array_equal(points[:, 0], TIMES[3:])
+    if plot is plot_residuals:
+        bars = collection.get_viz("seen", var_name="autocorrelation", observable="level")
+        ends = bars.get_ydata().reshape(-1, 3)[:, 1]  # from zero, to the value, and a gap
+        of_records = diagnostics["filter_diagnostics"]["d_autocorrelation"]
+        np.testing.assert_allclose(np.sort(np.abs(ends)), np.sort(np.abs(of_records[1, :, 0])))
     with pytest.raises(ModelError, match=r"record must be a label .* \['A', 'B'\], got None"):
         plot(diagnostics, backend="none")
 

@@ -241,3 +241,17 @@ def test_one_warning_for_failures_of_all_records():
         psf.FilterWarning, match=r"gave -inf in \d+ of 30 evaluations, of records 'b', 'a', 'c'"
     ):
         psf.filtered_states(idata, panel_model())
+
+
+def test_a_collapse_is_repeated_in_the_record_where_it_was():
+    """A surprise in the last record, which has two rows."""
+    surprising = DATA.copy()
+    surprising[5] = 12.0
+    with pm.Model() as model:
+        pm.Normal("a", shape=3)
+        psf.StateSpace(
+            "d", FORCED, PARTICLES, panel=LABELS, steps=STEPS, observed=surprising, inputs=FORCES
+        )
+    told = r"of record 'c' \(.* these are 1 of 2 terms, j = 1"
+    with pytest.warns(psf.FilterWarning, match=told):
+        psf.filtered_states(posterior(a=A), model, random_seed=1)
