@@ -29,16 +29,13 @@ from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import sampling_request
 from pymc_statespace_filters.sampling.target.log_density import screening_density
+from pymc_statespace_filters.sampling.target.record_target import target_of
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.autoregression import autoregression
 from tests.sampling.rank_uniformity import chi_square_p, ecdf_p
 
-STEPS = np.arange(1, 31)
 LINEAR = autoregression(observation_noise=[[0.5]])
-# The last is exact, and finds a posterior that is too wide or too narrow all around, which hardly
-# shows in the parameters.
-QUANTITIES = ("phi", "spread", "log-likelihood")
 
 TUNE = 1000
 N_KEPT = 63
@@ -51,17 +48,82 @@ THREADS = 2
 N_REPLICATIONS = 200
 
 
-def from_the_prior(rng):
-    return {"phi": rng.uniform(-0.9, 0.9), "spread": 0.7 * np.exp(0.3 * rng.standard_normal())}
-
-
-def record_of(phi, spread, rng):
+def path_of(phi, spread, n_steps, rng):
     """The system's equations once more, so that the package's simulator has no part in it."""
-    x, record = rng.standard_normal(), np.empty((STEPS.size, 1))
+    x, record = rng.standard_normal(), np.empty((n_steps, 1))
     for row in record:
         x = phi * x + spread * rng.standard_normal()
         row[0] = x + np.sqrt(0.5) * rng.standard_normal()
     return record
+
+
+def log_likelihood_of(phi, spread, record):
+    """Exact, of a record at n draws, (n,)."""
+    params, steps = {"phi": phi, "spread": spread}, np.arange(1, len(record) + 1)
+    return psf.log_likelihood(LINEAR, psf.EKF(), params, record, steps=steps).sum(axis=-1)
+
+
+class OneRecord:
+    """Two parameters and a record of 30 steps."""
+
+    # The log-likelihood is exact, and finds a posterior that is too wide or too narrow all around,
+    # which hardly shows in the parameters.
+    quantities = ("phi", "spread", "log-likelihood")
+    n_rows = 30
+    rows: dict[str, Any] = {"steps": np.arange(1, 31)}  # noqa: RUF012
+
+    def truth(self, rng):
+        return {"phi": rng.uniform(-0.9, 0.9), "spread": 0.7 * np.exp(0.3 * rng.standard_normal())}
+
+    def record(self, truth, rng):
+        return path_of(**truth, n_steps=self.n_rows, rng=rng)
+
+    def prior(self):
+        pm.Uniform("phi", -0.9, 0.9)
+        pm.LogNormal("spread", np.log(0.7), 0.3)
+
+    def parameters(self, draws):
+        return [draws["phi"], draws["spread"]]
+
+    def log_likelihood(self, draws, record):
+        return log_likelihood_of(draws["phi"], draws["spread"], record)
+
+
+class Panel:
+    """Four records of unequal lengths, each with its own phi, from a population; one spread."""
+
+    quantities = ("typical", "spread", "phi of the first", "phi of the last", "log-likelihood")
+    lengths = (12, 5, 9, 14)
+    n_rows = sum(lengths)
+    rows: dict[str, Any] = {  # noqa: RUF012
+        "panel": np.repeat(np.arange(4), lengths),
+        "steps": np.concatenate([np.arange(1, n + 1) for n in lengths]),
+    }
+
+    def truth(self, rng):
+        typical = rng.normal(0.3, 0.3)
+        spread = 0.7 * np.exp(0.3 * rng.standard_normal())
+        return {"typical": typical, "phi": rng.normal(typical, 0.3, 4), "spread": spread}
+
+    def record(self, truth, rng):
+        each = zip(truth["phi"], self.lengths, strict=True)
+        return np.concatenate([path_of(phi, truth["spread"], n, rng) for phi, n in each])
+
+    def prior(self):
+        typical = pm.Normal("typical", 0.3, 0.3)
+        pm.Normal("phi", typical, 0.3, shape=4)
+        pm.LogNormal("spread", np.log(0.7), 0.3)
+
+    def parameters(self, draws):
+        return [draws["typical"], draws["spread"], draws["phi"][..., 0], draws["phi"][..., -1]]
+
+    def log_likelihood(self, draws, record):
+        records = np.split(record, np.cumsum(self.lengths)[:-1])
+        each = zip(draws["phi"].T, records, strict=True)
+        return sum(log_likelihood_of(phi, draws["spread"], one) for phi, one in each)
+
+
+ONE, PANEL = OneRecord(), Panel()
 
 
 @dataclass(frozen=True)
@@ -73,18 +135,18 @@ class Setting:
     filter : Filter
     dram : dict
         Settings of DRAM.
-    truths : callable
-        From a generator to the true parameters: of the model's prior, unless it is to be wrong.
-    run : type
-        The way a chain is made: ChainTask, unless it is to be wrong.
+    problem : OneRecord or Panel
+        Prior, system's records, and the quantities whose ranks are taken.
+    run : type, optional
+        The way a chain is made, if that is to be wrong.
     graph : callable, optional
         From the model to the log-density that is sampled, if that is to be wrong.
     """
 
     filter: Any
     dram: dict = field(default_factory=dict)
-    truths: Callable[[np.random.Generator], dict] = from_the_prior
-    run: type[ChainTask] = ChainTask
+    problem: OneRecord | Panel = ONE
+    run: type[ChainTask] | None = None
     graph: Callable[[pm.Model], Any] | None = None
 
 
@@ -93,9 +155,9 @@ class Calibration(NamedTuple):
 
     Attributes
     ----------
-    ranks : ndarray of int, shape (replications, 3)
-        Of the true values of QUANTITIES among N_KEPT draws.
-    lags : ndarray, shape (replications, 3)
+    ranks : ndarray of int, shape (replications, quantities)
+        Of the true values among N_KEPT draws.
+    lags : ndarray, shape (replications, quantities)
         Correlation of neighbours among these draws.
     lengths : ndarray, shape (replications,)
         Iterations after warm-up that the chains took.
@@ -114,25 +176,27 @@ class Replications:
 
     def __init__(self, setting):
         self._setting = setting
-        self.record = pytensor.shared(np.zeros((STEPS.size, 1)), name="record")
+        self._problem = problem = setting.problem
+        self.record = pytensor.shared(np.zeros((problem.n_rows, 1)), name="record")
         with pm.Model() as self.model:
-            pm.Uniform("phi", -0.9, 0.9)
-            pm.LogNormal("spread", np.log(0.7), 0.3)
-            psf.StateSpace("d", LINEAR, setting.filter, steps=STEPS, observed=self.record)
+            problem.prior()
+            psf.StateSpace("d", LINEAR, setting.filter, observed=self.record, **problem.rows)
         settings = DRAMSettings.from_arguments(setting.dram)
-        graph = setting.graph and setting.graph(self.model)
-        self._target = Target(self.model, None, settings, graph=graph)
+        if setting.graph:
+            self._target = Target(self.model, None, settings, graph=setting.graph(self.model))
+        else:
+            self._target = target_of(self.model, settings, None, None, has_pilot=False)
         self._deterministics = Deterministics(self.model, self._target.raveled)
         # Machine code runs in threads; what PyTensor has compiled is called by one at a time.
         self._lock = Lock()
 
     def truth_and_record(self, index):
         rng = np.random.default_rng([2018, index])
-        truth = self._setting.truths(rng)
-        return truth, record_of(**truth, rng=rng)
+        truth = self._problem.truth(rng)
+        return truth, self._problem.record(truth, rng)
 
     def chain(self, index, n_draws):
-        """Draws by name, each (n_draws,): those of ``sample_dram(random_seed=index, chains=1)``."""
+        """Draws (n_draws, ...) by name: those of ``sample_dram(random_seed=index, chains=1)``."""
         request = sampling_request(
             n_draws, TUNE, 1, index, None, False, None, None, self._setting.dram
         )
@@ -142,7 +206,8 @@ class Replications:
             task.prepare()
             task.population = task.find_population(progressbar=False)
             chain = task.chain_task(0)
-        chain.__class__ = self._setting.run
+        if self._setting.run:
+            chain.__class__ = self._setting.run
         chain.run(Event())
         task.add_result(0, *chain.result())
         while task.extend():
@@ -154,23 +219,25 @@ class Replications:
 
     def replicate(self, index):
         """Ranks of the truth, correlations of neighbours, and the length of the chain."""
+        truth, record = self.truth_and_record(index)
         for n_draws in LENGTHS:
             draws = self.chain(index, n_draws)
-            if min(az.ess(draws[name][None]) for name in ("phi", "spread")) >= N_KEPT:
+            elements = [draws[name].reshape(1, n_draws, -1) for name in truth]
+            if min(az.ess(one) for of in elements for one in np.moveaxis(of, 2, 0)) >= N_KEPT:
                 break
-        truth, record = self.truth_and_record(index)
         kept = np.arange(1, N_RANKS) * n_draws // N_KEPT - 1
-        drawn = quantities({name: draws[name][kept] for name in truth}, record)
-        ranks = np.sum(drawn < quantities(truth, record), axis=1)
+        drawn = self.quantities({name: draws[name][kept] for name in truth}, record)
+        at_truth = {name: np.asarray(value)[None] for name, value in truth.items()}
+        ranks = np.sum(drawn < self.quantities(at_truth, record), axis=1)
         centred = drawn - drawn.mean(axis=1, keepdims=True)
         lags = np.mean(centred[:, 1:] * centred[:, :-1], axis=1) / np.mean(centred**2, axis=1)
         return ranks, lags, n_draws
 
-
-def quantities(params, record):
-    """Stack QUANTITIES for some parameters, (3, n)."""
-    terms = psf.log_likelihood(LINEAR, psf.EKF(), params, record, steps=STEPS)
-    return np.array([params["phi"], params["spread"], terms.sum(axis=-1)]).reshape(3, -1)
+    def quantities(self, draws, record):
+        """Stack the quantities of the problem at n draws, (quantities, n)."""
+        return np.stack(
+            [*self._problem.parameters(draws), self._problem.log_likelihood(draws, record)]
+        )
 
 
 def calibrate(setting, n_replications=N_REPLICATIONS):
@@ -186,7 +253,7 @@ def calibrate(setting, n_replications=N_REPLICATIONS):
 
 
 def p_values(ranks):
-    """For each quantity, (3, 2): by chi-square over bins, by the band of the ECDF."""
+    """For each quantity, (quantities, 2): by chi-square over bins, by the band of the ECDF."""
     return np.array([[chi_square_p(r, N_RANKS, N_BINS), ecdf_p(r, N_RANKS)] for r in ranks.T])
 
 
@@ -201,9 +268,20 @@ class Redrawing(ChainTask):
         return chain.advance(False, done, done, 1)
 
 
-def from_another_prior(rng):
-    truth = from_the_prior(rng)
-    return truth | {"spread": 1.2 * truth["spread"]}
+class AnotherPrior(OneRecord):
+    """The true spread is not from the model's prior."""
+
+    def truth(self, rng):
+        truth = super().truth(rng)
+        return truth | {"spread": 1.2 * truth["spread"]}
+
+
+class AnotherPopulation(Panel):
+    """The true phi of all records are higher than the model's population has them."""
+
+    def truth(self, rng):
+        truth = super().truth(rng)
+        return truth | {"phi": truth["phi"] + 0.2}
 
 
 def screen_alone(model):
@@ -217,10 +295,12 @@ SETTINGS = {
     "pseudo-marginal": Setting(FEW, TWO),
     "screened by EKF": Setting(FEW, TWO | {"screen": EXACT, "screen_power": 0.5}),
     "screened by EnKF(20)": Setting(FEW, TWO | {"screen": psf.EnKF(20), "screen_power": 1.0}),
+    "panel, record by record": Setting(FEW, problem=PANEL),
 }
 # What the same comparisons must find.
 CONTROLS = {
-    "another prior": Setting(EXACT, TWO, truths=from_another_prior),
+    "another prior": Setting(EXACT, TWO, problem=AnotherPrior()),
     "the screen alone": Setting(EXACT, TWO, graph=screen_alone),
     "estimates redrawn": Setting(FEW, run=Redrawing),
+    "panel of another population": Setting(FEW, problem=AnotherPopulation()),
 }

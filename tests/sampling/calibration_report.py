@@ -16,7 +16,6 @@ from tests.sampling.calibration import (
     N_BINS,
     N_RANKS,
     N_REPLICATIONS,
-    QUANTITIES,
     SETTINGS,
     calibrate,
     p_values,
@@ -24,7 +23,19 @@ from tests.sampling.calibration import (
 from tests.sampling.rank_uniformity import ecdf_band, ecdf_counts, histogram
 
 STATIC = Path(__file__).parents[2] / "docs" / "_static"
-COLOURS = ("#1b6ca8", "#d1792b", "#3f8f4f")
+COLOURS = {
+    "phi": "#1b6ca8",
+    "spread": "#d1792b",
+    "log-likelihood": "#3f8f4f",
+    "typical": "#222222",
+    "phi of the first": "#7b5ea7",
+    "phi of the last": "#b0476b",
+}
+
+
+def quantities_of(name):
+    """Whose ranks a setting has."""
+    return (SETTINGS | CONTROLS)[name].problem.quantities
 
 
 def tables(results):
@@ -32,7 +43,7 @@ def tables(results):
     counts = f"ranks in {N_BINS} bins"
     lines = [f"| setting | quantity | p, chi-square | p, ECDF | {counts} |", "| --- " * 5 + "|"]
     for name, result in results.items():
-        both = zip(QUANTITIES, result.ranks.T, p_values(result.ranks), strict=True)
+        both = zip(quantities_of(name), result.ranks.T, p_values(result.ranks), strict=True)
         for quantity, ranks, (by_bins, by_ecdf) in both:
             bins = " ".join(map(str, histogram(ranks, N_RANKS, N_BINS)))
             lines.append(f"| {name} | {quantity} | {by_bins:.2g} | {by_ecdf:.2g} | {bins} |")
@@ -48,7 +59,7 @@ def tables(results):
 def picture(results, target):
     """ECDFs of the ranks less the uniform one, with the band that holds all of 99 %."""
     figure, panels = plt.subplots(
-        2, 4, figsize=(11, 5), sharex=True, sharey="row", layout="constrained"
+        2, 5, figsize=(13, 5), sharex=True, sharey="row", layout="constrained"
     )
     places = np.arange(1, N_RANKS) / N_RANKS
     low, high = ecdf_band(N_REPLICATIONS, N_RANKS, error_rate=0.01)
@@ -61,18 +72,20 @@ def picture(results, target):
                 high / N_REPLICATIONS - places,
                 color="#dddddd",
             )
-            for ranks, quantity, colour in zip(
-                results[name].ranks.T, QUANTITIES, COLOURS, strict=True
-            ):
+            for ranks, quantity in zip(results[name].ranks.T, quantities_of(name), strict=True):
                 share = ecdf_counts(ranks, N_RANKS) / N_REPLICATIONS
-                axis.plot(places, share - places, color=colour, label=quantity, linewidth=1.2)
+                axis.plot(
+                    places, share - places, color=COLOURS[quantity], label=quantity, linewidth=1.2
+                )
             axis.set_title(name, fontsize=9)
             axis.spines[["top", "right"]].set_visible(False)
     panels[0, 0].set_ylabel("right samplers:\nECDF less uniform", fontsize=9)
     panels[1, 0].set_ylabel("wrong on purpose:\nECDF less uniform", fontsize=9)
     figure.supxlabel("rank of the true value, as a share", fontsize=9)
-    panels[1, -1].axis("off")
-    panels[1, -1].legend(*panels[0, 0].get_legend_handles_labels(), frameon=False)
+    shown = {}
+    for panel in (panels[0, 0], panels[0, -1]):
+        shown |= dict(zip(*panel.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(shown.values(), shown, loc="outside right center", frameon=False)
     figure.savefig(target, dpi=110)
 
 

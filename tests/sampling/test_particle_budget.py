@@ -72,6 +72,32 @@ def test_the_suggestion_is_in_the_target_at_the_exact_mode(first):
     assert (table["n_failed"] == 0).all()
 
 
+def test_a_panel_is_tuned_on_its_noisiest_record_unless_parameters_are_shared():
+    """Six like records; the last has no observation but one, and hardly any noise."""
+    n, rows = 6, np.tile(STEPS[:20], 6)
+    labels = np.repeat(np.arange(n), 20)
+    observed = np.tile(DATA[:20], n)
+    observed[-19:] = np.nan
+    found = {}
+    for name in ("own", "shared"):
+        with pm.Model() as model:
+            pm.Normal("phi", 0.8, 0.2, shape=n)
+            spread = 0.7 if name == "own" else pm.TruncatedNormal("s", 0.7, 0.01, lower=0.1)
+            psf.StateSpace(
+                "d",
+                LINEAR,
+                psf.BootstrapPF(20),
+                panel=labels,
+                steps=rows,
+                observed=observed,
+                params={"spread": spread},
+            )
+        table = psf.suggest_particles(model, random_seed=1, progressbar=False)
+        found[name] = table.loc[20, "variance_centre"], table.attrs["n_particles"]
+    assert 3.0 < found["shared"][0] / found["own"][0] < 7.0  # five noisy records
+    assert found["shared"][1] > 2.5 * found["own"][1]
+
+
 def two_records(a, b):
     with pm.Model() as model:
         pm.Normal("phi", 0.5, 0.5)

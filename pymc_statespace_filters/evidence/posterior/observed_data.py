@@ -7,7 +7,9 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
+from pymc_statespace_filters.pymc_model.aligned_axes import records_of_rows
 from pymc_statespace_filters.pymc_model.inspection import scored_rows
+from pymc_statespace_filters.pymc_model.random_variable import PanelRV
 
 
 class _Observed(NamedTuple):
@@ -18,6 +20,7 @@ class _Observed(NamedTuple):
     """
 
     values: NDArray[np.float64]
+    records: list[NDArray[np.float64]]  # the values, by record in a panel
     is_vector: bool
     score_from: int
     is_scored: Any
@@ -30,15 +33,21 @@ class _Observed(NamedTuple):
 
 def _observed(model: pm.Model) -> list[_Observed]:
     """What every observed variable has for data."""
-    return [
-        _Observed(
-            np.asarray(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"), dtype=np.float64),
-            getattr(rv.owner.op, "ndim_supp", 0) > 0,
-            getattr(rv.owner.op, "score_from", 0),
-            scored_rows(rv.owner),
-        )
-        for rv in model.observed_RVs
-    ]
+    found = []
+    for rv in model.observed_RVs:
+        values = np.asarray(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"), dtype=np.float64)
+        op = rv.owner.op
+        is_vector, score_from = getattr(op, "ndim_supp", 0) > 0, getattr(op, "score_from", 0)
+        records = _records(rv.owner, values)
+        found.append(_Observed(values, records, is_vector, score_from, scored_rows(rv.owner)))
+    return found
+
+
+def _records(node: Any, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The values of each record of a panel; all together of any other variable."""
+    if not isinstance(node.op, PanelRV):
+        return [values]
+    return np.split(values, np.flatnonzero(np.diff(records_of_rows(node.inputs[3]))) + 1)
 
 
 def observation_count(model: pm.Model) -> int:
@@ -66,14 +75,14 @@ def data_fingerprint(model: pm.Model) -> str:
     str
         Hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows that
         are not scored: reproducible across processes, and independent of the structure of the model
-        and the names of its variables.
-        Axes of length one are ignored, so that a vector of J values equals a table of one column.
+        and the names of its variables. The records of a panel count like variables, so that neither
+        their order nor their labels matter. Axes of length one are ignored, so that a vector of J values equals a table of one column.
     """
     hashes = []
     for one in _observed(model):
-        values = np.squeeze(one.values)
-        canonical = np.where(np.isnan(values), np.nan, values + 0.0)  # one kind of NaN and of zero
-        content = repr(values.shape).encode() + canonical.astype("<f8").tobytes()
         unscored = f" scored from {one.score_from}" if one.score_from else ""
-        hashes.append(hashlib.sha256(content + unscored.encode()).digest())
+        for values in map(np.squeeze, one.records):
+            canonical = np.where(np.isnan(values), np.nan, values + 0.0)  # one NaN, one zero
+            content = repr(values.shape).encode() + canonical.astype("<f8").tobytes()
+            hashes.append(hashlib.sha256(content + unscored.encode()).digest())
     return hashlib.sha256(b"".join(sorted(hashes))).hexdigest()

@@ -9,6 +9,7 @@ from pymc.model import Model
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
+from pymc_statespace_filters.pymc_model.aligned_axes import records_of_rows
 from pymc_statespace_filters.pymc_model.graph_rewrites import (
     likelihood_terms,
     with_filter,
@@ -18,7 +19,9 @@ from pymc_statespace_filters.pymc_model.inspection import (
     noisy_filters,
     quieter_filter,
     resized,
+    state_space_nodes,
 )
+from pymc_statespace_filters.pymc_model.panel_structure import panel_structure
 from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     TOO_NOISY,
@@ -55,11 +58,17 @@ class Estimates(NamedTuple):
     totals: np.ndarray  # (R,)
     terms: np.ndarray  # (R, J), of the likelihood
     seconds: float  # CPU time of one
+    records: np.ndarray | None  # (J,), numbers of records of which each moves by itself
 
     @property
     def spread(self) -> SeedSpread:
-        """Moments of the totals."""
-        return spread_of(self.totals)
+        """Moments of the totals, or of the sum of the record that has the largest variance."""
+        whole = spread_of(self.totals)
+        if self.records is None or not np.isfinite(whole.variance):
+            return whole
+        sums = np.array([np.bincount(self.records, terms) for terms in self.terms])
+        noisiest = max(map(spread_of, sums.T), key=lambda spread: spread.variance)
+        return noisiest._replace(mean=whole.mean, n_failed=whole.n_failed)
 
 
 class NoisyLikelihood:
@@ -77,6 +86,7 @@ class NoisyLikelihood:
         if not self._raveled.dim:
             raise ModelError("model must have at least one free variable, it has none")
         self._densities: dict[Filter, ParallelMap] = {}
+        self._records = _records_moved_alone(model, self.name)
 
     def points(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """Run the pilot; the centre of the posterior and its tail points, shape (d,) each."""
@@ -111,7 +121,7 @@ class NoisyLikelihood:
         results = density(np.tile(position, (n_seeds, 1)), *seeds.T)
         totals, terms = results[:, 0], results[:, -density.shapes[-1][0] :]
         seconds = (time.process_time() - began) / n_seeds
-        return Estimates(np.where(totals < np.inf, totals, -np.inf), terms, seconds)
+        return Estimates(np.where(totals < np.inf, totals, -np.inf), terms, seconds, self._records)
 
     def prepare(self, filter: Any) -> ParallelMap:
         """Compile what `estimates` evaluates, unless it is there."""
@@ -148,6 +158,14 @@ class NoisyLikelihood:
         spreads = [self.estimates(filter, x, _PER_BEST).spread for x in points]
         best = int(np.argmax([spread.mean for spread in spreads]))
         return pilot.positions[best], spreads[best].variance
+
+
+def _records_moved_alone(model: Model, name: str) -> np.ndarray | None:
+    """The record of each row of a panel (J,), if no move of a chain needs all its records."""
+    structure = panel_structure(model)
+    if structure is None or structure.name != name or structure.shared:
+        return None
+    return records_of_rows(state_space_nodes(model)[name].inputs[3])
 
 
 def noisy_variable(model: Any, var_name: Any) -> tuple[str, Any]:
