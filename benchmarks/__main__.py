@@ -3,8 +3,8 @@
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
 writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are. So
-have ``--only ode``, ``epidemic``, ``panel``, ``panel_sampling`` and ``panel_evidence``.
+package; these parts have a file of their own, and the tables of the others stay as they are.
+So have ``--only ode``, ``epidemic``, ``panel``, ``panel_nuts`` and ``panel_evidence``.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from benchmarks import (
     ode,
     panel,
     panel_evidence,
+    panel_nuts,
     panel_sampling,
     report,
     sampling,
@@ -57,6 +58,7 @@ PARTS = {
     "cold": lambda peers: cold.cold(),
     "demo": lambda peers: demo.demo(),
     "panel_evidence": lambda peers: panel_evidence.panel_evidence(),
+    "panel_nuts": panel_nuts.panel_nuts,
     "panel_sampling": lambda peers: panel_sampling.panel_sampling(),
     "integrators": lambda peers: integrators.integrators(),
 }

@@ -14,6 +14,7 @@ from benchmarks.growth import Curve
 from benchmarks.measure import FOLDER, ROOT, Row
 from benchmarks.noise import Noise, Normals
 from benchmarks.panel_evidence import PanelEvidence
+from benchmarks.panel_nuts import DRAWS, N_RECORDS, PanelNuts
 from benchmarks.panel_sampling import PanelChain
 from benchmarks.ratios import ratios
 from benchmarks.sampling import Chains
@@ -42,6 +43,8 @@ def write(parts: list[str]) -> str:
         write_integrators(found["rows"])
     if found := kept.pop("panel_evidence", None):
         write_panel_evidence(found["rows"])
+    if found := kept.pop("panel_nuts", None):
+        write_panel_nuts(found)
     own = {part: k for part, k in kept.items() if part in OWN}
     separate = {part: k for part, k in kept.items() if part in SEPARATE}
     compared = {part: k for part, k in kept.items() if part not in OWN | SEPARATE}
@@ -118,6 +121,30 @@ def write_panel_evidence(rows: list[dict]) -> None:
     ]
     head = ["parameters", "estimator", "error (nats)", "standard error", "time"]
     (TARGET / "panel_evidence.inc").write_text(table(head, lines))
+
+
+def write_panel_nuts(kept: dict) -> None:
+    """Write the table of NUTS on a panel."""
+    lines = []
+    for r in (PanelNuts(**row) for row in kept["rows"]):
+        if r.seconds is None:
+            lines.append([r.who, *[""] * 5, r.note])
+            continue
+        each = number(r.effective / r.seconds)
+        whole = seconds(r.whole_call)
+        answer = f"{r.log_likelihood:.3f}"
+        lines.append([r.who, number(r.effective), seconds(r.seconds), each, whole, answer, r.note])
+    head = [
+        "",
+        "effective draws",
+        "tuning and draws",
+        "a second",
+        "first call",
+        "log-likelihood",
+        "",
+    ]
+    text = f"\n## NUTS, {N_RECORDS} records, {DRAWS} + {DRAWS} iterations\n\n" + table(head, lines)
+    (TARGET / "panel_nuts.inc").write_text(machine({"panel_nuts": kept}) + text)
 
 
 def write_integrators(rows: list[dict]) -> None:

@@ -1,6 +1,7 @@
 """What users get wrong is an error that names the argument, its value and what is expected."""
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
@@ -226,6 +227,7 @@ INTEGRATORS = {
     "dt infinite": (lambda: euler(dt=np.inf), "dt .*positive.*inf"),
     "dt missing": (lambda: euler(dt=None), "dt .*None"),
     "no substeps": (lambda: euler(substeps=0), "substeps .*at least 1.*0"),
+    "too many substeps": (lambda: euler(substeps=10**9), "substeps must be at most 1000"),
     "half a substep": (lambda: euler(substeps=1.5), "substeps .*integer.*1.5"),
     "drift too long": (lambda: euler(drift=lambda x: [x[0]]), r"drift .*\(2,\).*\(1,\)"),
     "drift with noise": (lambda: euler(drift=lambda x, q: x), "drift.*'q' is reserved"),
@@ -278,17 +280,30 @@ RECORDS = {
     "before the start": (dict(steps=None, times=[-1.0, 1.0]), "negative"),
     "times not finite": (dict(steps=None, times=[0.0, np.nan]), "times .*finite"),
     "times not numbers": (dict(steps=None, times=["now", "then"]), "times must be numbers"),
+    "dates": (
+        dict(steps=None, times=np.array(["2020-01-01", "2020-01-02"], "datetime64[D]")),
+        r"times .*dates.*np.timedelta64\(1, 's'\)",
+    ),
+    "durations": (dict(steps=None, times=np.arange(2).astype("timedelta64[h]")), "times .*dates"),
+    "index of dates": (dict(steps=None, times=pd.date_range("2020", periods=2)), "times .*dates"),
+    "times too far": (dict(steps=None, times=[0.0, 1e30]), "at most 1e.09, .*got 1e.30"),
+    "steps too far": (dict(steps=[0, 10**12]), "at most 1e.09, .*got 1e.12"),
+    "steps beyond 64 bits": (dict(steps=[0, 2**70]), "at most 1e.09"),
     "t0 not a number": (dict(t0="0"), "t0 .*'0'"),
     "t0 infinite": (dict(t0=np.inf), "t0 .*finite"),
     # data
     "data too short": (dict(observed=[0.0]), r"observed .*\(2, 1\).*\(1,\)"),
     "data too wide": (dict(observed=np.zeros((2, 2))), r"observed .*\(2, 1\).*\(2, 2\)"),
     "data infinite": (dict(observed=[0.0, np.inf]), r"observed .*NaN where missing.*inf"),
+    "data too large": (dict(observed=[0.0, 1e160]), r"observed\[1, 0\] = 1e.160: take another"),
     "data words": (dict(observed=["a", "b"]), "observed must be numbers"),
     # parameters
     "parameter missing": (dict(params={}), r"no value for the parameters \['a'\]"),
     "parameter unknown": (dict(params={"a": 1.0, "b": 2.0}), r"parameters .*\['a'\], got \['b'\]"),
     "parameter NaN": (dict(params={"a": np.nan}), "'a' must not be NaN"),
+    "parameter masked": (
+        dict(params={"a": np.ma.masked_array(0.5, True)}), "'a' must have no masked values",
+    ),
     "parameter a word": (dict(params={"a": "big"}), "'a' must be numbers"),
     "not a mapping": (dict(params=[1.0]), "params must be a mapping"),
     "params must be arrays that broadcast together": (
@@ -351,6 +366,34 @@ def test_a_wrong_simulation_is_refused(changes, words):
         psf.simulate(given.pop("system"), given.pop("params"), **given)
 
 
+@pytest.mark.parametrize("name", [3, ""])
+def test_a_variable_has_a_name(name):
+    with pm.Model(), pytest.raises(psf.ModelError, match="name must be a text"):
+        psf.StateSpace(name, SYSTEM, psf.EKF(), params={"a": 0.5}, steps=[0], observed=[0.0])
+
+
+def _skewed(b):
+    return [[1.0, b], [0.2 * b, 1.0]]
+
+
+def _correlated(b):
+    return [[1.0, 0.2 * b], [0.2 * b, 1.0]]
+
+
+@pytest.mark.parametrize("role", ["process_noise", "observation_noise", "initial_cov"])
+def test_functions_give_symmetric_covariances(role):
+    """One triangle of the matrix is all that a filter reads."""
+    both = dict(
+        transition=lambda x, q: [x[0] + q[0], x[1] + q[1]],
+        process_noise=np.eye(2),
+        observation=lambda x: x,
+        observation_noise=np.eye(2),
+    )
+    make(**both | {role: _correlated})
+    with pytest.raises(psf.ModelError, match=f"{role} must be symmetric, got .* parameters"):
+        make(**both | {role: _skewed})
+
+
 def test_a_density_alone_cannot_be_simulated():
     system = make(
         observation=..., observation_noise=..., observation_logp=lambda d, x: -(d[0] ** 2)
@@ -362,11 +405,12 @@ def test_a_density_alone_cannot_be_simulated():
 @pytest.mark.parametrize(
     ("construct", "words"),
     [
-        (lambda: psf.EnKF(1), "n_members .*at least 2.*1"),
+        (lambda: psf.EnKF(1), "n_members .*from 2 .*1"),
         (lambda: psf.EnKF(10.0), "n_members .*integer.*10.0"),
         (lambda: psf.EnKF(True), "n_members .*True"),
         (lambda: psf.EnKF(10, likelihood="exact"), "likelihood .*'ensemble', 'gaussian'.*'exact'"),
-        (lambda: psf.BootstrapPF(0), "n_particles .*at least 2.*0"),
+        (lambda: psf.BootstrapPF(0), "n_particles .*from 2 .*0"),
+        (lambda: psf.BootstrapPF(10**30), "n_particles .*to 1e.08"),
         (lambda: psf.BootstrapPF(10, resample_below=2), "resample_below .*0 to 1.*2"),
         (lambda: psf.BootstrapPF(10, resampling="residual"), "resampling .*'residual'"),
         (lambda: psf.PFEnKF(10, likelihood="gaussian"), "likelihood .*'predictive'.*'gaussian'"),
@@ -401,6 +445,8 @@ def test_filters_refuse_systems_that_they_cannot_treat():
             "times .*different steps of dt = 0.1, got 0.1 and 0.104: take a smaller dt",
         ),
         (([-0.2, 0.1], 0.1), "negative"),
+        ((np.arange(2).astype("timedelta64[s]"), 0.1), "times .*dates"),
+        (([0.0, 1e30], 0.1), "steps must be at most"),
         (([0.0, np.nan], 0.1), "times .*finite"),
         (([0.0, 0.1], 0.0), "dt must be a positive number, got 0.0"),
         (([0.0, 0.1], "0.1"), "dt must be a positive number, got '0.1'"),

@@ -9,6 +9,7 @@ import pandas as pd
 import pymc as pm
 import xarray as xr
 
+from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.agreement import Agreement, assess_agreement
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
@@ -118,7 +119,7 @@ def chib_jeliazkov(
     >>> abs(evidence.log_evidence - (-4.6154)) < 4 * evidence.se < 0.1
     True
     """
-    with cores_set_to(_checked_cores(cores)):
+    with cores_set_to(_checked_cores(cores)), COMPILATION:
         found = run_estimators(
             idata,
             model,
@@ -262,7 +263,7 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
-    with cores_set_to(_checked_cores(cores)):
+    with cores_set_to(_checked_cores(cores)), COMPILATION:
         estimates = run_estimators(
             idata,
             model,
@@ -289,7 +290,11 @@ def _select_estimators(
     given: str | Estimator | Iterable[str | Estimator], target_se: float
 ) -> list[Estimator]:
     """Look up names, check that the estimators are valid and differ in name, and set targets."""
-    entries = [given] if isinstance(given, str | Estimator) else list(given or ())
+    if not isinstance(given, str | Estimator | Iterable):
+        raise ModelError(
+            f"estimators must be names among {list(ESTIMATORS)} or Estimator objects, got {given!r}"
+        )
+    entries = [given] if isinstance(given, str | Estimator) else list(given)
     found: dict[str, Estimator] = {}
     for entry in entries:
         estimator = ESTIMATORS.get(entry) if isinstance(entry, str) else entry

@@ -8,11 +8,13 @@ import numpy as np
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import is_integer
 
+MOST_MEMBERS = 10**8
+
 
 def check_count(name: str, value: object) -> int:
-    """Return ``value`` as an int of at least 2."""
-    if not is_integer(value) or value < 2:
-        raise ModelError(f"{name} must be an integer of at least 2, got {value!r}.")
+    """Return ``value`` as an int of at least 2, of which the memory may hold the states."""
+    if not is_integer(value) or not 2 <= value <= MOST_MEMBERS:
+        raise ModelError(f"{name} must be an integer from 2 to {MOST_MEMBERS:.0e}, got {value!r}.")
     return int(value)
 
 

@@ -24,6 +24,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import (
 )
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
+from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
@@ -115,7 +116,8 @@ def evaluator(op: FilterOp) -> Any:
     It is compiled without PyTensor's function around it, which would take as long to compile again,
     and whose object stores the arguments of a call in cells that all threads would overwrite.
     """
-    function, key = _call(op)
+    with COMPILATION:
+        function, key = _call(op)
     compiled = jit(function)
     machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
     kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]

@@ -129,6 +129,8 @@ class StateSpace(Continuous):
     ) -> TensorVariable:
         """Add the variable, its coordinates and its seed to the model of the context."""
         model = pm.modelcontext(None)
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"name must be a text that is not empty, got {name!r}")
         check_system_and_filter(system, filter)
         warn_of_choice(system, filter)
         given = {} if params is None else params

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pymc as pm
+import pytensor
+import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import NDArray
 from pymc.initial_point import make_initial_point_fn
-from pymc.model.transform_values import unconstrain_values
+from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 
@@ -68,14 +70,8 @@ def unconstrained_draws(
             raise DataMismatchError(
                 f"{rv.name!r} in idata must have the model's shape {expected}, got {drawn}"
             )
-    # A single call for all draws does not repay compilation to machine code.
-    unconstrained = unconstrain_values(
-        _completed(posterior, model), model=model, compile_kwargs={"mode": "FAST_COMPILE"}
-    )
-    columns = [
-        unconstrained[model.rvs_to_values[rv].name].values.reshape(n_chains, n_draws, -1)
-        for rv in chosen
-    ]
+    unconstrained = _unconstrained(model, _completed(posterior, model))
+    columns = [unconstrained[rv.name].reshape(n_chains, n_draws, -1) for rv in chosen]
     draws = np.concatenate(columns, axis=-1).astype(np.float64)
     outside = int((~np.isfinite(draws).all(axis=-1)).sum())
     if outside:
@@ -85,6 +81,30 @@ def unconstrained_draws(
             "another model"
         )
     return draws
+
+
+def _unconstrained(model: pm.Model, posterior: xr.Dataset) -> dict[str, np.ndarray]:
+    """All draws (chain * draw, ...) of each free variable, as its transform maps them.
+
+    PyMC's ``unconstrain_values`` hands DataArrays to operations that need arrays, such as that of
+    `LKJCorr`.
+    """
+    free = list(model.free_RVs)
+    symbols = [rv.type() for rv in free]
+    graphs = []
+    for rv, symbol in zip(free, symbols, strict=True):
+        transform = model.rvs_to_transforms[rv]
+        graphs.append(symbol if transform is None else transform.forward(symbol, *rv.owner.inputs))
+    graphs = graph_replace(graphs, dict(zip(free, symbols, strict=True)), strict=False)
+    batches = [pt.tensor(dtype=s.type.dtype, shape=(None, *s.type.shape)) for s in symbols]
+    results = vectorize_graph(graphs, dict(zip(symbols, batches, strict=True)))
+    # A single call for all draws does not repay compilation to machine code.
+    function = pytensor.function(batches, results, mode="FAST_COMPILE", on_unused_input="ignore")
+    values = []
+    for rv, batch in zip(free, batches, strict=True):
+        drawn = posterior[rv.name].transpose("chain", "draw", ...).values
+        values.append(drawn.reshape(-1, *drawn.shape[2:]).astype(batch.type.dtype))
+    return dict(zip([rv.name for rv in free], function(*values), strict=True))
 
 
 def _completed(posterior: xr.Dataset, model: pm.Model) -> xr.Dataset:

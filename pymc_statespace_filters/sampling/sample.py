@@ -195,7 +195,7 @@ def sample_dram(
     options = ExecutionOptions(
         cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
     )
-    folders = [] if checkpoint is None else [checkpoint]
+    folders = [] if checkpoint is None else [_checked_folder(checkpoint)]
     trees = sample_models({"": model}, [request], options, folders)
     return None if trees is None else trees[""]
 
@@ -305,5 +305,14 @@ def run_models(
     options = ExecutionOptions(
         cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
     )
-    folders = [] if checkpoint is None else [Path(checkpoint, folder_name(name)) for name in models]
+    folders = []
+    if checkpoint is not None:
+        folder = _checked_folder(checkpoint)
+        folders = [Path(folder, folder_name(name)) for name in models]
     return sample_models(models, requests, options, folders)
+
+
+def _checked_folder(checkpoint: Any) -> str | os.PathLike:
+    if not isinstance(checkpoint, str | os.PathLike) or not os.fspath(checkpoint):
+        raise ModelError(f"checkpoint must be the path of a folder, got {checkpoint!r}")
+    return checkpoint

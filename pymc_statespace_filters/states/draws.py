@@ -42,7 +42,13 @@ class PosteriorDraws:
             raise ModelError(
                 f"{name!r} has shape {shape} in the model, {values.shape[2:]} in idata"
             )
-        return values.reshape(-1, *shape)
+        values = values.reshape(-1, *shape)
+        if bad := int((~np.isfinite(values.reshape(len(values), -1)).all(axis=1)).sum()):
+            raise ModelError(
+                f"{name!r} in idata must be finite, got {bad} of {len(values)} draws with NaN or "
+                "infinity"
+            )
+        return values
 
     def stored_seeds(self, name: str, n_records: int) -> NDArray[np.int64] | None:
         """The noise seed of the likelihood estimate of every draw; None if none is stored.

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytensor
 import pytensor.tensor as pt
 from pymc.pytensorf import constant_fold
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
@@ -212,8 +214,39 @@ def trace_covariance(
 ) -> TensorVariable:
     """The matrix (size, size) of a covariance; numbers are checked."""
     if isinstance(covariance, Equation):
-        return as_matrix(role, covariance(values), size, size)
+        matrix = as_matrix(role, covariance(values), size, size)
+        _check_symmetry(role, matrix)
+        return matrix
     return pt.as_tensor(_constant_covariance(role, covariance, size, definite=definite))
+
+
+def _check_symmetry(role: str, matrix: TensorVariable) -> None:
+    """Raise if the matrix of a function is not symmetric where all parameters are near 1.
+
+    Filters use one triangle of it. A matrix that cannot be computed there is not checked.
+    """
+    if matrix.type.shape == (1, 1):
+        return
+    inputs = [v for v in graph_inputs([matrix]) if not isinstance(v, Constant)]
+    rng = np.random.default_rng(1)
+    values = []
+    for symbol in inputs:
+        if None in symbol.type.shape or symbol.type.dtype != "float64":
+            return
+        values.append(rng.uniform(0.6, 0.9, symbol.type.shape))
+    function = pytensor.function(inputs, matrix, mode="FAST_COMPILE", on_unused_input="ignore")
+    try:
+        with np.errstate(all="ignore"):
+            found = function(*values)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return
+    if found.shape != found.T.shape:
+        return  # refused with its size
+    if np.isfinite(found).all() and np.abs(found - found.T).max() > 1e-8 * np.abs(found).max():
+        raise ModelError(
+            f"{role} must be symmetric, got {found.round(4).tolist()} at parameters between 0.6 "
+            "and 0.9"
+        )
 
 
 def _constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:

@@ -92,6 +92,8 @@ def check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: st
 
 def numbers(name: str, value: Any) -> np.ndarray:
     """The value of a parameter as an array, which may hold infinities but no NaN."""
+    if np.ma.is_masked(value):
+        raise ModelError(f"parameter {name!r} must have no masked values, got {value!r}")
     try:
         array = np.asarray(value, dtype="float64")
     except (TypeError, ValueError):

@@ -17,11 +17,21 @@ from pymc_statespace_filters.system.accumulators import (
     with_resets,
     with_symbolic_resets,
 )
-from pymc_statespace_filters.system.checks import check_finite, check_positive, shortened
+from pymc_statespace_filters.system.checks import (
+    check_finite,
+    check_positive,
+    is_integer,
+    shortened,
+)
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Times must lie on the grid of steps to this fraction of a step.
 GRID_TOLERANCE = 1e-6
+
+# Beyond this a record would take hours, or not fit into memory; each step is computed.
+MOST_STEPS = 10**9
+# Beyond this the square of an observation overflows.
+LARGEST_OBSERVATION = 1e150
 
 ROWS_AT = ("observations", "steps")
 
@@ -130,6 +140,8 @@ def check_steps(steps: Any) -> np.ndarray:
     array = np.asarray(steps)
     if array.size == 0:
         raise ModelError(f"steps must hold at least one step, got {shortened(steps)}")
+    if array.ndim == 1 and _holds_large_integers(array):
+        raise _too_many_steps(float(max(array.tolist())))
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise ModelError(
             f"steps must be a vector of integers (give real timestamps as times), got "
@@ -146,15 +158,22 @@ def check_steps(steps: Any) -> np.ndarray:
     return array.astype("int64")
 
 
+def _holds_large_integers(array: np.ndarray) -> bool:
+    """Whether all are integers, NumPy's or Python's, and one of them is too large."""
+    if array.dtype == object and not all(is_integer(value) for value in array):
+        return False
+    return array.dtype.kind in "iuO" and bool((array > MOST_STEPS).any())
+
+
 def steps_of(steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
     """The step numbers of a record, given as steps or as times on the grid ``t0 + k * dt``."""
     if (steps is None) == (times is None):
         raise ModelError("give exactly one of steps and times")
     if steps is not None:
         return check_steps(steps)
-    array = _floats("times", times, 1)
+    array = _numbers_of_time(times)
     exact = (array - t0) / dt
-    whole = np.round(exact)
+    whole = _checked_whole(np.round(exact))
     off = np.abs(exact - whole)
     if (off > GRID_TOLERANCE).any():
         at = int(np.argmax(off))
@@ -163,6 +182,31 @@ def steps_of(steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
             f"dt = {dt:g} by {off[at]:.3g} steps; round with psf.nearest_steps(times, dt, t0=t0)"
         )
     return check_steps(whole.astype("int64"))
+
+
+def _numbers_of_time(times: Any) -> np.ndarray:
+    """Times as floats; dates are refused, because their unit is not that of ``dt``."""
+    if np.asarray(times).dtype.kind in "mM":
+        raise ModelError(
+            "times must be numbers in the unit of dt, got dates or durations: write "
+            "(times - times[0]) / np.timedelta64(1, 's') if dt is in seconds, and round them with "
+            f"psf.nearest_steps; got {shortened(times)}"
+        )
+    return _floats("times", times, 1)
+
+
+def _checked_whole(steps: np.ndarray) -> np.ndarray:
+    """Numbers of steps, still floats, that fit into integers."""
+    if (np.abs(steps) > MOST_STEPS).any():
+        raise _too_many_steps(float(np.abs(steps).max()))
+    return steps
+
+
+def _too_many_steps(number: float) -> ModelError:
+    return ModelError(
+        f"steps must be at most {MOST_STEPS:.0e}, each of which is computed, got {number:g}: take "
+        "a larger dt, or a t0 close to the first time"
+    )
 
 
 def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
@@ -192,14 +236,9 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     >>> psf.nearest_steps([0.0, 0.101, 0.199], dt=0.01)
     array([ 0, 10, 20])
     """
-    if np.asarray(times).dtype.kind in "mM":
-        raise ModelError(
-            f"times must be numbers in the unit of dt (seconds from a start), got dates: "
-            f"{shortened(times)}"
-        )
-    array = _floats("times", times, 1)
+    array = _numbers_of_time(times)
     dt, t0 = check_positive("dt", dt), check_finite("t0", t0)
-    steps = np.round((array - t0) / dt)
+    steps = _checked_whole(np.round((array - t0) / dt))
     if (clashes := np.flatnonzero(np.diff(steps) == 0)).size:
         first, second = array[clashes[0]], array[clashes[0] + 1]
         raise ModelError(
@@ -229,6 +268,12 @@ def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) 
         raise ModelError(
             f"observed must have shape {(n_observations, system.p)} (observations x observables), "
             f"got {np.shape(observed)}"
+        )
+    if (large := np.abs(array) > LARGEST_OBSERVATION).any():
+        row, column = map(int, np.argwhere(large)[0])
+        raise ModelError(
+            f"observed must be at most {LARGEST_OBSERVATION:g} in magnitude, got observed[{row}, "
+            f"{column}] = {array[row, column]:g}: take another unit"
         )
     return array
 

@@ -79,6 +79,7 @@ def test_a_single_name_will_do(idata, model):
     [
         ([], r"estimators must have at least one of \['chib_j.*got \[\]"),
         (["bridge", "harmonic_mean"], r"names among \['chib_j.* objects, got 'harmonic_mean'"),
+        (3, "or Estimator objects, got 3"),
         (["bridge", 3], "or Estimator objects, got 3"),
         (["bridge", Bridge()], "must have different names, got 'bridge' more than once"),
     ],

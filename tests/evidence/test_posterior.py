@@ -212,3 +212,17 @@ def test_a_chain_far_below_the_others_needs_no_more_draws():
     assert re.search(r"chain 3 stayed 1\d{3} nats below chain \d \(median log-density\)", doubt)
     assert "initvals" in doubt
     assert "times as many" not in doubt
+
+
+def test_transforms_of_matrices_get_arrays():
+    """Correlations go through Python code of PyMC, which needs arrays."""
+    rng = np.random.default_rng(1)
+    with pm.Model() as model:
+        pm.LKJCorr("c", n=3, eta=2.0)
+    value = model.value_vars[0]
+    at = rng.normal(size=(2, 20, 3))
+    backward = model.compile_fn(model.unobserved_value_vars, point_fn=False)
+    drawn = [[backward(point)[-1] for point in chain] for chain in at]
+    idata = az.from_dict({"posterior": {"c": np.array(drawn)}})
+    np.testing.assert_allclose(unconstrained_draws(idata, model), at, atol=1e-9)
+    assert value.type.ndim == 1

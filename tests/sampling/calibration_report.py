@@ -82,6 +82,7 @@ def picture(results, target):
     panels[0, 0].set_ylabel("right samplers:\nECDF less uniform", fontsize=9)
     panels[1, 0].set_ylabel("wrong on purpose:\nECDF less uniform", fontsize=9)
     figure.supxlabel("rank of the true value, as a share", fontsize=9)
+    panels[1, -1].axis("off")
     shown = {}
     for panel in (panels[0, 0], panels[0, -1]):
         shown |= dict(zip(*panel.get_legend_handles_labels()[::-1], strict=True))

@@ -221,12 +221,15 @@ def test_stored_estimates_are_those_of_their_seeds(noisy):
             ModelError,
             r"initvals must name free variables of the model, mu, sigma, got 'nu'",
         ),
+        ({"initvals": {"mu": [1.0, 2.0]}}, ModelError, r"'mu' must have shape \(\), got \(2,\)"),
+        ({"initvals": {"mu": "x"}}, ModelError, r"'mu' must be numbers, .* got 'x'"),
         ({"initvals": {"sigma": -1.0}}, ModelError, r"not finite at the start, \[0\.0, nan\]"),
         ({"progressbar": "wide"}, ValueError, r"Invalid value for `progressbar`"),
         ({"step": None}, TypeError, r"argument 'step': the settings of DRAM are proposal_cov, sta"),
         ({"stages": 0}, ModelError, r"stages must be .* got 0"),
         ({"model": 3}, ModelError, r"model must be a pymc.Model, got 3"),
-        ({"checkpoint": 3}, TypeError, r"path"),
+        ({"checkpoint": 3}, ModelError, r"checkpoint must be the path of a folder, got 3"),
+        ({"checkpoint": ""}, ModelError, r"checkpoint must be the path of a folder, got ''"),
     ],
 )
 def test_bad_arguments(arguments, error, message):

@@ -137,6 +137,12 @@ def test_draws_in_another_order_of_dimensions():
     assert_exact(group, laws_of(partial(pair_law, "filtered", STEPS), A))
 
 
+def test_draws_must_be_finite():
+    idata = posterior(a=np.where(A == A.flat[0], np.nan, A))
+    with pytest.raises(psf.ModelError, match="'a' in idata must be finite, got 1 of"):
+        psf.filtered_states(idata, pair_model())
+
+
 def test_coordinates_are_times_names_and_the_draws_own():
     idata = posterior(a=A).isel(draw=[2, 0])
     idata["posterior"] = idata["posterior"].to_dataset().assign_coords(chain=[4, 7])

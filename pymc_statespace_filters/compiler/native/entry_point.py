@@ -46,6 +46,14 @@ class _CacheByKey(FunctionCache):
     def _index_key(self, signature, codegen):
         return signature, codegen.magic_tuple(), CACHED_SRC_FUNCTIONS[self._py_func]
 
+    def load_overload(self, sig, target_context):
+        """The machine code of a signature; None, and no file, if the file is damaged."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever unpickling half a file raises
+            self.flush()
+            return None
+
 
 # Keeps the Python objects, and with them their machine code, alive.
 _compiled: dict[str, Any] = {}

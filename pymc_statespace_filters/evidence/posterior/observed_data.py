@@ -76,7 +76,8 @@ def data_fingerprint(model: pm.Model) -> str:
         Hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows that
         are not scored: reproducible across processes, and independent of the structure of the model
         and the names of its variables. The records of a panel count like variables, so that neither
-        their order nor their labels matter. Axes of length one are ignored, so that a vector of J values equals a table of one column.
+        their order nor their labels matter. Axes of length one are ignored, so that a vector of J
+        values equals a table of one column.
     """
     hashes = []
     for one in _observed(model):

@@ -21,6 +21,7 @@ from functools import partial
 from pymc.model import Model
 from xarray import DataTree
 
+from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.parallel.cpu_affinity import allowed_cores, cores_per_process
@@ -81,15 +82,17 @@ def _run(
     # Each model is compiled by one rank of a computer, the others find the code on disk; rank 0
     # needs all models, the others those of their chains.
     for local in (tasks[local_rank :: len(cores)], tasks if comm.rank == 0 else ()):
-        comm.run_collectively(partial(_prepare, local))
+        with COMPILATION:
+            comm.run_collectively(partial(_prepare, local))
     n_threads = 1  # followers evaluate for one chain at a time
     if not tasks[0].is_distributed:
         n_threads = options.cores or cores_per_process(local_rank, cores)
     n_chains = sum(task.request.chains for task in tasks)
     with ExitStack() as stack:
-        if checkpoints:
-            _open_checkpoints(tasks, checkpoints, comm, stack)
-        _find_populations(tasks, comm, progressbar=bool(options.progressbar))
+        with COMPILATION:
+            if checkpoints:
+                _open_checkpoints(tasks, checkpoints, comm, stack)
+            _find_populations(tasks, comm, progressbar=bool(options.progressbar))
         run_chains(
             tasks,
             comm,
@@ -103,10 +106,11 @@ def _run(
         check = options.compute_convergence_checks
         # Who wants no progress bar wants no report on the screen either.
         level = "info" if options.progressbar else "debug"
-        return {
-            task.name: task.to_datatree(check_convergence=check, report_level=level)
-            for task in tasks
-        }
+        with COMPILATION:
+            return {
+                task.name: task.to_datatree(check_convergence=check, report_level=level)
+                for task in tasks
+            }
 
     return comm.run_collectively(trees) if options.gather == "all" else trees()
 

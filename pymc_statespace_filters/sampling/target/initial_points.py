@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymc.initial_point import make_initial_point_fn, make_initial_point_fns_per_chain
 from pymc.model import Model
+from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
@@ -201,3 +202,25 @@ def _check_initvals(model: Model, initvals: Any, chains: int) -> None:
                 f"initvals must name free variables of the model, "
                 f"{', '.join(rv.name for rv in model.free_RVs)}, got {unknown[0]!r}"
             )
+        for name, value in (given or {}).items():
+            _check_initial_value(model, str(name), value)
+
+
+def _check_initial_value(model: Model, name: str, value: Any) -> None:
+    """Raise unless a value, if it is numbers, has the shape of its variable."""
+    if isinstance(value, Variable):
+        return
+    if isinstance(value, str):
+        if value not in ("support_point", "prior"):
+            raise ModelError(
+                f"initvals of {name!r} must be numbers, 'support_point' or 'prior', got {value!r}"
+            )
+        return
+    pairs = model.values_to_rvs.items()
+    types = {variable.name: variable.type for pair in pairs for variable in pair}
+    expected, found = types[name].shape, np.shape(value)
+    is_like = len(expected) == len(found) and all(
+        e is None or e == f for e, f in zip(expected, found, strict=True)
+    )
+    if not is_like:
+        raise ModelError(f"initvals of {name!r} must have shape {expected}, got {found}")

@@ -18,6 +18,8 @@ from pymc_statespace_filters.system.equations import (
 )
 from pymc_statespace_filters.system.integrators.diffusion import constant_diffusion
 
+MOST_SUBSTEPS = 1000  # 400 take most of a minute to compile
+
 Values = Mapping[str, TensorVariable]
 
 
@@ -36,7 +38,11 @@ class SubstepIntegrator:
         if self.diffusion is not None and not callable(self.diffusion):
             object.__setattr__(self, "diffusion", constant_diffusion(self.diffusion))
         _ = self.equations  # checks the functions
-        check_count("substeps", self.substeps, 1)
+        if check_count("substeps", self.substeps, 1) > MOST_SUBSTEPS:
+            raise ModelError(
+                f"substeps must be at most {MOST_SUBSTEPS}, as the code of each is compiled, got "
+                f"{self.substeps}: take a smaller dt"
+            )
 
     def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The state after a substep, from the values at its start and its standard normals."""
