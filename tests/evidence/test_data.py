@@ -8,6 +8,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
+import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.posterior.observed_data import (
     data_fingerprint,
     observation_count,
@@ -97,3 +98,42 @@ def test_fingerprint_is_stable_across_processes():
     content = b"(2,)" + struct.pack("<2d", 1.0, 2.0)
     expected = hashlib.sha256(hashlib.sha256(content).digest()).hexdigest()
     assert data_fingerprint(scalar_model(np.array([1.0, 2.0]))) == expected
+
+
+def panel_model(order, lengths=(2, 3)):
+    """Records of these lengths, in this order, as one panel."""
+    labels = np.concatenate([np.full(lengths[g], g) for g in order])
+    steps = np.concatenate([np.arange(lengths[g]) for g in order])
+    with pm.Model() as model:
+        psf.StateSpace(
+            "d",
+            LEVEL,
+            psf.EKF(),
+            panel=labels,
+            steps=steps,
+            observed=np.concatenate([RECORDS[g][: lengths[g]] for g in order]),
+        )
+    return model
+
+
+RECORDS = [np.array([0.1, 0.3]), np.array([0.2, np.nan, 0.5])]
+LEVEL = psf.StateSpaceModel(
+    transition=lambda x, q: [x[0] + q[0]],
+    process_noise=[[1.0]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[1.0]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+
+
+def test_records_of_a_panel_count_like_variables():
+    with pm.Model() as variables:
+        for name, record in zip("ba", RECORDS, strict=True):
+            steps = np.arange(record.size)
+            psf.StateSpace(name, LEVEL, psf.EKF(), steps=steps, observed=record)
+    expected = data_fingerprint(variables)
+    assert data_fingerprint(panel_model([0, 1])) == expected
+    assert data_fingerprint(panel_model([1, 0])) == expected
+    assert data_fingerprint(panel_model([0, 1], lengths=(2, 2))) != expected
+    assert data_fingerprint(panel_model([0], lengths=(2, 3))) != expected
