@@ -72,7 +72,7 @@ class UnequalWidths(Given):
 class Skewed(Given):
     """Independent parameters sinh(a asinh(z) + b): one tail long, heavier than normal."""
 
-    TAIL, SKEW = 1.5, 0.5
+    TAIL, SKEW = 2.0, 1.0
 
     def log_posterior(self, x):
         y = (np.arcsinh(x) - self.SKEW) / self.TAIL
@@ -85,9 +85,9 @@ class Skewed(Given):
 
 
 class Funnel(Given):
-    """v ~ N(0, 1.5^2), and k - 1 further parameters ~ N(0, exp(v))."""
+    """v ~ N(0, 3^2), and k - 1 further parameters ~ N(0, exp(v))."""
 
-    SD = 1.5
+    SD = 3.0
 
     def log_posterior(self, x):
         v, others = x[:, :1], x[:, 1:]
@@ -102,7 +102,7 @@ class Funnel(Given):
 class Bent(Given):
     """The second parameter is the square of the first, up to a small error; others are normal."""
 
-    SD, CURVATURE, WIDTH = 2.0, 0.5, 0.3
+    SD, CURVATURE, WIDTH = 2.0, 1.0, 0.15
 
     def _middle(self, first):
         return self.CURVATURE * (first**2 - self.SD**2)
