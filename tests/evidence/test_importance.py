@@ -93,7 +93,9 @@ def test_draws_only_say_where_to_look(wrong):
     rng = np.random.default_rng(56)
     posterior = gaussian(2, (4, 2500), rng)
     mean = posterior.draws.mean(axis=(0, 1))
-    posterior = replace(posterior, draws=mean + (posterior.draws - mean) * 2 ** (wrong / 4))
+    draws = mean + (posterior.draws - mean) * 2 ** (wrong / 4)
+    log_density = posterior.evaluate(draws.reshape(-1, 2), rng).reshape(4, 2500)
+    posterior = replace(posterior, draws=draws, log_density=log_density)
     found = Importance().estimate(posterior, rng=rng)
     assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.05
 

@@ -16,6 +16,7 @@ from pymc_statespace_filters.evidence.estimators.smc_moves import (
     sample_prior_particles,
 )
 from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
+from pymc_statespace_filters.student_mixture import StudentMixture
 from tests.evidence.state_space import state_space
 from tests.evidence.targets import (
     REAL,
@@ -217,9 +218,12 @@ class TestParts:
             log_likelihood=regression.log_likelihood(x) + noise,
         )
         coordinates = cross_fit(1.5 * particles.x - 1)  # not that of the target
+        guide = StudentMixture(  # nor are these
+            np.array([0.3, 0.7]), mean + np.array([[-0.5, 0], [0, 0.5]]), np.stack([chol, 2 * chol])
+        )
         for _ in range(5):
             particles, walks, jumps = metropolis_step(
-                particles, temperature, coordinates, 1.0, posterior, rng
+                particles, temperature, coordinates, guide, 1.0, posterior, rng
             )
             assert walks > 0.1
             assert jumps > 0.1

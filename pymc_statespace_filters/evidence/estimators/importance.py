@@ -10,11 +10,17 @@ of independent terms. With a noisy likelihood every proposal gets a fresh estima
 likelihood estimates give an unbiased evidence.
 
 The method fails if q is low where the posterior is not: a few large weights, or one not yet
-sampled, then dominate the mean. The diagnostic is the shape k of a generalised Pareto distribution
-fitted to the largest weights: above 0.7 the error is unreliable (Vehtari, Simpson, Gelman, Yao and
-Gabry 2024). The weights are not smoothed, because that would bias the mean.
+sampled, then dominate the mean. Two diagnostics show it. One is the shape k of a generalised Pareto
+distribution fitted to the largest weights: above 0.7 the error is unreliable (Vehtari, Simpson,
+Gelman, Yao and Gabry 2024). The weights are not smoothed, because that would bias the mean.
+
+The other is the share u of the draws whose weight exceeds that of every proposal. About this share
+of the posterior has not been sampled, whatever the weights that have been: the neck of a funnel
+leaves no trace among the proposals. The mean is then too low by about u, which is therefore a part
+of the standard error.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -37,6 +43,7 @@ from pymc_statespace_filters.evidence.log_mean import (
 from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
 
 MAX_PARETO_K = 0.7
+MOST_COMPARED = 10_000  # draws whose weights are compared with those of the proposals
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,9 @@ class Importance:
     def estimate(self, posterior: Posterior, *, rng: np.random.Generator) -> Estimate:
         """Estimate the log-evidence from a fit to the draws and fresh log-densities."""
         q = choose_mixture(posterior, rng)
+        compared = posterior.thinned(MOST_COMPARED)
+        draws = compared.draws.reshape(-1, compared.draws.shape[-1])
+        of_draws = compared.log_density.ravel() - q.log_density(draws)
         log_weights = np.empty(0)
         for n_proposals in totals(posterior, self.target_se):
             proposals = q.sample(n_proposals - len(log_weights), rng)
@@ -76,33 +86,42 @@ class Importance:
             log_weights = np.append(log_weights, log_density - q.log_density(proposals))
             check_overlap(log_weights)
             evidence = log_mean_of_independent(log_weights)
-            if is_small(self.target_se, 0.0, evidence.error):
+            unsampled = float((of_draws > log_weights.max()).mean())
+            se = math.hypot(evidence.error, unsampled)
+            if is_small(self.target_se, 0.0, se):
                 break
         tail = pareto_k(log_weights)
         n_effective = evidence.kish_ess(n_proposals)
         return Estimate(
             log_evidence=evidence.value,
-            se=evidence.error,
+            se=se,
             settings={
                 "n_proposals": n_proposals,
                 "n_components": len(q.weights),
                 "n_effective_proposals": n_effective,
                 "pareto_k": tail,
+                "unsampled": unsampled,
                 "zero_density": float(np.isneginf(log_weights).mean()),
             },
-            doubts=tuple(_check(n_effective, tail)),
+            doubts=tuple(_check(n_effective, tail, unsampled, evidence.error)),
             shortfall=shortfall(
                 self.target_se,
                 0.0,
-                evidence.error,
+                se,
                 posterior.log_density.size,
                 "draw more, for proposals that fit better, or use bridge sampling",
             ),
         )
 
 
-def _check(n_effective: float, tail: float) -> Iterator[str]:
-    """Check the effective number of proposals and the tail of their weights."""
+def _check(n_effective: float, tail: float, unsampled: float, error: float) -> Iterator[str]:
+    """Check the number of proposals, the tail of their weights, and those of the draws beyond."""
+    if unsampled > error:
+        yield (
+            f"{unsampled:.1%} of the draws have a weight above that of every proposal: that part "
+            "of the posterior has not been sampled; use bridge sampling, or reparametrise towards "
+            "a Gaussian posterior"
+        )
     if n_effective < MIN_EFFECTIVE:
         yield (
             f"the proposals are worth {n_effective:.0f} independent draws, fewer than "

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.whitening import Whitening
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.student_mixture import StudentMixture
 
 MIN_ALIVE = 50  # prior draws of positive likelihood
 
@@ -82,6 +83,13 @@ class CrossFittedWhitening(NamedTuple):
         first, second = np.split(z, 2)
         return np.concatenate([self.first.unconstrained(first), self.second.unconstrained(second)])
 
+    def log_normal_density(self, z: Array) -> Array:
+        """Log-density of the fitted normals at all particles, whose whitened points are z."""
+        n, k = z.shape
+        log_det = [np.log(np.diagonal(one.chol)).sum() for one in self]
+        constant = np.repeat(log_det, [n - n // 2, n // 2]) + 0.5 * k * math.log(2 * math.pi)
+        return np.asarray(-0.5 * (z**2).sum(axis=1) - constant)
+
 
 def cross_fit(x: Array) -> CrossFittedWhitening:
     """Fit the coordinates of each half of the runs to the particles of the other half."""
@@ -106,30 +114,38 @@ def metropolis_step(
     particles: Particles,
     temperature: float,
     coordinates: CrossFittedWhitening,
+    guide: StudentMixture,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,
 ) -> tuple[Particles, float, float]:
     """Move every particle by a random-walk or an independence proposal, with equal probability.
 
-    The random walk suits any shape; the independence proposal, the fitted normal distribution,
-    mixes at once if the target is nearly normal. Returns the particles and the acceptance rates of
-    the two.
+    The random walk suits any shape. The independence proposal is drawn from the fitted normal
+    distribution, which mixes at once if the target is nearly normal, or from the ``guide``, whose
+    points may lie in another mode. Returns the particles and the acceptance rates of walks and of
+    independence proposals.
     """
-    k = particles.x.shape[1]
+    n, k = particles.x.shape
     z = coordinates.whitened(particles.x)
-    walks = rng.random(len(z)) < 0.5
+    walks, guided = rng.random((2, n)) < 0.5
     normals = rng.standard_normal(z.shape)
     proposed = np.where(walks[:, np.newaxis], z + scale * 2.38 / math.sqrt(k) * normals, normals)
+    x = np.where(
+        (guided & ~walks)[:, np.newaxis],
+        guide.sample(n, rng),
+        coordinates.unconstrained(proposed),
+    )
     # Proposal densities cancel for the random walk, not for the independence proposal.
-    log_jump = np.where(walks, 0.0, 0.5 * ((proposed**2).sum(axis=1) - (z**2).sum(axis=1)))
+    log_jump = _log_independence(particles.x, coordinates, guide)
+    log_jump -= _log_independence(x, coordinates, guide)
+    log_jump[walks] = 0.0
 
-    x = coordinates.unconstrained(proposed)
     log_prior, log_likelihood = posterior.evaluate_factors(x, rng)
     with np.errstate(invalid="ignore"):  # zero likelihood at both points: NaN, not accepted
         log_ratio = log_prior - particles.log_prior + log_jump
         log_ratio += temperature * (log_likelihood - particles.log_likelihood)
-        accepted = np.log(rng.random(len(z))) < log_ratio
+        accepted = np.log(rng.random(n)) < log_ratio
     new = Particles(
         np.where(accepted[:, np.newaxis], x, particles.x),
         np.where(accepted, log_prior, particles.log_prior),
@@ -137,3 +153,9 @@ def metropolis_step(
         particles.ancestor,
     )
     return new, float(accepted[walks].mean()), float(accepted[~walks].mean())
+
+
+def _log_independence(x: Array, coordinates: CrossFittedWhitening, guide: StudentMixture) -> Array:
+    """Log-density of the independence proposal, up to a constant, at points of all particles."""
+    fitted = coordinates.log_normal_density(coordinates.whitened(x))
+    return np.logaddexp(fitted, guide.log_density(x))

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.estimators.populations import compare_with_draws
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate
 from pymc_statespace_filters.evidence.estimators.smc_moves import (
     Particles,
@@ -46,7 +47,9 @@ from pymc_statespace_filters.evidence.estimators.smc_moves import (
     resample_systematic,
     sample_prior_particles,
 )
+from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.student_mixture import StudentMixture
 from pymc_statespace_filters.system.checks import check_count, is_integer
 from pymc_statespace_filters.tempering import next_temperature
 
@@ -114,6 +117,7 @@ class TemperedSMC:
             If the prior is improper, or too few of its draws have a positive likelihood.
         """
         particles = sample_prior_particles(posterior, self.n_runs * self.n_particles, rng)
+        guide = choose_mixture(posterior, rng)
         log_evidences = np.zeros(self.n_runs)
         temperature, scale = 0.0, 1.0
         stages: list[_Stage] = []
@@ -126,8 +130,9 @@ class TemperedSMC:
             particles = particles.at(resample_systematic(log_weights, rng))
             temperature = raised
             if temperature == 1:
-                return _summary(log_evidences, particles.ancestor, stages)
-            particles, stage = move_particles(particles, temperature, scale, posterior, rng)
+                missed = compare_with_draws(particles, self.n_runs, posterior, rng)
+                return _summary(log_evidences, particles.ancestor, stages, missed)
+            particles, stage = move_particles(particles, temperature, guide, scale, posterior, rng)
             scale = stage.scale
             stages.append(stage)
 
@@ -135,6 +140,7 @@ class TemperedSMC:
 def move_particles(
     particles: Particles,
     temperature: float,
+    guide: StudentMixture,
     scale: float,
     posterior: Posterior,
     rng: np.random.Generator,
@@ -145,7 +151,7 @@ def move_particles(
     distance, rates = 0.0, []
     for _ in range(MAX_MOVES):
         particles, walks, jumps = metropolis_step(
-            particles, temperature, coordinates, scale, posterior, rng
+            particles, temperature, coordinates, guide, scale, posterior, rng
         )
         rates.append((walks + jumps) / 2)
         scale = float(np.clip(scale * math.exp(walks - ACCEPTANCE), *SCALES))
@@ -156,7 +162,12 @@ def move_particles(
     return particles, _Stage(len(rates), float(np.mean(rates)), scale)
 
 
-def _summary(log_evidences: Array, ancestor: NDArray[np.int64], stages: list[_Stage]) -> Estimate:
+def _summary(
+    log_evidences: Array,
+    ancestor: NDArray[np.int64],
+    stages: list[_Stage],
+    missed: tuple[str, ...] = (),
+) -> Estimate:
     """Average the evidences of the runs (runs,), with the standard error from their spread."""
     n_runs = len(log_evidences)
     peak = log_evidences.max()
@@ -178,7 +189,7 @@ def _summary(log_evidences: Array, ancestor: NDArray[np.int64], stages: list[_St
             "n_ancestors": n_ancestors,
             "spread_of_runs": spread,
         },
-        doubts=tuple(_check(acceptance, n_ancestors, spread)),
+        doubts=(*_check(acceptance, n_ancestors, spread), *missed),
     )
 
 
