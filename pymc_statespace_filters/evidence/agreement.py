@@ -66,21 +66,23 @@ def _diagnose(evidences: Mapping[str, Evidence]) -> str:
     from_prior = [e.estimator in FROM_PRIOR for e in (low, high)]
     if from_prior == [False, True]:
         cause = (
-            "the chains have probably not visited all of the posterior and miss a mode or a tail: "
+            "the chains have probably not visited all of the posterior and miss a mode or a tail; "
             "run more chains, longer, from dispersed starting points"
         )
     elif from_prior == [True, False]:
         cause = (
-            f"{low.estimator} has probably missed a narrow peak that the chains have found: it is "
-            "less reliable the narrower the posterior is relative to the prior"
+            f"{low.estimator} has probably missed a narrow peak or a tail that the chains have "
+            "found: it is less reliable the narrower the posterior is relative to the prior, or "
+            "one mode relative to another"
         )
     elif all(from_prior):
         cause = "the posterior is too narrow relative to the prior for prior_monte_carlo"
     else:
         cause = (
             "the draws are too few, or the posterior is far from the shape that the estimators "
-            "fit to it (several modes, heavy tails): run longer chains, and compare with "
-            "tempered_smc, which does not use the draws"
+            "fit to it (several modes, heavy tails): run longer chains, and add tempered_smc, "
+            "which says whether its particles and the draws lie in the same places; a narrow mode "
+            "that both have missed remains unknown"
         )
     return f"{gap}; {cause}"
 

@@ -196,7 +196,7 @@ def estimate_evidence(
         Names among "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution),
         "warp_bridge" (warp-III bridge sampling, for skewed posteriors), "importance" (importance
         sampling from a mixture of Student-t distributions, for several modes), "tempered_smc"
-        (tempered sequential Monte Carlo from the prior, without the draws), "prior_monte_carlo"
+        (tempered sequential Monte Carlo from the prior, guided by the draws), "prior_monte_carlo"
         (mean likelihood of prior draws, for few parameters) and "laplace" (Laplace's approximation,
         without a standard error); or any
         `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other settings or

@@ -20,7 +20,7 @@ from pymc_statespace_filters.evidence.log_mean import mcse_of_chains
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from pymc_statespace_filters.student_mixture import fit_mixture, place_components, standardised
 
-FALSE_ALARMS = 0.001  # probability of a difference in any region, if there is none
+FALSE_ALARMS = 0.002  # probability of a difference in any region, if there is none
 N_COMPONENTS = 8
 MOST_FITTED = 2000  # particles, and draws, to which the mixture is fitted
 LEVELS = (0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.98)  # probabilities of the levels of log-density

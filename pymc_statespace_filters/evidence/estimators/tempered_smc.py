@@ -25,7 +25,19 @@ noise, drawn from g, so that g cancels in its acceptance probability. At :math:`
 the prior and fresh noise; at :math:`\beta = 1` its integral is that of the prior times the expected
 likelihood: the evidence is exact, although the intermediate distributions depend on the noise.
 
-Posterior draws are not used, so that modes missed by the chains can be found.
+The particles start from the prior, so that modes missed by the chains can be found. The draws guide
+them: a part of the proposals comes from a mixture of Student-t distributions fitted to the draws. The
+moves leave the distribution at every temperature invariant whatever that mixture is, so that draws
+which miss a mode cost precision and not truth.
+
+The guide is needed for modes of unequal width. Of two normal modes in k dimensions, of equal mass
+and widths :math:`s_1 > s_2`, the narrower one holds about :math:`(s_2 / s_1)^{k(1 - \beta)}` of the
+other's mass at the inverse temperature :math:`\beta`, far less than one particle in a long part of
+the path. Random walks do not bring the particles back; proposals at the draws do, as soon as the
+narrow mode gains mass.
+
+A narrow mode that the chains have missed as well remains unknown. At the end the particles are
+compared with the draws (`populations`), and a region that only one of the two visits is a doubt.
 """
 
 import math
@@ -76,7 +88,11 @@ class _Stage(NamedTuple):
 
 @dataclass(frozen=True)
 class TemperedSMC:
-    """Tempered sequential Monte Carlo from the prior; posterior draws are not used.
+    """Tempered sequential Monte Carlo from the prior, guided by the posterior draws.
+
+    Wide modes that the chains have missed are found. A mode that is much narrower than another, in
+    many dimensions, is found only if the chains have visited it: if neither has, nothing shows it.
+    A doubt says so if the last particles miss a region that the draws visit, or the reverse.
 
     Parameters
     ----------
