@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from pymc_statespace_filters.ops.distributed import check_ranks, distributed_eva
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.panel import PanelLogLikelihood, single_records
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
+from pymc_statespace_filters.system.checks import check_count
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import CheckedPanel, checked_panel
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
@@ -36,6 +38,7 @@ def log_likelihood(
     t0: float = 0.0,
     seed: Any = 0,
     comm: Any = None,
+    cores: int = 1,
 ) -> np.ndarray:
     """Evaluate the log-likelihood of a record, or of the records of a panel, term by term.
 
@@ -64,6 +67,8 @@ def log_likelihood(
     comm : mpi4py.MPI.Intracomm or "world", optional
         Ranks among which the filter's members are divided, in blocks of 64. All of them make
         this call with the same arguments and get the same result, bit for bit that of one rank.
+    cores : int
+        Threads among which the records of a panel are divided; the result is the same, bit for bit.
 
     Returns
     -------
@@ -103,7 +108,9 @@ def log_likelihood(
     warn_of_choice(system, filter)
     if panel is not None:
         data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
-        return _of_panel(system, filter, params, panel, observed, data, seed, comm)
+        return _of_panel(system, filter, params, panel, observed, data, seed, comm, cores)
+    if check_count("cores", cores, 1) > 1:
+        raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
     record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
@@ -136,7 +143,9 @@ def _of_panel(
     data: dict[str, Any],
     seed: Any,
     comm: Any,
+    cores: Any,
 ) -> np.ndarray:
+    n_threads = check_count("cores", cores, 1)
     if comm is not None:
         raise ModelError("comm must be None for a panel: every rank evaluates all records")
     table = checked_panel(system, panel, observed, **data)
@@ -144,11 +153,23 @@ def _of_panel(
     seeds = check_seed("seed", seed)
     if seeds.ndim:
         raise ModelError(f"seed must be one number for a panel, got shape {seeds.shape}")
-    record = (table.rows, table.observed, table.inputs, table.t0)
-    terms, health = evaluator(PanelLogLikelihood(system, filter))(theta, *record, seeds)
-    if health[1] != NONE or health[0] < COLLAPSED:
+    evaluate = evaluator(PanelLogLikelihood(system, filter))
+    starts = table.records.starts
+
+    def part(first: int, last: int) -> tuple:
+        rows = slice(starts[first], starts[last])
+        data = table.rows[rows], table.observed[rows], table.inputs, table.t0
+        return evaluate(theta[first:last], *data, seeds)
+
+    # One after the other, the first alone: it may be compiled.
+    ends = np.linspace(0, len(starts) - 1, min(n_threads, len(starts) - 1) + 1).astype(int)
+    found = [part(*ends[:2])]
+    with ThreadPoolExecutor(n_threads) as pool:
+        found += pool.map(part, ends[1:-1], ends[2:])
+    health = [one for _, one in found]
+    if any(one[1] != NONE or one[0] < COLLAPSED for one in health):
         _warn_of_records(system, filter, theta, table, seeds)
-    return terms
+    return np.concatenate([terms for terms, _ in found])
 
 
 def _warn_of_records(

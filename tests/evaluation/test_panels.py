@@ -61,6 +61,20 @@ def test_a_simulated_panel_is_that_of_each_record(noise):
         np.testing.assert_array_equal(seen["obs_time"], single["obs_time"])
 
 
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(32)])
+def test_threads_divide_records_and_change_nothing(filter):
+    given = {"steps": STEPS, "panel": LABELS, "seed": 3}
+    one = psf.log_likelihood(PAIR, filter, POINT, DATA, **given)
+    for cores in (2, 3, 8):
+        np.testing.assert_array_equal(
+            psf.log_likelihood(PAIR, filter, POINT, DATA, cores=cores, **given), one
+        )
+    with pytest.raises(psf.ModelError, match="cores must be an integer of at least 1, got 0"):
+        psf.log_likelihood(PAIR, filter, POINT, DATA, cores=0, **given)
+    with pytest.raises(psf.ModelError, match="cores must be 1 without a panel"):
+        psf.log_likelihood(PAIR, filter, {"a": 0.5, "b": 0.3}, DATA[:1], steps=[0], cores=2)
+
+
 def test_records_in_another_order_have_the_same_paths_and_runs():
     order = [3, 4, 5, 0, 1, 2]  # A, C, B
     permuted = {"a": [0.2, 0.5, 0.7], "b": 0.3}

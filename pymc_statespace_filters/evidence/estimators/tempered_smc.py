@@ -26,9 +26,9 @@ the prior and fresh noise; at :math:`\beta = 1` its integral is that of the prio
 likelihood: the evidence is exact, although the intermediate distributions depend on the noise.
 
 The particles start from the prior, so that modes missed by the chains can be found. The draws guide
-them: a part of the proposals comes from a mixture of Student-t distributions fitted to the draws. The
-moves leave the distribution at every temperature invariant whatever that mixture is, so that draws
-which miss a mode cost precision and not truth.
+them: a part of the proposals comes from a mixture of Student-t distributions fitted to the draws.
+The moves leave the distribution at every temperature invariant whatever that mixture is, so that
+draws which miss a mode cost precision and not truth.
 
 The guide is needed for modes of unequal width. Of two normal modes in k dimensions, of equal mass
 and widths :math:`s_1 > s_2`, the narrower one holds about :math:`(s_2 / s_1)^{k(1 - \beta)}` of the
