@@ -86,7 +86,7 @@ def test_resampling_at_every_observation_holds_for_equal_weights_too():
 
 @pytest.mark.parametrize("n_particles", [1, 10.0, True])
 def test_count_must_be_an_integer_of_at_least_two(n_particles):
-    with pytest.raises(ModelError, match=r"n_particles must be an integer of at least 2, got"):
+    with pytest.raises(ModelError, match=r"n_particles must be an integer from 2 to 1e.08, got"):
         BootstrapPF(n_particles)
 
 
