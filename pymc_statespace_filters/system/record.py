@@ -30,8 +30,6 @@ GRID_TOLERANCE = 1e-6
 
 # Beyond this a record would take hours, or not fit into memory; each step is computed.
 MOST_STEPS = 10**9
-# Beyond this the square of an observation overflows.
-LARGEST_OBSERVATION = 1e150
 
 ROWS_AT = ("observations", "steps")
 
@@ -268,12 +266,6 @@ def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) 
         raise ModelError(
             f"observed must have shape {(n_observations, system.p)} (observations x observables), "
             f"got {np.shape(observed)}"
-        )
-    if (large := np.abs(array) > LARGEST_OBSERVATION).any():
-        row, column = map(int, np.argwhere(large)[0])
-        raise ModelError(
-            f"observed must be at most {LARGEST_OBSERVATION:g} in magnitude, got observed[{row}, "
-            f"{column}] = {array[row, column]:g}: take another unit"
         )
     return array
 
