@@ -2,9 +2,9 @@
 
 ``python -m benchmarks`` measures part after part and stores each as a file in ``out/benchmarks``.
 ``--only ekf enkf`` measures some parts again, ``--resume`` those that are missing, and ``--report``
-writes the documentation from the stored parts. ``--only normals noise cold demo`` needs no other
-package; these parts have a file of their own, and the tables of the others stay as they are.
-So have ``--only ode``, ``epidemic``, ``panel``, ``panel_nuts`` and ``panel_evidence``.
+writes the documentation from the stored parts. ``--only normals noise cold demo panel_sampling``
+needs no other package; these parts share a file of their own, and the tables of the others stay as
+they are. ``ode``, ``epidemic``, ``panel``, ``panel_nuts`` and ``panel_evidence`` have a file each.
 """
 
 import argparse

@@ -58,8 +58,8 @@ from .system.integrators import (
 from .system.model import StateSpaceModel
 from .system.noise_distributions import euler_multinomial, gamma_white_noise
 from .system.panel_frame import panel_from
-from .system.record import nearest_steps
 from .system.second_order import second_order
+from .system.steps import nearest_steps
 
 __all__ = [
     "DRAM",

@@ -78,8 +78,4 @@ def chain(n_draws):
     return make
 
 
-serve(
-    {"log_likelihood": lambda: log_likelihood, "nuts/400": chain(400), "nuts/20": chain(20)},
-    "dynestyx",
-    "jax",
-)
+serve({"log_likelihood": lambda: log_likelihood, "nuts/400": chain(400)}, "dynestyx", "jax")

@@ -161,11 +161,12 @@ def _of_panel(
         data = table.rows[rows], table.observed[rows], table.inputs, table.t0
         return evaluate(theta[first:last], *data, seeds)
 
-    # One after the other, the first alone: it may be compiled.
-    ends = np.linspace(0, len(starts) - 1, min(n_threads, len(starts) - 1) + 1).astype(int)
-    found = [part(*ends[:2])]
-    with ThreadPoolExecutor(n_threads) as pool:
-        found += pool.map(part, ends[1:-1], ends[2:])
+    n_parts = min(n_threads, len(starts) - 1)
+    ends = np.linspace(0, len(starts) - 1, n_parts + 1).astype(int)
+    if n_parts > 1:
+        part(0, 0)  # compiles, before there are threads
+    with ThreadPoolExecutor(n_parts) as pool:
+        found = list(pool.map(part, ends[:-1], ends[1:]))
     health = [one for _, one in found]
     if any(one[1] != NONE or one[0] < COLLAPSED for one in health):
         _warn_of_records(system, filter, theta, table, seeds)

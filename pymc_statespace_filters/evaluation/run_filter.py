@@ -17,7 +17,8 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import checked_panel, row_coords
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_at, check_seed, checked_record, rows_at
+from pymc_statespace_filters.system.record import check_seed, checked_record
+from pymc_statespace_filters.system.steps import check_at, rows_at
 
 
 def run_filter(

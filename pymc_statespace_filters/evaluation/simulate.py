@@ -26,7 +26,8 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import checked_panel, row_coords
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_inputs, check_system, steps_of
+from pymc_statespace_filters.system.record import check_inputs, check_system
+from pymc_statespace_filters.system.steps import steps_of
 
 
 @lru_cache(maxsize=256)

@@ -11,7 +11,7 @@ from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.groups import add_group, join_rows, row_coords, state_dims
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed
-from pymc_statespace_filters.system.record import check_at, rows_at
+from pymc_statespace_filters.system.steps import check_at, rows_at
 
 
 def filtered_states(

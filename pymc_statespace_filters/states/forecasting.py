@@ -15,7 +15,7 @@ from pymc_statespace_filters.states.groups import add_group, join_rows, row_coor
 from pymc_statespace_filters.states.record import Array, RecordAtDraws
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.record import steps_of
+from pymc_statespace_filters.system.steps import steps_of
 
 
 def forecast(

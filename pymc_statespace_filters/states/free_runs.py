@@ -26,7 +26,8 @@ from pymc_statespace_filters.states.prediction_errors import prediction_errors
 from pymc_statespace_filters.states.record import Array, RecordAtDraws, simulate_observations
 from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
 from pymc_statespace_filters.system.checks import check_flag, check_random_seed
-from pymc_statespace_filters.system.record import check_observed, steps_of
+from pymc_statespace_filters.system.record import check_observed
+from pymc_statespace_filters.system.steps import steps_of
 
 
 def free_run(

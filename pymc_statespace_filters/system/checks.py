@@ -1,4 +1,4 @@
-"""Checks of single numbers that users give: integers, positive numbers, seeds."""
+"""Checks of numbers that users give: integers, positive numbers, seeds, arrays."""
 
 from numbers import Integral, Real
 from typing import Any, TypeGuard
@@ -56,6 +56,25 @@ def check_random_seed(random_seed: Any) -> np.random.Generator:
             f"random_seed must be None, an integer that is not negative or a "
             f"numpy.random.Generator, got {random_seed!r}"
         ) from None
+
+
+def check_floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -> np.ndarray:
+    """Return ``value`` as an array of finite floats; with ``missing``, NaN may stand in it."""
+    if np.ma.isMaskedArray(value):
+        value = np.ma.filled(np.ma.asarray(value, dtype="float64"), np.nan)
+    try:
+        array = np.array(value, dtype="float64")
+    except (TypeError, ValueError):
+        raise ModelError(f"{name} must be numbers, got {shortened(value)}") from None
+    if ndim is not None and array.ndim != ndim:
+        raise ModelError(f"{name} must have {ndim} dimension(s), got shape {array.shape}")
+    bad = np.isinf(array) if missing else ~np.isfinite(array)
+    if bad.any():
+        at = tuple(int(i) for i in np.argwhere(bad)[0])
+        allowed = "numbers, or NaN where missing" if missing else "finite numbers"
+        place = f"{name}[{', '.join(map(str, at))}]" if at else name
+        raise ModelError(f"{name} must hold {allowed}, got {place} = {array[at]}")
+    return array
 
 
 def shortened(value: Any) -> str:

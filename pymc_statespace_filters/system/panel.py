@@ -22,7 +22,8 @@ from pymc_statespace_filters.system.checks import check_finite
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel_inputs import panel_inputs, symbolic_panel_inputs
 from pymc_statespace_filters.system.panel_records import Records, records_of
-from pymc_statespace_filters.system.record import check_observed, check_steps, steps_of
+from pymc_statespace_filters.system.record import check_observed
+from pymc_statespace_filters.system.steps import check_steps, steps_of
 
 # Columns of the rows of a panel.
 RECORD, STEP, FIRST_INPUT = range(3)

@@ -9,7 +9,7 @@ import pandas as pd
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.checks import shortened
 from pymc_statespace_filters.system.panel_records import records_of
-from pymc_statespace_filters.system.record import nearest_steps
+from pymc_statespace_filters.system.steps import nearest_steps
 
 
 def panel_from(

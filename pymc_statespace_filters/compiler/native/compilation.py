@@ -8,4 +8,4 @@ without numba, for good.
 from threading import RLock
 
 COMPILATION = RLock()
-"""Held by all parts of the package that compile and may run in a user's thread."""
+"""Held by sampling and evidence, except while chains run, and where `log_likelihood` compiles."""

@@ -58,9 +58,9 @@ def suggest_particles(
         their noise, which adds to the variance of the log-likelihood in a chain.
     target : (float, float), default (1.0, 3.3)
         Range for the variance of the estimated log-likelihood. Per unit of time chains gain most
-        between 1 and 3.3 [1]_, [2]_. If all parameters of a panel are those of single records or of
-        the population, each record is accepted by its own likelihood; then it is the variance of
-        the record that has the largest. Shared parameters need the variance of the sum.
+        between 1 and 3.3 [1]_, [2]_. In a panel whose records share no parameter, `sample_dram`
+        accepts each record by its own likelihood, and the range is that of the record with the
+        largest variance. With shared parameters it is that of the sum.
     random_seed : None, int or numpy.random.Generator
         It determines the table except the column ``seconds``, unless ``max_seconds`` is reached.
     max_seconds : float, default 180
