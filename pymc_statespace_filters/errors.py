@@ -27,7 +27,7 @@ class ModelError(StateSpaceFiltersError, ValueError):
     >>> import pymc_statespace_filters as psf
     >>> psf.EnKF(1)
     Traceback (most recent call last):
-    pymc_statespace_filters.errors.ModelError: n_members must be an integer of at least 2, got 1...
+    pymc_statespace_filters.errors.ModelError: n_members must be an integer from 2 to 1e+08, got 1.
     """
 
 

@@ -66,7 +66,7 @@ def _diagnose(evidences: Mapping[str, Evidence]) -> str:
     from_prior = [e.estimator in FROM_PRIOR for e in (low, high)]
     if from_prior == [False, True]:
         cause = (
-            "the chains have probably not visited all of the posterior and miss a mode or a tail; "
+            "the chains have probably not visited all of the posterior and miss a mode or a tail: "
             "run more chains, longer, from dispersed starting points"
         )
     elif from_prior == [True, False]:

@@ -9,6 +9,7 @@ from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
 from pymc_statespace_filters.evidence.log_mean import pareto_k
 from tests.evidence.analytic import gaussian, half_normal
+from tests.evidence.hard_targets import Funnel
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
@@ -116,6 +117,16 @@ def test_weights_of_heavy_tail_are_doubted():
     few, tail = found.doubts
     assert "independent draws, fewer than 100" in few
     assert "heavy tail (Pareto k" in tail
+
+
+def test_what_no_proposal_has_sampled_is_a_part_of_the_error():
+    """The neck of a funnel: no weight shows that it is missing, but the draws lie there."""
+    target, rng = Funnel(8), np.random.default_rng(57)
+    found = Importance().estimate(target.posterior((4, 2500), rng), rng=rng)
+    unsampled = found.settings["unsampled"]
+    assert found.se > unsampled > 0.02
+    assert any("has not been sampled" in doubt for doubt in found.doubts)
+    assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
 
 
 def test_same_seed_same_number():

@@ -107,6 +107,7 @@ def test_a_mode_that_the_chains_have_missed():
     found = smc(missed)
     assert found.se < 0.05
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
+    assert any("the chains have missed a region" in doubt for doubt in found.doubts)
     misled = Bridge().estimate(missed, rng=np.random.default_rng(84))
     assert misled.log_evidence < target.log_evidence - 0.3
 
