@@ -139,7 +139,7 @@ def write_panel_nuts(kept: dict) -> None:
         "effective draws",
         "tuning and draws",
         "a second",
-        "first call",
+        "whole call",
         "log-likelihood",
         "",
     ]
