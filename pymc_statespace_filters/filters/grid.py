@@ -7,7 +7,8 @@ Prediction and update are integrals, thesis Eqs. 3.13-3.16 written as the recurs
 
 and both are trapezoidal sums, whose error for smooth integrands is below any power of the spacing.
 Spacing and length of the grid are checked during an evaluation: if the grid is too coarse or too
-short, the evaluation starts again with a finer or a longer one.
+short, the evaluation starts again with a finer or a longer one. Where no uniform grid will do, it
+starts again on segments, see `point_mass.segments`.
 """
 
 from dataclasses import KW_ONLY, dataclass
@@ -30,7 +31,7 @@ from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
     OUT_OF_MEMORY,
-    ZERO_WEIGHTS,
+    TOO_FAR,
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
@@ -40,6 +41,12 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
 )
 from pymc_statespace_filters.filters.point_mass.predictions import predictions_function
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
+from pymc_statespace_filters.filters.point_mass.segment_pass import (
+    discard_segments,
+    first_accuracy,
+    needs_segments,
+    pass_on_segments,
+)
 from pymc_statespace_filters.filters.point_mass.states import run_function, states_function
 from pymc_statespace_filters.filters.protocol import (
     LogLikelihoodFunction,
@@ -89,14 +96,18 @@ class GridFilter:
 
     Notes
     -----
-    The process noise must be additive given the state, ``g(x, q) = g(x, 0) + G(x) q``, and nowhere
-    zero. A transition with kinks (`freeplay`, an absolute value) is integrated with an error of
-    second order in the spacing, which the error estimate does not include: `is_exact_for` is then
-    False. Beside the kink of a sensor the error is of second order, too, and is estimated: 1e-8
-    would need some 10^5 points there. Parameters that would need more than 8192 points get the
-    log-likelihood minus infinity, with that reason. Masses below the rounding error of the largest
-    are dropped, until an observation falls so far out that they matter. A grid point that diverges
-    is left out, as a particle that is not finite would be.
+    The process noise must be additive given the state, ``g(x, q) = g(x, 0) + G(x) q``. A transition
+    with kinks (`freeplay`, an absolute value) is integrated with an error of second order in the
+    spacing, which the error estimate does not include: `is_exact_for` is then False. Beside the
+    kink of a sensor the error is of second order, too, and is estimated: 1e-8 would need some 10^5
+    points there. Masses below the rounding error of the largest are dropped, until an observation
+    falls so far out that they matter. A point from which a step is not finite (it diverges, or the
+    logarithm of the state ends there) is left out, as such a particle would be.
+
+    A density with an edge, one that is narrow here and very broad there, or noise that vanishes at
+    a point needs segments in place of the grid, and some ten times as long. Parameters that would
+    need more than 8192 points, and observations where the density of the state is below 1e-265, get
+    the log-likelihood minus infinity, with that reason.
 
     Time grows in proportion to the record: 1 to 3 microseconds for a step without an observation
     where some hundred points suffice, 3 to 50 for an observation, the more the finer the sensor is.
@@ -216,7 +227,7 @@ def _point_mass(
     code, j = _evaluate(system, carray(steps, (n_observations,)), record, t0, tolerance, out)
     for failed in range(j, n_observations):
         out[failed] = -np.inf
-    failure = code if code >= NONE else ZERO_WEIGHTS
+    failure = code if code >= NONE else TOO_FAR
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
@@ -232,7 +243,13 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
         )
         again, spacing, reach = next_grid(code, spacing, reach)
         if not again:
-            return code, j
+            break
+    if needs_segments(code):
+        reach, floor = first_accuracy(tolerance)
+        code, j, _, _ = pass_on_segments(
+            system, steps, observed, t0, reach, floor, tolerance, terms, discard_segments, None
+        )
+    return code, j
 
 
 POINT_MASS = EntryPoint(_point_mass, POINT_MASS_ARGUMENTS, "point_mass", digest("point_mass"))

@@ -14,6 +14,7 @@ ZERO_WEIGHTS = 3
 NO_PROCESS_NOISE = 4
 GRID_TOO_LARGE = 5
 OUT_OF_MEMORY = 6
+TOO_FAR = 7
 
 FAILURES: dict[int, str] = {
     NONE: "no failure",
@@ -21,9 +22,11 @@ FAILURES: dict[int, str] = {
     COVARIANCE_NOT_POSITIVE: "a covariance of the system or the forecast is not positive definite",
     ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
     NO_PROCESS_NOISE: "the process noise vanished where the state may be",
-    GRID_TOO_LARGE: "the grid would need more than 8192 points, for the noise or the sensor is so "
-    "fine beside the spread of the state, or the equations are so far from smooth; a larger "
-    "tolerance, such as GridFilter(tolerance=1e-3), needs fewer",
+    GRID_TOO_LARGE: "the density would need more than 8192 points, for the noise or the sensor is "
+    "so fine beside the spread of the state; a larger tolerance, such as "
+    "GridFilter(tolerance=1e-3), needs fewer",
+    TOO_FAR: "the observation lies where the density of the state is below 1e-265, which this "
+    "filter does not resolve",
     OUT_OF_MEMORY: "there was not enough memory for the members",
 }
 

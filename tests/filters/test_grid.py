@@ -16,7 +16,7 @@ from pymc_statespace_filters.filters.outcomes import (
     GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
     NO_PROCESS_NOISE,
-    ZERO_WEIGHTS,
+    TOO_FAR,
 )
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds
 from pymc_statespace_filters.testing import kalman_log_likelihood
@@ -243,7 +243,7 @@ def test_failures_are_minus_infinity_and_a_reason():
     assert reason(alpha=np.inf)[1] == NO_FINITE_MEMBER
     assert reason(initial_var=1e8)[1] == GRID_TOO_LARGE
     terms, code = reason(observed=[1.0, 50.0, 1.0], steps=[5, 10, 15])
-    assert code == ZERO_WEIGHTS
+    assert code == TOO_FAR
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()
 

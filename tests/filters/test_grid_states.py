@@ -10,7 +10,7 @@ from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.outcomes import NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
@@ -334,7 +334,7 @@ def test_states_from_a_failure_on_are_nan():
             assert np.isfinite(part[:known]).all() or part is found.n_effective
             assert not np.isnan(part[:known]).any()
             assert np.isnan(part[known:]).all()
-        np.testing.assert_array_equal(found.health, [np.inf, ZERO_WEIGHTS, 1.0])
+        np.testing.assert_array_equal(found.health, [np.inf, TOO_FAR, 1.0])
 
 
 def test_no_rows():

@@ -1,1 +1,1 @@
-"""The density of one state on a grid."""
+"""The density of one state: on a uniform grid, or on segments where none holds it."""

@@ -22,9 +22,9 @@ from pymc_statespace_filters.filters.point_mass.recursion import (
 )
 from pymc_statespace_filters.filters.system_table import step_moments
 
-_LENGTHENING = 1.6
+LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
-_SHORTEST_REACH, _LONGEST_REACH = 8.5, 35.0
+SHORTEST_REACH, LONGEST_REACH = 8.5, 35.0
 _PER_STEP = 1e-5  # planned error of one step, relative to the tolerance
 
 
@@ -42,7 +42,7 @@ def first_grid(system, steps, t0, tolerance):
     """
     spacing = np.inf
     if steps.size == 0 or steps[-1] == 0:
-        return spacing, _SHORTEST_REACH
+        return spacing, SHORTEST_REACH
     mean, sd = initial_moments(system)
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
@@ -54,7 +54,7 @@ def first_grid(system, steps, t0, tolerance):
         if width > 0.0:
             spacing = min(spacing, width)
     spacing = spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-    return spacing, _SHORTEST_REACH
+    return spacing, SHORTEST_REACH
 
 
 @njit_internal
@@ -62,8 +62,8 @@ def next_grid(code, spacing, reach):
     """After an attempt that ended with this code: (whether to repeat it, spacing, reach)."""
     if code == TOO_COARSE:
         return True, spacing * REFINEMENT, reach
-    if code == TOO_SHORT and reach * _LENGTHENING < _LONGEST_REACH:
-        return True, spacing, reach * _LENGTHENING
+    if code == TOO_SHORT and reach * LENGTHENING < LONGEST_REACH:
+        return True, spacing, reach * LENGTHENING
     return False, spacing, reach
 
 

@@ -31,6 +31,12 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
 from pymc_statespace_filters.filters.point_mass.grid import grid_points
 from pymc_statespace_filters.filters.point_mass.moments import total_mass
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
+from pymc_statespace_filters.filters.point_mass.segment_pass import (
+    first_accuracy,
+    needs_segments,
+    pass_on_segments,
+)
+from pymc_statespace_filters.filters.point_mass.segments import POINTS, points_of
 from pymc_statespace_filters.filters.protocol import PredictionsFunction, System
 from pymc_statespace_filters.filters.system_table import (
     SYSTEM_ARGUMENTS,
@@ -79,6 +85,12 @@ def _grid_predictions(
         tape = system, at, record, t0, laws
         code, j = attempt(system, at, record, t0, spacing, reach, tolerance, terms, _predict, tape)
         again, spacing, reach = next_grid(code, spacing, reach)
+    if needs_segments(code):
+        tape = system, at, record, t0, laws
+        reach, floor = first_accuracy(tolerance)
+        code, j, _, _ = pass_on_segments(
+            system, at, record, t0, reach, floor, tolerance, terms, _predict_on_segments, tape
+        )
     if code != NONE:
         _forget(laws, j)
 
@@ -96,13 +108,36 @@ def _forget(laws, first):
 @njit_internal
 def _predict(tape, k, grid, updated):
     """Write the law of the observation at step k, if there is one, from the grid before it."""
+    low, spacing, mass = grid
+    if not updated:
+        _write_law(tape, k, grid_points(low, mass.size, spacing), mass, mass.size)
+
+
+@njit_internal
+def _predict_on_segments(tape, k, segments):
+    """The same from segments; a pass may be repeated from step 0 on."""
+    laws = tape[4]
+    if k == 0:
+        laws.next[0] = 0
+    n = segments.low.size
+    X = np.empty((1, n * POINTS))
+    for p in range(n):
+        points_of(segments.low[p], segments.high[p], X[0, p * POINTS : (p + 1) * POINTS])
+    _write_law(tape, k, X, segments.predicted.reshape(n * POINTS), POINTS)
+
+
+@njit_internal
+def _write_law(tape, k, X, mass, n_together):
+    """Write the law of the next observation, if it is at step k, from masses at the points X.
+
+    So many points in turn lie beside each other, and the next ones may be elsewhere.
+    """
     system, steps, observed, t0, laws = tape
     j = laws.next[0]
-    if updated or j == steps.size or steps[j] != k:
+    if j == steps.size or steps[j] != k:
         return
     laws.next[0] = j + 1
-    low, spacing, mass = grid
-    h, roots = _observations(system, k, t0 + k * system.dt, low, spacing, mass.size)
+    h, roots = _observations(system, k, t0 + k * system.dt, X)
     weight = 1.0 / total_mass(mass)
     _write_moments(mass, weight, h, roots, laws.mean[j], laws.cov[j])
     for b in range(system.p):
@@ -111,17 +146,19 @@ def _predict(tape, k, grid, updated):
             variance = 0.0
             for a in range(system.p):
                 variance += roots[a, b, i] * roots[a, b, i]
-            variance += _variance_of_cell(h[b], i, variance)
+            first = i - i % n_together
+            variance += _variance_of_cell(h[b, first : first + n_together], i - first, variance)
             z = (observed[j, b] - h[b, i]) / math.sqrt(2.0 * variance)
-            below += 0.5 * weight * mass[i] * math.erfc(-z)
-            above += 0.5 * weight * mass[i] * math.erfc(z)
+            if mass[i] > 0.0:
+                below += 0.5 * weight * mass[i] * math.erfc(-z)
+                above += 0.5 * weight * mass[i] * math.erfc(z)
         laws.log_below[j, b], laws.log_above[j, b] = math.log(below), math.log(above)
 
 
 @njit_internal
-def _observations(system, k, t, low, spacing, n):
+def _observations(system, k, t, X):
     """h (p, n) at every point, and what each standard normal adds to it (p, p, n)."""
-    p, X = system.p, grid_points(low, n, spacing)
+    p, n = system.p, X.shape[1]
     h, roots, Z = np.empty((p, n)), np.empty((p, p, n)), np.zeros((p, n))
     observe(system, k, t, Z.ctypes.data, n, X, h)
     for a in range(p):

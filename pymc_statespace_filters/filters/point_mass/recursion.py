@@ -102,6 +102,12 @@ def initial_moments(system):
 
 
 @njit_internal
+def is_known(mean, sd):
+    """Whether a state of these moments is known exactly."""
+    return sd <= _KNOWN * abs(mean)
+
+
+@njit_internal
 def truncation_of(reach):
     """Masses below this fraction of the largest are dropped."""
     return math.exp(-0.5 * reach * reach)
@@ -114,7 +120,7 @@ def initialise(system, spacing, reach):
     source = np.full(1, mean), np.full(1, sd), one
     if not (np.isfinite(mean) and np.isfinite(sd)):
         return NO_FINITE_MEMBER, (np.int64(0), 1.0, one), source
-    if sd <= _KNOWN * abs(mean):
+    if is_known(mean, sd):
         return NONE, (np.int64(1), mean, one), source
     spacing = min(spacing, 0.6 * sd)
     low, n = extent_of(*source, spacing, reach)

@@ -15,7 +15,6 @@ without the ratio.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import carray, types
@@ -40,7 +39,7 @@ from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
     OUT_OF_MEMORY,
-    ZERO_WEIGHTS,
+    TOO_FAR,
     is_missing,
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
@@ -57,6 +56,15 @@ from pymc_statespace_filters.filters.point_mass.recursion import (
     transition_at,
     with_sources,
 )
+from pymc_statespace_filters.filters.point_mass.rows import (
+    FILTERED,
+    MOMENTS,
+    PREDICTED,
+    SMOOTHED,
+    Rows,
+)
+from pymc_statespace_filters.filters.point_mass.segment_pass import needs_segments
+from pymc_statespace_filters.filters.point_mass.segment_states import states_on_segments
 from pymc_statespace_filters.filters.point_mass.tiles import LANES, block_of, multiply
 from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
 from pymc_statespace_filters.filters.system_table import (
@@ -65,10 +73,6 @@ from pymc_statespace_filters.filters.system_table import (
     read_system,
     system_table,
 )
-
-PREDICTED, FILTERED, SMOOTHED = range(3)
-MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
-"""Given the observations before the step, up to and at the step, or all."""
 
 STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
     "tolerance": types.float64, "moment": types.intp,
@@ -80,16 +84,6 @@ STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
 StatesArguments = arguments_class("StatesArguments", STATES_ARGUMENTS, __name__)
 
 
-class _Rows(NamedTuple):
-    """Results: mean, standard deviation and a draw of the state at the steps ``at``."""
-
-    at: np.ndarray
-    draw_seed: int
-    mean: np.ndarray
-    sd: np.ndarray
-    drawn: np.ndarray
-
-
 def _grid_states(
     table, dt, theta, n_theta, inputs, n_rows, tolerance, moment, steps, n_observations, observed,
     t0, rows, R, draw_seed, mean, sd, drawn, terms, health,
@@ -97,7 +91,7 @@ def _grid_states(
     """The states as one function for all systems; see `_evaluate` for what it writes."""
     system = read_system(table, dt, theta, n_theta, inputs, n_rows)
     at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
-    wanted = _Rows(
+    wanted = Rows(
         carray(rows, (R,)), draw_seed, carray(mean, (R,)), carray(sd, (R,)), carray(drawn, (R,))
     )
     out = carray(terms, (n_observations,))
@@ -108,7 +102,7 @@ def _grid_states(
         if code != NONE and (moment == SMOOTHED or j == 0 or wanted.at[i] >= at[j]):
             wanted.mean[i], wanted.sd[i], wanted.drawn[i] = np.nan, np.nan, np.nan
     state = carray(health, (3,))
-    failure = code if code >= NONE else ZERO_WEIGHTS
+    failure = code if code >= NONE else TOO_FAR
     state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
 
 
@@ -135,6 +129,10 @@ def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
         again, spacing, reach = next_grid(code, spacing, reach)
         if not again:
             break
+    if needs_segments(code):
+        return states_on_segments(
+            system, steps, observed, t0, tolerance, moment, rows, stored, terms
+        )
     if moment != SMOOTHED:
         _write_rows(rows, grids)
     return code, j

@@ -1,0 +1,267 @@
+"""GridFilter where no uniform grid holds the density, against sums over dense matrices."""
+
+from functools import cache
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from numba import njit
+from numpy.polynomial import Polynomial
+from scipy.stats import kstest, norm, poisson
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.filters.outcomes import FAILURES, NONE, TOO_FAR
+from pymc_statespace_filters.filters.point_mass.segments import POINTS, draw, points_of, weight
+from tests.references.fixed_nodes import FixedNodes
+
+MOMENTS = ("predicted", "filtered", "smoothed")
+LOG_GROWTH = 3.8
+
+
+def ricker_counts(n=30, seed=5):
+    """Counts of a map whose log abundance falls to -40 and comes back."""
+    rng = np.random.default_rng(seed)
+    x, counts = np.log(7.0), []
+    for _ in range(n):
+        counts.append(rng.poisson(10.0 * np.exp(x)))
+        x = LOG_GROWTH + x - np.exp(x) + 0.3 * rng.standard_normal()
+    return np.array(counts, float)
+
+
+def gaussian(d, sd=0.2):
+    return lambda x: norm.pdf(d, x, sd)
+
+
+def counted(d, rate):
+    return lambda x: poisson.pmf(d, np.maximum(rate(x), 0.0)) * (rate(x) >= 0.0)
+
+
+LOG = psf.StateSpaceModel(
+    lambda x, q: [x[0] + 0.1 * pt.log(x[0]) + q[0]],
+    lambda x: [x[0]],
+    process_noise=[[0.01]],
+    observation_noise=[[0.04]],
+    initial_mean=[0.5],
+    initial_cov=[[0.09]],
+)
+ROOT = psf.StateSpaceModel(
+    lambda x, q: [0.9 * x[0] + 0.2 * pt.sqrt(x[0]) + q[0]],
+    lambda x: [x[0]],
+    process_noise=[[0.01]],
+    observation_noise=[[0.04]],
+    initial_mean=[0.3],
+    initial_cov=[[0.04]],
+)
+ROOT_NOISE = psf.StateSpaceModel(
+    lambda x, q: [x[0] + 0.1 * (1.0 - x[0]) + 0.2 * pt.sqrt(x[0]) * q[0]],
+    lambda x: [x[0]],
+    process_noise=[[1.0]],
+    observation_noise=[[0.04]],
+    initial_mean=[1.0],
+    initial_cov=[[0.01]],
+)
+COUNTED = psf.StateSpaceModel(
+    lambda x, q: [0.9 * x[0] + q[0]],
+    observation_dist=lambda x: [pm.Poisson.dist(mu=4.0 * x[0])],
+    process_noise=[[0.04]],
+    initial_mean=[0.4],
+    initial_cov=[[0.09]],
+)
+RICKER = psf.StateSpaceModel(
+    lambda x, q: [LOG_GROWTH + x[0] - pt.exp(x[0]) + q[0]],
+    observation_dist=lambda x: [pm.Poisson.dist(mu=10.0 * pt.exp(x[0]))],
+    process_noise=[[0.09]],
+    initial_mean=[np.log(7.0)],
+    initial_cov=[[0.0]],
+)
+
+STEPS, DATA = np.array([0, 1, 2, 3, 5, 8]), np.array([0.45, 0.5, np.nan, 0.2, 0.4, 0.5])
+COUNTS = np.array([1.0, 0.0, np.nan, 2.0, 0.0, 3.0])
+# Towards zero ever narrower: there the logarithm and the root bend without limit.
+NEAR_ZERO = np.append(0.0, 0.5 ** np.arange(40, 5, -1.0))
+
+
+def edges(lowest, highest, width):
+    below = np.arange(lowest, 0.0, width) if lowest < 0.0 else []
+    return np.concatenate([below, NEAR_ZERO, np.arange(width, highest, width)])
+
+
+def by_step(likelihood, data=DATA):
+    """What is observed at each step, or None."""
+    out = [None] * (STEPS[-1] + 1)
+    for k, d in zip(STEPS, data, strict=True):
+        out[k] = None if np.isnan(d) else likelihood(d)
+    return out
+
+
+@cache
+def case(name):
+    """(system, steps, observed, reference)."""
+    if name == "ricker":
+        counts = ricker_counts()
+        fine, coarse = np.arange(-2.0, 6.0, 0.06), np.arange(-60.0, -2.0, 0.3)
+        reference = FixedNodes(
+            [*coarse, *fine],
+            lambda x: LOG_GROWTH + x - np.exp(x),
+            lambda x: 0.3,
+            np.log(7.0),
+            [counted(d, lambda x: 10.0 * np.exp(x)) for d in counts],
+        )
+        return RICKER, np.arange(counts.size), counts, reference
+    if name == "log":
+        mean, sd = lambda x: x + 0.1 * np.log(x), lambda x: 0.1
+        start, rows = lambda x: norm.pdf(x, 0.5, 0.3), by_step(gaussian)
+        return LOG, STEPS, DATA, FixedNodes(edges(-3.0, 4.0, 0.04), mean, sd, start, rows)
+    if name == "root":
+        mean, sd = lambda x: 0.9 * x + 0.2 * np.sqrt(x), lambda x: 0.1
+        start, rows = lambda x: norm.pdf(x, 0.3, 0.2), by_step(gaussian)
+        return ROOT, STEPS, DATA, FixedNodes(edges(-2.0, 3.0, 0.04), mean, sd, start, rows)
+    if name == "root noise":
+        mean, sd = lambda x: x + 0.1 * (1.0 - x), lambda x: 0.2 * np.sqrt(x)
+        start, rows = lambda x: norm.pdf(x, 1.0, 0.1), by_step(gaussian)
+        return ROOT_NOISE, STEPS, DATA, FixedNodes(edges(-0.5, 3.5, 0.02), mean, sd, start, rows)
+    mean, sd = lambda x: 0.9 * x, lambda x: 0.2
+    start = lambda x: norm.pdf(x, 0.4, 0.3)  # noqa: E731
+    rows = by_step(lambda d: counted(d, lambda x: 4.0 * x), COUNTS)
+    return COUNTED, STEPS, COUNTS, FixedNodes(edges(-4.0, 5.0, 0.04), mean, sd, start, rows)
+
+
+CASES = ("ricker", "log", "root", "root noise", "counted")
+# Beside the root, dense matrices with noise that vanishes are themselves good to 1e-7.
+ATOL = {"root noise": 1e-6}
+
+
+@pytest.mark.parametrize("tolerance", [1e-8, 1e-3])
+@pytest.mark.parametrize("name", CASES)
+def test_terms_are_those_of_dense_matrices(name, tolerance):
+    system, steps, observed, reference = case(name)
+    terms = psf.log_likelihood(
+        system, psf.GridFilter(tolerance=tolerance), {}, observed, steps=steps
+    )
+    atol = max(ATOL.get(name, 1e-8), tolerance)
+    np.testing.assert_allclose(terms, np.array(reference.terms)[steps], rtol=0.0, atol=atol)
+
+
+def compiled(name, method, *arguments):
+    """A compiled function of the filter, as a function of further arguments."""
+    system, steps, observed, _ = case(name)
+    function = getattr(psf.GridFilter(), method)(compile_system(system), *arguments).function
+    record = np.empty(0), steps.astype(np.int64), observed[:, None], np.empty((steps[-1] + 1, 0))
+    return lambda *rest: function(*record, 0.0, 0, *rest)
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("name", CASES)
+def test_states_are_those_of_dense_matrices(name, moment):
+    _, steps, _, reference = case(name)
+    rows = np.arange(1, steps[-1] + 1)  # step 0 of one case is known, which nodes cannot hold
+    mean, sd, _, n_effective, health = compiled(name, "compile_states", moment)(rows, 0)
+    law, atol = reference.law(moment), ATOL.get(name, 1e-7)
+    np.testing.assert_array_equal(health, [np.inf, NONE, -1.0])
+    assert (n_effective == np.inf).all()
+    np.testing.assert_allclose(mean[:, 0], law.mean[rows], rtol=0.0, atol=atol)
+    np.testing.assert_allclose(sd[:, 0], law.sd[rows], rtol=0.0, atol=atol)
+
+
+def test_a_known_start_is_drawn_as_it_is():
+    for moment in MOMENTS:
+        mean, sd, drawn, _, _ = compiled("ricker", "compile_states", moment)(np.arange(2), 3)
+        assert mean[0, 0] == drawn[0, 0] == np.log(7.0)
+        assert sd[0, 0] == 0.0
+
+
+@njit
+def points_and_weights(low, high):
+    x, weights = np.empty(POINTS), np.empty(POINTS)
+    points_of(low, high, x)
+    for i in range(POINTS):
+        weights[i] = weight(low, high, i)
+    return x, weights
+
+
+@njit
+def inverse(low, high, mass, u):
+    return draw(low, high, mass, u)
+
+
+def test_draws_invert_the_distribution_function():
+    """Exactly: the density is a polynomial of degree 9 on each of two segments."""
+    low, high = np.array([-1.0, 0.5]), np.array([0.5, 1.0])
+    density = Polynomial([1.0, 0.3, 0.0, -0.5, 0.0, 0.2, 0.0, 0.0, 0.0, 0.4])
+    both = [points_and_weights(*ends) for ends in zip(low, high, strict=True)]
+    mass = np.array([density(x) * weights for x, weights in both])
+    cdf = density.integ(lbnd=-1.0)
+    for u in (1e-12, 1e-3, 0.4, 0.7, 0.9, 1.0 - 1e-9):
+        assert cdf(inverse(low, high, mass, u)) / cdf(1.0) == pytest.approx(u, abs=1e-13)
+
+
+N_DRAWS = 120
+
+
+def test_smoothed_draws_are_trajectories():
+    """Two Kolmogorov-Smirnov tests and a covariance; a right one fails one time in 10^4."""
+    reference, rows = case("log")[3], np.array([4, 5])
+    run = compiled("log", "compile_states", "smoothed")
+    drawn = np.array([run(rows, seed)[2][:, 0] for seed in range(N_DRAWS)])
+    for i, k in enumerate(rows):
+        cdf = np.cumsum(reference.law("smoothed").density[k] * reference.weights)
+        law = lambda x, cdf=cdf: np.interp(x, reference.x, cdf)  # noqa: E731
+        assert kstest(drawn[:, i], law).pvalue > 1e-5
+    product = drawn[:, 0] * drawn[:, 1]
+    error = product.std() / np.sqrt(N_DRAWS)
+    assert abs(product.mean() - reference.mean_product(4)) < 4.5 * error
+
+
+def test_laws_of_observations():
+    _, steps, observed, reference = case("log")
+    mean, cov, below, above = compiled("log", "compile_predictions")()
+    x, weights = reference.x, reference.weights
+    for j, k in enumerate(steps):
+        mass = reference.law("predicted").density[k] * weights
+        first = mass @ x
+        np.testing.assert_allclose(mean[j, 0], first, atol=1e-7)
+        np.testing.assert_allclose(cov[j, 0, 0], mass @ (x - first) ** 2 + 0.04, atol=1e-7)
+        if not np.isnan(observed[j]):
+            z = (observed[j] - x) / 0.2
+            np.testing.assert_allclose(below[j, 0], np.log(mass @ norm.cdf(z)), atol=1e-7)
+            np.testing.assert_allclose(above[j, 0], np.log(mass @ norm.sf(z)), atol=1e-7)
+
+
+def test_one_run_has_terms_and_filtered_states():
+    system, steps, observed, reference = case("ricker")
+    run = psf.run_filter(system, psf.GridFilter(), {}, observed, steps=steps)
+    np.testing.assert_allclose(run["log_likelihood"], np.array(reference.terms), atol=1e-8)
+    law = reference.law("filtered")
+    np.testing.assert_allclose(run["mean"].values[1:, 0], law.mean[1:], atol=1e-7)
+
+
+@pytest.mark.parametrize("far", [30.0, 1e6])
+def test_an_observation_beyond_what_doubles_hold_is_named(far):
+    with pytest.warns(psf.FilterWarning, match=FAILURES[TOO_FAR]):
+        terms = psf.log_likelihood(LOG, psf.GridFilter(), {}, [0.4, far, 0.3], steps=np.arange(3))
+    assert np.isfinite(terms[0])
+    assert (terms[1:] == -np.inf).all()
+
+
+def test_a_sensor_may_have_kinks_and_jumps():
+    """A detector that sees nothing below zero, and a limit of its range."""
+    system = psf.StateSpaceModel(
+        lambda x, q: [0.8 * x[0] + q[0]],
+        observation_dist=lambda x: [pm.Poisson.dist(mu=pt.clip(3.0 * x[0], 0.1, 5.0))],
+        process_noise=[[0.25]],
+        initial_mean=[0.5],
+        initial_cov=[[1.0]],
+    )
+    counts = np.array([2.0, 0.0, 7.0, 1.0])
+    breaks = [*np.linspace(-8.0, 0.1 / 3.0, 160), *np.linspace(0.1 / 3.0, 5.0 / 3.0, 40)[1:]]
+    reference = FixedNodes(
+        [*breaks, *np.linspace(5.0 / 3.0, 9.0, 150)[1:]],
+        lambda x: 0.8 * x,
+        lambda x: 0.5,
+        lambda x: norm.pdf(x, 0.5, 1.0),
+        [counted(d, lambda x: np.clip(3.0 * x, 0.1, 5.0)) for d in counts],
+    )
+    terms = psf.log_likelihood(system, psf.GridFilter(), {}, counts, steps=np.arange(4))
+    np.testing.assert_allclose(terms, reference.terms, rtol=0.0, atol=1e-5)
