@@ -34,17 +34,18 @@ from pymc_statespace_filters.filters.outcomes import (
     TOO_FAR,
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
+    END,
+    ON_GRID,
+    ON_SEGMENTS,
     attempt,
     discard,
     first_grid,
-    next_grid,
+    next_attempt,
 )
 from pymc_statespace_filters.filters.point_mass.predictions import predictions_function
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
 from pymc_statespace_filters.filters.point_mass.segment_pass import (
     discard_segments,
-    first_accuracy,
-    needs_segments,
     pass_on_segments,
 )
 from pymc_statespace_filters.filters.point_mass.states import run_function, states_function
@@ -105,7 +106,7 @@ class GridFilter:
     logarithm of the state ends there) is left out, as such a particle would be.
 
     A density with an edge, one that is narrow here and very broad there, or noise that vanishes at
-    a point needs segments in place of the grid, and some ten times as long. Parameters that would
+    a point needs segments in place of the grid, and some eight times as long. Parameters that would
     need more than 8192 points, and observations where the density of the state is below 1e-265, get
     the log-likelihood minus infinity, with that reason.
 
@@ -236,19 +237,17 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
     if not has_valid_covariances(system):
         return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
-    spacing, reach = first_grid(system, steps, t0, tolerance)
-    while True:
-        code, j = attempt(
-            system, steps, observed, t0, spacing, reach, tolerance, terms, discard, None
-        )
-        again, spacing, reach = next_grid(code, spacing, reach)
-        if not again:
-            break
-    if needs_segments(code):
-        reach, floor = first_accuracy(tolerance)
-        code, j, _, _ = pass_on_segments(
-            system, steps, observed, t0, reach, floor, tolerance, terms, discard_segments, None
-        )
+    place, settings = ON_GRID, first_grid(system, steps, t0, tolerance)
+    while place != END:
+        if place == ON_SEGMENTS:
+            code, j = pass_on_segments(
+                system, steps, observed, t0, tolerance, terms, discard_segments, None
+            )
+        else:
+            code, j = attempt(
+                system, steps, observed, t0, settings, tolerance, terms, discard, None
+            )
+        place, settings = next_attempt(place, code, settings)
     return code, j
 
 

@@ -23,6 +23,7 @@ from tests.evidence.calibration import (
 STATIC = Path(__file__).parents[2] / "docs" / "_static"
 RESULTS = STATIC / "evidence_calibration.csv"
 TABLE, LONG_TABLE = STATIC / "evidence_calibration.inc", STATIC / "evidence_long_chains.inc"
+DOUBTS_TABLE = STATIC / "evidence_doubts.inc"
 KEYS = ["target", "estimator"]
 HEADS = (
     "target", "estimator", "runs", "bias", "reported error", "actual error",
@@ -63,6 +64,28 @@ def row(title, estimator, r):
     return f"| {' | '.join(map(str, cells))} |"
 
 
+def table_of_doubts(results):
+    """How often an estimator doubts itself where it is right, and does not where it is wrong."""
+    lines = ["| estimator | right rows | falsely doubted | wrong rows | doubt missed |"]
+    lines.append("| --- " * 5 + "|")
+    for estimator in CALIBRATED:
+        rows = [r for (_, name), r in results.items() if name == estimator]
+        scored = [r for r in rows if not np.isnan(r.reported)]
+        right = [r for r in scored if r.is_right]
+        wrong = [r for r in scored if not r.is_right]
+        if scored:
+            cells = len(right), share_of_runs(right, 1), len(wrong), share_of_runs(wrong, 0)
+            lines.append(f"| {estimator} | {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def share_of_runs(rows, doubted):
+    """How many runs of these rows were doubted (1) or not (0), of how many."""
+    n_runs = sum(r.n_runs for r in rows)
+    found = sum(r.n_runs * (r.doubted if doubted else 1.0 - r.doubted) for r in rows)
+    return f"{found:.0f} of {n_runs} runs" if rows else ""
+
+
 def kept():
     """Results of earlier runs, by target and estimator."""
     if not RESULTS.exists():
@@ -89,6 +112,7 @@ def main(names):
                 keep(kept() | {(target, name): found})
     TABLE.write_text(table(CASES, kept()))
     LONG_TABLE.write_text(table(LONG_CHAINS, kept()))
+    DOUBTS_TABLE.write_text(table_of_doubts(kept()))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,21 @@
-"""One pass of the point-mass filter over a record, and the grid settings of the next attempt.
+"""One pass of the point-mass filter over a record, and what the next attempt does.
 
 A pass hands its grids to ``keep(tape, k, grid, updated)``: the predicted grid of every step, and at
 an observation the updated grid too.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.outcomes import NONE, is_missing
+from pymc_statespace_filters.filters.outcomes import (
+    GRID_TOO_LARGE,
+    NO_PROCESS_NOISE,
+    NONE,
+    is_missing,
+)
 from pymc_statespace_filters.filters.point_mass.recursion import (
     REFINEMENT,
     TOO_COARSE,
@@ -26,6 +32,20 @@ LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
 SHORTEST_REACH, LONGEST_REACH = 8.5, 35.0
 _PER_STEP = 1e-5  # planned error of one step, relative to the tolerance
+# A density that needs more is not smooth, and segments mostly hold it at a fraction of the cost.
+_MOST_REFINEMENTS = 4
+
+# Where the next attempt represents the density, or that there is none.
+ON_GRID, ON_SEGMENTS, END = range(3)
+
+
+class Settings(NamedTuple):
+    """Spacing of the grid, its reach, how often it was refined, and whether it may be further."""
+
+    spacing: float
+    reach: float
+    n_refined: int
+    is_refinable: bool
 
 
 @inline_always
@@ -35,14 +55,14 @@ def discard(tape, k, grid, updated):
 
 @njit_internal
 def first_grid(system, steps, t0, tolerance):
-    """(spacing, reach) of the first attempt: the spacing that the first step requires.
+    """Of the first attempt: the spacing that the first step requires.
 
     The step is taken from the initial mean and one standard deviation to either side, see
     `grid.aliasing`.
     """
     spacing = np.inf
     if steps.size == 0 or steps[-1] == 0:
-        return spacing, SHORTEST_REACH
+        return Settings(spacing, SHORTEST_REACH, 0, True)
     mean, sd = initial_moments(system)
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
@@ -54,22 +74,34 @@ def first_grid(system, steps, t0, tolerance):
         if width > 0.0:
             spacing = min(spacing, width)
     spacing = spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-    return spacing, SHORTEST_REACH
+    return Settings(spacing, SHORTEST_REACH, 0, True)
 
 
 @njit_internal
-def next_grid(code, spacing, reach):
-    """After an attempt that ended with this code: (whether to repeat it, spacing, reach)."""
+def next_attempt(place, code, settings):
+    """After an attempt in this place that ended with this code: (place, settings) of the next one.
+
+    Segments are tried once. If they fail, as where mass explodes, a grid that was only too coarse
+    is refined further.
+    """
+    spacing, reach, n_refined, is_refinable = settings
+    finer = Settings(spacing * REFINEMENT, reach, n_refined + 1, is_refinable)
+    if place == ON_SEGMENTS:
+        return (ON_GRID if is_refinable and code == GRID_TOO_LARGE else END), settings
+    if code == TOO_SHORT:
+        longer = Settings(spacing, reach * LENGTHENING, n_refined, is_refinable)
+        return (ON_GRID if longer.reach < LONGEST_REACH else END), longer
     if code == TOO_COARSE:
-        return True, spacing * REFINEMENT, reach
-    if code == TOO_SHORT and reach * LENGTHENING < LONGEST_REACH:
-        return True, spacing, reach * LENGTHENING
-    return False, spacing, reach
+        return (ON_SEGMENTS if n_refined == _MOST_REFINEMENTS else ON_GRID), finer
+    if code in (GRID_TOO_LARGE, NO_PROCESS_NOISE) and n_refined <= _MOST_REFINEMENTS:
+        return ON_SEGMENTS, Settings(spacing, reach, n_refined, False)
+    return END, settings
 
 
 @njit_internal
-def attempt(system, steps, observed, t0, spacing, reach, tolerance, terms, keep, tape):
+def attempt(system, steps, observed, t0, settings, tolerance, terms, keep, tape):
     """Write the terms of one pass; return (NONE, J), or (reason, observation) of a stop."""
+    spacing, reach, _, _ = settings
     k = np.int64(0)
     code, grid, source = initialise(system, spacing, reach)
     if code == NONE:

@@ -24,16 +24,17 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
 from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
+    END,
+    ON_GRID,
+    ON_SEGMENTS,
     attempt,
     first_grid,
-    next_grid,
+    next_attempt,
 )
 from pymc_statespace_filters.filters.point_mass.grid import grid_points
 from pymc_statespace_filters.filters.point_mass.moments import total_mass
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
 from pymc_statespace_filters.filters.point_mass.segment_pass import (
-    first_accuracy,
-    needs_segments,
     pass_on_segments,
 )
 from pymc_statespace_filters.filters.point_mass.segments import POINTS, points_of
@@ -78,19 +79,17 @@ def _grid_predictions(
     )  # fmt: skip
     if not has_valid_covariances(system):
         return
-    spacing, reach = first_grid(system, at, t0, tolerance)
-    terms, again = np.empty(J), True
-    while again:
+    place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
+    terms, tape = np.empty(J), (system, at, record, t0, laws)
+    while place != END:
         laws.next[0] = 0
-        tape = system, at, record, t0, laws
-        code, j = attempt(system, at, record, t0, spacing, reach, tolerance, terms, _predict, tape)
-        again, spacing, reach = next_grid(code, spacing, reach)
-    if needs_segments(code):
-        tape = system, at, record, t0, laws
-        reach, floor = first_accuracy(tolerance)
-        code, j, _, _ = pass_on_segments(
-            system, at, record, t0, reach, floor, tolerance, terms, _predict_on_segments, tape
-        )
+        if place == ON_SEGMENTS:
+            code, j = pass_on_segments(
+                system, at, record, t0, tolerance, terms, _predict_on_segments, tape
+            )
+        else:
+            code, j = attempt(system, at, record, t0, settings, tolerance, terms, _predict, tape)
+        place, settings = next_attempt(place, code, settings)
     if code != NONE:
         _forget(laws, j)
 

@@ -10,9 +10,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.filters.outcomes import (
-    GRID_TOO_LARGE,
     NO_FINITE_MEMBER,
-    NO_PROCESS_NOISE,
     NONE,
     TOO_FAR,
     is_missing,
@@ -42,12 +40,6 @@ _SHARE, _NEGLIGIBLE = 0.1, 1e-5
 _MUCH_LARGER = 1e3  # than the floor needed: the pass is repeated
 
 
-@njit_internal
-def needs_segments(code):
-    """Whether a pass on a uniform grid failed with this code for what segments may resolve."""
-    return code in (GRID_TOO_LARGE, NO_PROCESS_NOISE)
-
-
 @inline_always
 def discard_segments(tape, k, segments):
     """Keep no segments: a likelihood needs none."""
@@ -71,8 +63,18 @@ def next_accuracy(code, reach, floor, needed):
 
 
 @njit_internal
-def pass_on_segments(system, steps, observed, t0, reach, floor, tolerance, terms, keep, tape):
-    """Write the terms: (NONE, J, reach, floor), or (reason, observation, ..) of a failure."""
+def pass_on_segments(system, steps, observed, t0, tolerance, terms, keep, tape):
+    """Write the terms; return (NONE, J), or (reason, observation) of a failure."""
+    reach, floor = first_accuracy(tolerance)
+    code, j, _, _ = pass_from(
+        system, steps, observed, t0, reach, floor, tolerance, terms, keep, tape
+    )
+    return code, j
+
+
+@njit_internal
+def pass_from(system, steps, observed, t0, reach, floor, tolerance, terms, keep, tape):
+    """The same from this accuracy on: (NONE, J, reach, floor), or (reason, observation, ..)."""
     while True:
         code, j, needed = _attempt(
             system, steps, observed, t0, reach, floor, tolerance, terms, keep, tape

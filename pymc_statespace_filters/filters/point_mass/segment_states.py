@@ -15,7 +15,7 @@ from pymc_statespace_filters.filters.point_mass.rows import PREDICTED, SMOOTHED
 from pymc_statespace_filters.filters.point_mass.segment_pass import (
     first_accuracy,
     next_accuracy,
-    pass_on_segments,
+    pass_from,
 )
 from pymc_statespace_filters.filters.point_mass.segments import (
     POINTS,
@@ -34,7 +34,7 @@ def states_on_segments(system, steps, observed, t0, tolerance, moment, rows, sto
     tape, again = (kept, stored), True
     reach, floor = first_accuracy(tolerance)
     while again:
-        code, j, reach, floor = pass_on_segments(
+        code, j, reach, floor = pass_from(
             system, steps, observed, t0, reach, floor, tolerance, terms, _keep, tape
         )
         if moment == SMOOTHED and code == NONE and rows.at.size:

@@ -43,9 +43,12 @@ from pymc_statespace_filters.filters.outcomes import (
     is_missing,
 )
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
+    END,
+    ON_GRID,
+    ON_SEGMENTS,
     attempt,
     first_grid,
-    next_grid,
+    next_attempt,
 )
 from pymc_statespace_filters.filters.point_mass.grid import gather, grid_points
 from pymc_statespace_filters.filters.point_mass.moments import draw, mean_and_sd, total_mass
@@ -63,7 +66,6 @@ from pymc_statespace_filters.filters.point_mass.rows import (
     SMOOTHED,
     Rows,
 )
-from pymc_statespace_filters.filters.point_mass.segment_pass import needs_segments
 from pymc_statespace_filters.filters.point_mass.segment_states import states_on_segments
 from pymc_statespace_filters.filters.point_mass.tiles import LANES, block_of, multiply
 from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
@@ -114,27 +116,31 @@ def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     stored = rows.at
     if moment == SMOOTHED and rows.at.size:
         stored = np.arange(rows.at[0], steps[-1] + 1)
-    spacing, reach = first_grid(system, steps, t0, tolerance)
-    while True:
-        grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
-        grids.clear()
-        tape = grids, stored, moment
-        code, j = attempt(
-            system, steps, observed, t0, spacing, reach, tolerance, terms, _keep, tape
-        )
-        if moment == SMOOTHED and code == NONE and rows.at.size:
-            code, j = _smooth(
-                system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows
+    place, settings = ON_GRID, first_grid(system, steps, t0, tolerance)
+    while place != END:
+        if place == ON_SEGMENTS:
+            code, j = states_on_segments(
+                system, steps, observed, t0, tolerance, moment, rows, stored, terms
             )
-        again, spacing, reach = next_grid(code, spacing, reach)
-        if not again:
-            break
-    if needs_segments(code):
-        return states_on_segments(
-            system, steps, observed, t0, tolerance, moment, rows, stored, terms
-        )
+        else:
+            code, j = _states_on_grid(
+                system, steps, observed, t0, settings, tolerance, moment, rows, stored, terms
+            )
+        place, settings = next_attempt(place, code, settings)
+    return code, j
+
+
+@njit_internal
+def _states_on_grid(system, steps, observed, t0, settings, tolerance, moment, rows, stored, terms):
+    """One attempt: write rows and terms; return (NONE, J), or (reason, observation) of a stop."""
+    grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
+    grids.clear()
+    tape = grids, stored, moment
+    code, j = attempt(system, steps, observed, t0, settings, tolerance, terms, _keep, tape)
     if moment != SMOOTHED:
         _write_rows(rows, grids)
+    elif code == NONE and rows.at.size:
+        code, j = _smooth(system, steps, observed, t0, settings, tolerance, terms, tape, rows)
     return code, j
 
 
@@ -164,8 +170,9 @@ def _write_rows(rows, grids):
 
 
 @njit_internal
-def _smooth(system, steps, observed, t0, spacing, reach, tolerance, terms, tape, rows):
+def _smooth(system, steps, observed, t0, settings, tolerance, terms, tape, rows):
     """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
+    spacing, reach, _, _ = settings
     grids, stored, _ = tape
     table, later = empty_table(), grids[-1]
     weights, ratio = later[2], np.ones(later[2].size)
