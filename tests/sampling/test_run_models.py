@@ -97,7 +97,7 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(ChainPool, "finished", interrupted)
-        with pytest.raises(ModelError, match="nothing to return"):  # all were in their warm-up
+        with pytest.raises(KeyboardInterrupt, match="before there was a draw"):  # in the warm-up
             psf.run_models(models, **settings)
     stored = [
         {segment.name.partition(".")[0] for segment in folder.rglob("*.segment")}

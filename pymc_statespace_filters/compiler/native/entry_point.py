@@ -31,6 +31,7 @@ from pymc_statespace_filters.compiler.native.code_library import (
     InternalLinkageCompiler,
     with_internal_linkage,
 )
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 
 F64_PTR = types.CPointer(types.float64)
@@ -139,7 +140,8 @@ class EntryPoint:
         )
         if self.key is not None and config.numba__cache:
             compiled._cache = _cache(self._function, self.key)
-        with slow_compilation(self._name), _no_garbage_collection():
+        # LLVM calls Python, where an interrupt would be lost.
+        with held_interrupts(), slow_compilation(self._name), _no_garbage_collection():
             compiled.compile()
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled

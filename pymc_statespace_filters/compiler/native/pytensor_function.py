@@ -15,6 +15,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
 from numba import carray, njit, typeof, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -27,6 +28,8 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     call_address,
 )
+from pymc_statespace_filters.compiler.native.python_call import call_machine_code
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
@@ -73,8 +76,16 @@ class NativeFunction:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
         self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
-        with slow_compilation("the functions of the model"):
+        with held_interrupts(), slow_compilation("the functions of the model"):
             self.shapes = [np.shape(result) for result in self(*example)]
+
+    @property
+    def calls_python(self) -> bool:
+        """Whether machine code calls Python for it: hold interrupts back meanwhile.
+
+        Machine code with parts in numba's object mode does so too, but raises what they raise.
+        """
+        return not self._is_native
 
     @property
     def size(self) -> int:
@@ -84,7 +95,7 @@ class NativeFunction:
     def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
         """Call from Python."""
         if self._is_native:
-            return self._function.vm.jit_fn(*inputs, *self._data)
+            return call_machine_code(self._function.vm.jit_fn, *inputs, *self._data)
         with self._one_at_a_time:
             return self._function(*inputs)
 
@@ -168,10 +179,22 @@ def _pointer(typing_context, address):
 
 
 def _forget_error(context: Any, builder: Any) -> None:
-    """Clear Python's error indicator, which a failed operation in Python has set."""
+    """Clear Python's error indicator, which a failed operation in Python has set.
+
+    An interrupt would not be raised by the second call: it is requested again.
+    """
     python = context.get_python_api(builder)
     lock = python.gil_ensure()
+    matches = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(ir.IntType(32), [python.pyobj]), "PyErr_ExceptionMatches"
+    )
+    interrupted = builder.call(matches, [python.get_c_object("PyExc_KeyboardInterrupt")])
     python.err_clear()
+    with builder.if_then(cgutils.is_not_null(builder, interrupted), likely=False):
+        request = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), []), "PyErr_SetInterrupt"
+        )
+        builder.call(request, [])
     python.gil_release(lock)
 
 

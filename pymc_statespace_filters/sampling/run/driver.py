@@ -109,7 +109,10 @@ def _run(
         # Who wants no progress bar wants no report on the screen either.
         level = "info" if options.progressbar else "debug"
         # After an interruption a model may have no draws: the others have theirs.
-        kept = [task for task in tasks if task.has_draws] or tasks
+        kept = [task for task in tasks if task.has_draws]
+        if not kept and not all(task.is_complete for task in tasks):
+            raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
+        kept = kept or tasks
         log_warnings([no_draws_warning(task.name) for task in tasks if task not in kept])
         with COMPILATION:
             return {
