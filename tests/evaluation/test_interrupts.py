@@ -55,9 +55,9 @@ def interrupt_in(seconds):
 
 @pytest.mark.parametrize("call", [batch, particles, run, path])
 def test_an_interrupt_at_any_moment(call):
-    """Of 30, one or two in each function came out right where numba met them."""
+    """Numba makes the arrays of a result by calls of Python, where a SystemError came of it."""
     call()
-    for moment in np.linspace(0.01, 0.1, 30):
+    for moment in np.linspace(0.01, 0.1, 12):
         timer = interrupt_in(moment)
         with pytest.raises(KeyboardInterrupt):  # noqa: PT012
             while True:
@@ -78,7 +78,7 @@ def test_an_interrupt_of_python_in_machine_code(mode):
         pm.Potential("slow", slow(pm.Normal("mu")))
     with pytensor.config.change_flags(mode=mode):
         density = ModelDensity(model)
-    for moment in np.linspace(0.01, 0.1, 30):
+    for moment in np.linspace(0.01, 0.1, 12):
         timer = interrupt_in(moment)
         with pytest.raises(KeyboardInterrupt):  # noqa: PT012
             while True:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +70,7 @@ class ParallelMap:
         ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
         control = np.zeros((n_threads, 2), dtype=np.int64)
         if len(rows) == 1:  # as in a search; a thread would take a millisecond
-            with held_interrupts() if self._native.calls_python else nullcontext():
+            with held_interrupts():
                 self._call_part(rows, results, control[0])
             self.on_progress(1)
             return results

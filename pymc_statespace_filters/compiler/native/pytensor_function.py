@@ -15,7 +15,6 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba import carray, njit, typeof, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -78,14 +77,6 @@ class NativeFunction:
         self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
         with held_interrupts(), slow_compilation("the functions of the model"):
             self.shapes = [np.shape(result) for result in self(*example)]
-
-    @property
-    def calls_python(self) -> bool:
-        """Whether machine code calls Python for it: hold interrupts back meanwhile.
-
-        Machine code with parts in numba's object mode does so too, but raises what they raise.
-        """
-        return not self._is_native
 
     @property
     def size(self) -> int:
@@ -179,22 +170,10 @@ def _pointer(typing_context, address):
 
 
 def _forget_error(context: Any, builder: Any) -> None:
-    """Clear Python's error indicator, which a failed operation in Python has set.
-
-    An interrupt would not be raised by the second call: it is requested again.
-    """
+    """Clear Python's error indicator, which a failed operation in Python has set."""
     python = context.get_python_api(builder)
     lock = python.gil_ensure()
-    matches = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(ir.IntType(32), [python.pyobj]), "PyErr_ExceptionMatches"
-    )
-    interrupted = builder.call(matches, [python.get_c_object("PyExc_KeyboardInterrupt")])
     python.err_clear()
-    with builder.if_then(cgutils.is_not_null(builder, interrupted), likely=False):
-        request = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), []), "PyErr_SetInterrupt"
-        )
-        builder.call(request, [])
     python.gil_release(lock)
 
 
