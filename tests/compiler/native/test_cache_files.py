@@ -33,6 +33,32 @@ def test_a_damaged_file_is_compiled_anew(ending):
     assert len(file.read_bytes()) > 0.9 * len(whole)  # for the next process
 
 
+SUM = """
+import pymc_statespace_filters as psf, pytensor, pytensor.tensor as pt
+psf.EKF()
+x = pt.dvector()
+print(pytensor.function([x], pt.sum(pt.exp(x)), mode="NUMBA")([0.0, 0.0]))
+"""
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_damaged_files_of_pytensor_are_compiled_anew(tmp_path, ending):
+    def run():
+        flags = {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path},blas__ldflags=,cxx="}
+        command = [sys.executable, "-c", SUM]
+        return subprocess.run(
+            command, env=os.environ | flags, capture_output=True, text=True, check=True
+        )
+
+    assert run().stdout == "2.0\n"
+    files = list(tmp_path.rglob(f"*.{ending}"))
+    assert files
+    for file in files:
+        file.write_bytes(file.read_bytes()[:10])
+    assert run().stdout == "2.0\n"
+    assert all(file.stat().st_size > 10 for file in files)  # for the next process
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
     flags = f"base_compiledir={tmp_path / 'file'},cxx="
