@@ -112,7 +112,7 @@ def _run(
         kept = [task for task in tasks if task.has_draws]
         if not kept and not all(task.is_complete for task in tasks):
             raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
-        kept = kept or tasks
+        kept = kept or list(tasks)
         log_warnings([no_draws_warning(task.name) for task in tasks if task not in kept])
         with COMPILATION:
             return {
