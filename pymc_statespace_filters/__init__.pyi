@@ -4,6 +4,7 @@ from .diagnostics import (
     leave_future_out,
 )
 from .errors import (
+    CheckpointError,
     CheckpointWarning,
     DataMismatchError,
     EvidenceWarning,
@@ -67,6 +68,7 @@ __all__ = [
     "IPLF",
     "UKF",
     "BootstrapPF",
+    "CheckpointError",
     "CheckpointWarning",
     "DataMismatchError",
     "DimensionCorrection",

@@ -149,6 +149,19 @@ class EvidenceWarning(UserWarning):
     """
 
 
+class CheckpointError(StateSpaceFiltersError, OSError):
+    """A file of a checkpoint cannot be written or read, for example because the disk is full.
+
+    What was stored before is kept, and the same call resumes from there.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> issubclass(psf.CheckpointError, OSError)
+    True
+    """
+
+
 class CheckpointWarning(UserWarning):
     """A part of a checkpoint is damaged; the chain resumes from the last intact record.
 

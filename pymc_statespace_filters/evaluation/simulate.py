@@ -17,9 +17,11 @@ from pymc_statespace_filters.compiler.lowering.observation_sampler import (
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.jit import copy_into
+from pymc_statespace_filters.compiler.native.python_call import call_in_thread, call_machine_code
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.panel import single_records
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -28,6 +30,8 @@ from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import check_inputs, check_system
 from pymc_statespace_filters.system.steps import steps_of
+
+_MANY_STEPS = 100_000  # some milliseconds at the least
 
 
 @lru_cache(maxsize=256)
@@ -140,7 +144,7 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
     # At once and not by the first call, which PyMC makes when its bar is on the screen already.
     vector, matrix, steps = np.zeros(1), np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
     arguments = np.random.default_rng(0), vector, steps, matrix, 0.0
-    with slow_compilation("the simulation of this system"):
+    with held_interrupts(), slow_compilation("the simulation of this system"):
         cached.function.compile(tuple(map(typeof, arguments)))
     return cached
 
@@ -230,7 +234,7 @@ def simulate(
         )
     with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
-    states, observations = simulator(system, with_noise).function(rng, theta, at, forces, t0)
+    states, observations = _call(simulator(system, with_noise).function, rng, theta, at, forces, t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {
@@ -246,6 +250,12 @@ def simulate(
             "obs_time": ("obs", t0 + at * system.dt),
         },
     )
+
+
+def _call(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *of: Any) -> Any:
+    """Call a simulator; in a thread if it takes long, so that an interrupt ends the wait."""
+    is_long = steps.size > 0 and steps[-1] > _MANY_STEPS
+    return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *of)
 
 
 def _simulate_panel(
@@ -264,7 +274,7 @@ def _simulate_panel(
     generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
     records = single_records(table, 0)
     simulated = [
-        run(rng, own, steps, inputs, float(t0))
+        _call(run, rng, own, steps, inputs, float(t0))
         for rng, own, (steps, _, inputs, t0, _) in zip(generators, theta, records, strict=True)
     ]
     states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))

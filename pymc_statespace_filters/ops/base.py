@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
+from numba import typeof
 from pytensor.gradient import grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
@@ -26,9 +27,11 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.python_call import TimedCall, call_machine_code
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
 from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
@@ -70,6 +73,8 @@ class FilterOp(Op):
     )
     # How an input is written in the call of the kernel, where not as a number or a copy.
     argument_code: ClassVar[Mapping[str, str]] = {}
+    # Whether its machine code exchanges numbers with other ranks, from the thread that calls it.
+    is_collective: ClassVar[bool] = False
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.system = system
@@ -82,6 +87,14 @@ class FilterOp(Op):
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """Compile the function of the inputs."""
         raise NotImplementedError
+
+    @staticmethod
+    def n_steps(theta: np.ndarray, steps: np.ndarray) -> int:
+        """Steps of an evaluation, roughly; of a panel, ``steps`` are its rows."""
+        if not steps.size:
+            return 0
+        last = steps[-1] if steps.ndim == 1 else steps[-1, STEP]
+        return int(last) * (len(theta) if theta.ndim == 2 else 1)
 
     def make_node(self, *inputs: Any) -> Apply:
         """Apply to symbols or numbers; the names and types are in `input_types`."""
@@ -121,15 +134,18 @@ def evaluator(op: FilterOp) -> Any:
     compiled = jit(function)
     machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
     kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]
+    call = TimedCall(machine_code)
 
     def evaluate(*values: Any) -> tuple:
         # Other types of arrays (in another order, or read-only) would be compiled again.
         arrays = [np.require(v, kind, ("C", "W")) for v, kind in zip(values, kinds, strict=True)]
         if not machine_code.overloads:
-            with slow_compilation(f"{type(op.filter).__name__} for this system"):
-                results = machine_code(*arrays)
+            with held_interrupts(), slow_compilation(f"{type(op.filter).__name__} for this system"):
+                machine_code.compile(tuple(map(typeof, arrays)))
+        if op.is_collective:
+            results = call_machine_code(machine_code, *arrays)
         else:
-            results = machine_code(*arrays)
+            results = call(arrays, op.n_steps(*arrays[:2]))
         return results if isinstance(results, tuple) else (results,)
 
     return evaluate

@@ -42,6 +42,7 @@ class DistributedLogLikelihood(LogLikelihood):
     )  # fmt: skip
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str]] = {}
+    is_collective = True
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's log-likelihood for the members of one rank."""

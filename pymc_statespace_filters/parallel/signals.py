@@ -19,6 +19,29 @@ def deferred_interrupts() -> Iterator[Event]:
         yield interrupted
 
 
+class held_interrupts:
+    """Hold an interrupt back until the end of the block.
+
+    In a Python function that machine code calls, an exception would be lost. A class, because it
+    surrounds single evaluations: it takes 3 microseconds, two generators would take 8.
+    """
+
+    def __enter__(self) -> None:
+        self._is_interrupted = False
+        self._is_main = current_thread() is main_thread()
+        if self._is_main:
+            self._before = signal.signal(signal.SIGINT, self._note)
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_main:
+            signal.signal(signal.SIGINT, self._before)
+        if self._is_interrupted:
+            signal.raise_signal(signal.SIGINT)
+
+    def _note(self, *_: object) -> None:
+        self._is_interrupted = True
+
+
 @contextmanager
 def ignored_interrupts() -> Iterator[None]:
     """Ignore interrupts: they may reach all ranks, and one of them stops the others."""

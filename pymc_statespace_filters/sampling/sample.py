@@ -143,7 +143,8 @@ def sample_dram(
     -------
     xarray.DataTree
         As returned by ``pm.sample``; None on ranks that do not get it. After Ctrl-C, the draws made
-        until then. The attributes ``exact`` (1 if the chains target the posterior itself, 0 if one
+        until then: of the chains that together have most, cut to one length; a warning names those
+        left out. The attributes ``exact`` (1 if the chains target the posterior itself, 0 if one
         with the bias of a filter), ``refresh_noise`` (0 or 1) and ``correlation`` describe the
         target, and ``filter``, a JSON text, names the filter of every StateSpace variable:
         ``'{"d": "BootstrapPF(200)"}'``.
@@ -260,7 +261,8 @@ def run_models(
     Returns
     -------
     dict of str to xarray.DataTree
-        As returned by `sample_dram`; None on ranks that do not get them.
+        As returned by `sample_dram`; None on ranks that do not get them. After Ctrl-C, those of the
+        models that have draws; a warning names the others.
 
     Raises
     ------

@@ -1,5 +1,7 @@
 """Selected draws of a posterior with the noise seed of each."""
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +21,15 @@ class PosteriorDraws:
     """Draws with the dimensions chain and draw, and their sampler statistics, which may be empty.
 
     ``noise_moved``: the chain moved its noise (``correlation``), so that no seed reproduces it.
+    ``observed`` are the data, and ``filters`` the filters by variable, of the run; either may lack
+    any of them.
     """
 
     posterior: xr.Dataset
     stats: xr.Dataset
     noise_moved: bool
+    observed: xr.Dataset
+    filters: Mapping[str, str]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -58,7 +64,22 @@ class PosteriorDraws:
         stored = f"{name}_seed"
         if self.noise_moved or stored not in self.stats:
             return None
-        seeds = self.stats[stored].transpose(*SAMPLE_DIMS, ...).values.astype(np.int64)
+        array = self.stats[stored]
+        if not set(SAMPLE_DIMS) <= set(array.dims):
+            raise ModelError(
+                f"{stored} in sample_stats of idata must have the dimensions chain and draw, got "
+                f"{array.dims}: drop sample_stats from idata"
+            )
+        with np.errstate(invalid="ignore"):  # what is not a number is refused
+            values = array.transpose(*SAMPLE_DIMS, ...).values
+            seeds = values.astype(np.int64) if values.dtype.kind in "iuf" else np.array(-1)
+        if bad := int(np.sum((seeds < 0) | (seeds != values))):
+            raise ModelError(
+                f"{stored} in sample_stats of idata must be noise seeds, integers from 0 to "
+                f"2^63 - 1, got others in {bad} of {values.size} places, as where runs of different"
+                " models are put together: use the draws of one run, or drop sample_stats from "
+                "idata"
+            )
         if seeds.ndim > 2 and seeds.shape[2] != n_records:
             raise ModelError(
                 f"idata has noise seeds of {seeds.shape[2]} records of {name!r}, of which the model"
@@ -93,7 +114,14 @@ def select_draws(idata: xr.DataTree, n_draws: int | None) -> PosteriorDraws:
         each = max(1, n_draws // n_chains)
         kept = {"draw": np.linspace(0, length - 1, each).round().astype(int)}
         posterior, stats = posterior.isel(kept), stats.isel(kept, missing_dims="ignore")
-    return PosteriorDraws(posterior, stats, noise_was_moved(idata))
+    data = idata["observed_data"].to_dataset() if "observed_data" in idata.children else None
+    return PosteriorDraws(
+        posterior,
+        stats,
+        noise_was_moved(idata),
+        xr.Dataset() if data is None else data,
+        json.loads(idata.attrs.get("filter", "{}")),
+    )
 
 
 def _matching_stats(stats: xr.Dataset, posterior: xr.Dataset) -> xr.Dataset:

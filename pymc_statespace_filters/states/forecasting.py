@@ -7,6 +7,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from pymc_statespace_filters.compiler.native.python_call import call_machine_code
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import continuation
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
@@ -167,5 +168,7 @@ def _simulate(
     observed = np.full((len(initial), future.size, system.p), np.nan)
     for i in np.flatnonzero(np.isfinite(initial).all(axis=1)):
         inputs = rows[i if len(rows) > 1 else 0]
-        paths[i], observed[i] = simulate(rng, theta[i], initial[i], first, future, inputs, t0)
+        paths[i], observed[i] = call_machine_code(
+            simulate, rng, theta[i], initial[i], first, future, inputs, t0
+        )
     return paths, observed

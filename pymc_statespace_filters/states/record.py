@@ -9,6 +9,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
+from pymc_statespace_filters.compiler.native.python_call import call_machine_code
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.simulate import observer
@@ -194,7 +195,7 @@ def simulate_observations(
     for i, path in enumerate(states):
         known = np.isfinite(path).all(axis=1)
         inputs = rows[i if len(rows) > 1 else 0]
-        simulated[i, known] = observe(
-            rng, record.theta[i], path[known], steps[known], inputs, record.t0
+        simulated[i, known] = call_machine_code(
+            observe, rng, record.theta[i], path[known], steps[known], inputs, record.t0
         )
     return simulated

@@ -18,13 +18,14 @@ from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about
+from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.state_graphs import (
     StateSpaceVariable,
     observed_variables,
     with_other_filter,
 )
-from pymc_statespace_filters.states.draws import PosteriorDraws
+from pymc_statespace_filters.states.draws import SAMPLE_DIMS, PosteriorDraws
 from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws
 from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
 from pymc_statespace_filters.system.panel_inputs import panel_inputs
@@ -149,7 +150,14 @@ class VariableAtDraws:
         *,
         stacklevel: int = 4,
     ) -> None:
-        """Warn of failures and of collapse, given health (draws, 3) and seeds of every record."""
+        """Warn of failures and of collapse, given health (draws, 3) and seeds of every record.
+
+        Raises
+        ------
+        ModelError
+            If the filter fails with a noise seed with which the draw's chain had a likelihood.
+        """
+        self._check_seeds(np.any([each[:, 1] != NONE for each in health], axis=0))
 
         def arguments_of(i: int) -> tuple[Any, ...]:
             number, draw = divmod(i, self.n_draws)
@@ -163,6 +171,29 @@ class VariableAtDraws:
             labels=[one.label for one in self.records] if self.variable.is_panel else None,
             stacklevel=stacklevel,
         )
+
+    def _check_seeds(self, failed: NDArray[np.bool_]) -> None:
+        """Raise if the stored seeds cannot be those of the draws, given where the filter fails.
+
+        With another filter or other data than in the run it may fail.
+        """
+        draws, variable = self.draws, self.variable
+        if not failed.any() or self.stored_seeds is None or "lp" not in draws.stats:
+            return
+        name, filter = str(variable.name), repr(variable.filter)
+        log_density = draws.stats["lp"].transpose(*SAMPLE_DIMS).values.ravel()
+        wrong = failed & np.isfinite(log_density)
+        if name in draws.observed:
+            now = np.concatenate([record.observed for record in self.records]).ravel()
+            if not np.array_equal(draws.observed[name].values.ravel(), now, equal_nan=True):
+                return
+        if wrong.any() and draws.filters.get(name, filter) == filter:
+            raise ModelError(
+                f"{name}_seed in sample_stats of idata is of another run or another model: with "
+                f"it {filter} fails at {wrong.sum()} of {failed.size} draws, at which their chain "
+                "had a finite likelihood; use the sample_stats of these draws, or drop them from "
+                "idata for fresh noise"
+            )
 
     def _compile(self, outputs: Sequence[Variable], inputs: Sequence[Variable]) -> Any:
         bound = clone_replace(list(outputs), self._replaced)

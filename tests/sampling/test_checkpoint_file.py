@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError, ModelError
+from pymc_statespace_filters.errors import (
+    CheckpointError,
+    CheckpointWarning,
+    DataMismatchError,
+    ModelError,
+)
 from pymc_statespace_filters.sampling.checkpoint import journal
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.checkpoint.journal import ChainJournal
@@ -273,11 +278,41 @@ def test_a_record_that_cannot_be_written_is_not_there(tmp_path, monkeypatch):
         stored.read()
         with monkeypatch.context() as disk:
             disk.setattr(journal.os, "fsync", full)
-            with pytest.raises(OSError, match="No space left"):
+            message = (
+                r"chain-0: record 2 of the chain cannot be written \(No space left on device\)"
+            )
+            with pytest.raises(CheckpointError, match=message) as caught:
                 append_all(stored, [50], first=2)
+            assert "The 1 before it are kept" in str(caught.value)
+            assert str(tmp_path) in str(caught.value)
         folder = append_all(stored, [1], first=2)
         assert len(list(folder.iterdir())) == 2
     assert_holds(read(tmp_path), 3)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_folder_in_the_place_of_a_record_is_named(tmp_path, number):
+    folder = write(tmp_path, [2, 1, 3])
+    path = folder / f"chain-0.{number}-{number}.segment"
+    content = path.read_bytes()
+    path.unlink()
+    path.mkdir()
+    message = rf"{path.name}: record {number + 1} of the chain cannot be read \(Is a directory\)"
+    with open_checkpoint(tmp_path, SETTINGS) as checkpoint:
+        with pytest.raises(CheckpointError, match=message):
+            checkpoint.journal(0).read()
+    (path,) = tmp_path.rglob(path.name)  # in the subfolder of the last job
+    path.rmdir()
+    path.write_bytes(content)
+    assert_holds(read(tmp_path), 6)
+
+
+@pytest.mark.parametrize("name", ["run.json", "run.json.unfinished", "lease.x"])
+def test_a_folder_in_the_place_of_another_file_is_named(tmp_path, name):
+    (tmp_path / name).mkdir()
+    message = rf"cannot be written to \(Is a directory at {name}\)"
+    with pytest.raises(ModelError, match=message):
+        open_checkpoint(tmp_path, SETTINGS)
 
 
 def test_other_arguments_are_named_with_both_values(tmp_path):

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import CheckpointError, DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.checkpoint import checkpoint, journal
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import (
     folder_name,
@@ -140,11 +140,11 @@ def test_a_write_that_is_on_its_way_goes_nowhere(tmp_path, clock, monkeypatch):
         with open_checkpoint(tmp_path, SETTINGS) as fresh:
             chain = second.journal(0)
             monkeypatch.setattr(chain, "_check", lambda: None)  # it has looked just before
-            with pytest.raises(FileNotFoundError):
+            with pytest.raises(CheckpointError, match="cannot be written"):
                 append(chain, 2)
             assert numbers_in(fresh.journal(0)) == [1]
             append(fresh.journal(0), 5)
-            with pytest.raises(FileNotFoundError):
+            with pytest.raises(OSError, match="No such file"):
                 append(chain, 3)
     with open_checkpoint(tmp_path, SETTINGS) as fresh:
         assert numbers_in(fresh.journal(0)) == [1, 5]
@@ -200,7 +200,7 @@ def test_a_job_that_is_refused_leaves_no_writer_behind(tmp_path, clock, monkeypa
             open_checkpoint(tmp_path, {"draws": 5})
         with open_checkpoint(tmp_path, SETTINGS) as fresh:
             monkeypatch.setattr(second.journal(0), "_check", lambda: None)
-            with pytest.raises(FileNotFoundError):
+            with pytest.raises(CheckpointError, match="cannot be written"):
                 append(second.journal(0), 2)
             assert numbers_in(fresh.journal(0)) == [1]
 

@@ -7,6 +7,7 @@ import pytest
 
 from pymc_statespace_filters.parallel.signals import (
     deferred_interrupts,
+    held_interrupts,
     ignored_interrupts,
 )
 
@@ -22,6 +23,16 @@ def test_an_interrupt_is_noticed():
         signal.raise_signal(signal.SIGINT)
 
 
+def test_an_interrupt_is_held_back():
+    lines = iter([lambda: signal.raise_signal(signal.SIGINT), lambda: None])
+    with pytest.raises(KeyboardInterrupt), held_interrupts():
+        _ = [line() for line in lines]
+    assert list(lines) == []  # all were run
+    with deferred_interrupts() as interrupted, held_interrupts():
+        signal.raise_signal(signal.SIGINT)
+    assert interrupted.is_set()  # what surrounds it decides
+
+
 def test_an_interrupt_is_left_to_another_rank():
     with ignored_interrupts():
         signal.raise_signal(signal.SIGINT)
@@ -29,7 +40,7 @@ def test_an_interrupt_is_left_to_another_rank():
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("context", [deferred_interrupts, ignored_interrupts])
+@pytest.mark.parametrize("context", [deferred_interrupts, held_interrupts, ignored_interrupts])
 def test_other_threads_are_never_interrupted(context):
     def inside():
         with context():

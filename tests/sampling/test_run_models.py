@@ -97,7 +97,7 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(ChainPool, "finished", interrupted)
-        with pytest.raises(ModelError, match="nothing to return"):  # of the model not begun
+        with pytest.raises(KeyboardInterrupt, match="before there was a draw"):  # in the warm-up
             psf.run_models(models, **settings)
     stored = [
         {segment.name.partition(".")[0] for segment in folder.rglob("*.segment")}
@@ -110,6 +110,30 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
         assert_identical(trees[name], expected[name])
     with pytest.raises(DataMismatchError, match="draws: "):
         psf.run_models(models, **settings | {"draws": 60})
+
+
+def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog):
+    """With one thread, the chains of the dear one have all ended before the others begin."""
+    start, begun = ChainPool.start, []
+
+    def interrupted(pool, number, task):
+        begun.append(number)
+        if len(begun) == 3:  # the first chain of the cheap one
+            raise KeyboardInterrupt
+        start(pool, number, task)
+
+    settings = SETTINGS | {"tune": 0, "cores": 1}
+    expected = psf.run_models({"dear/one": models["dear/one"]}, **settings)
+    with monkeypatch.context() as patch:
+        patch.setattr(ChainPool, "start", interrupted)
+        trees = psf.run_models(models, **settings)
+    assert list(trees) == ["dear/one"]
+    assert trees["dear/one"].sizes == expected["dear/one"].sizes
+    (said,) = [r.message for r in caplog.records if "interrupted" in r.message]
+    assert said == (
+        "The run was interrupted before the chains of model 'cheap one' had made a draw: the "
+        "results lack this model."
+    )
 
 
 def test_messages_name_the_model(caplog):

@@ -21,6 +21,8 @@ from pytensor.compile.ops import wrap_py
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
+from pymc_statespace_filters.sampling.output.report import left_out_warnings
+from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
@@ -405,6 +407,40 @@ def test_an_interrupt_returns_what_is_there(seconds, tune, presses):
     assert sizes["posterior"]["draw"] >= 1
     assert sizes["posterior"]["chain"] == 2
     assert sizes.get("warmup_posterior", {"draw": 0})["draw"] == tune
+
+
+@pytest.mark.parametrize(
+    ("lengths", "skipped", "said"),
+    [
+        ((30, 30, 30), 20, None),
+        ((0, 0, 0), 0, None),  # which is an error
+        (
+            (30, 29, 0),
+            20,
+            "2 of 3 chains, with 9 iterations of each. It lacks the others: chain 2 ",
+        ),
+        ((5, 90, 0), 0, "1 of 3 chains, with 90 iterations of each. It lacks the others: chain 0 "),
+    ],
+)
+def test_chains_left_out_are_named(lengths, skipped, said):
+    warnings = left_out_warnings(lengths, skipped)
+    assert [said in warning.message for warning in warnings] == [True] * (said is not None)
+    if said is not None:
+        assert warnings[0].message.endswith("chain 2 had not begun.")
+
+
+def test_an_interrupt_names_the_chains_that_had_not_begun(monkeypatch, caplog):
+    def interrupted(pool, *others):
+        while min(task.n_done for task in pool.running.values()) < 3:
+            time.sleep(0.001)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ChainPool, "finished", interrupted)
+    tree = sample_dram(simple_model(), draws=10**5, tune=0, chains=4, cores=2)
+    assert tree["posterior"].sizes["chain"] <= 2
+    (said,) = [r.message for r in caplog.records if "interrupted" in r.message]
+    assert "of 4 chains" in said
+    assert said.endswith("chain 2 had not begun, chain 3 had not begun.")
 
 
 @pytest.mark.parametrize("asked", [True, False])

@@ -24,17 +24,39 @@ from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 from pytensor import config
-from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
+from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS, NumbaPyTensorCacheLocator
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, digest
 from pymc_statespace_filters.compiler.native.code_library import (
     InternalLinkageCompiler,
     with_internal_linkage,
 )
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)
+
+
+_load_overload = FunctionCache.load_overload
+
+
+def _load_undamaged(cache: FunctionCache, signature: Any, target_context: Any) -> Any:
+    """The machine code of a signature; None, and no file, if the file is damaged.
+
+    Numba would raise, and at every start again. Only in PyTensor's folder, for its functions and
+    ours.
+    """
+    try:
+        return _load_overload(cache, signature, target_context)
+    except Exception:  # whatever unpickling half a file raises
+        if not isinstance(cache._impl.locator, NumbaPyTensorCacheLocator):
+            raise
+        cache.flush()
+        return None
+
+
+FunctionCache.load_overload = _load_undamaged
 
 
 class _CacheByKey(FunctionCache):
@@ -45,14 +67,6 @@ class _CacheByKey(FunctionCache):
 
     def _index_key(self, signature, codegen):
         return signature, codegen.magic_tuple(), CACHED_SRC_FUNCTIONS[self._py_func]
-
-    def load_overload(self, sig, target_context):
-        """The machine code of a signature; None, and no file, if the file is damaged."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling half a file raises
-            self.flush()
-            return None
 
 
 # Keeps the Python objects, and with them their machine code, alive.
@@ -139,7 +153,8 @@ class EntryPoint:
         )
         if self.key is not None and config.numba__cache:
             compiled._cache = _cache(self._function, self.key)
-        with slow_compilation(self._name), _no_garbage_collection():
+        # LLVM calls Python, where an interrupt would be lost.
+        with held_interrupts(), slow_compilation(self._name), _no_garbage_collection():
             compiled.compile()
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled

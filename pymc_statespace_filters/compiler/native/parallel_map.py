@@ -13,6 +13,7 @@ from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
 from pymc_statespace_filters.parallel.cpu_affinity import available_cores
+from pymc_statespace_filters.parallel.signals import held_interrupts
 
 _REFRESH_SECONDS = 0.1
 # Control block of each thread: rows done, written by the thread; stop, written by the main thread.
@@ -69,7 +70,8 @@ class ParallelMap:
         ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
         control = np.zeros((n_threads, 2), dtype=np.int64)
         if len(rows) == 1:  # as in a search; a thread would take a millisecond
-            self._call_part(rows, results, control[0])
+            with held_interrupts():
+                self._call_part(rows, results, control[0])
             self.on_progress(1)
             return results
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]

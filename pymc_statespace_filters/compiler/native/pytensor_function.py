@@ -27,6 +27,8 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     call_address,
 )
+from pymc_statespace_filters.compiler.native.python_call import call_machine_code
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
@@ -73,7 +75,7 @@ class NativeFunction:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
         self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
-        with slow_compilation("the functions of the model"):
+        with held_interrupts(), slow_compilation("the functions of the model"):
             self.shapes = [np.shape(result) for result in self(*example)]
 
     @property
@@ -84,7 +86,7 @@ class NativeFunction:
     def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
         """Call from Python."""
         if self._is_native:
-            return self._function.vm.jit_fn(*inputs, *self._data)
+            return call_machine_code(self._function.vm.jit_fn, *inputs, *self._data)
         with self._one_at_a_time:
             return self._function(*inputs)
 

@@ -130,8 +130,11 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
     except FileExistsError:
         raise ModelError(f"checkpoint={str(folder)!r} is a file: expected a folder") from None
     except OSError as error:
+        inside = error.filename and Path(error.filename).parent == folder
+        at = f" at {Path(error.filename).name}" if inside else ""
         raise ModelError(
-            f"checkpoint={str(folder)!r} cannot be written to ({error.strerror}): give another path"
+            f"checkpoint={str(folder)!r} cannot be written to ({error.strerror}{at}): give another "
+            "path"
         ) from error
     return Checkpoint(Ticket(str(folder), lease.path.name, text), lease)
 

@@ -18,7 +18,7 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.errors import CheckpointWarning
+from pymc_statespace_filters.errors import CheckpointError, CheckpointWarning
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -85,11 +85,17 @@ class ChainJournal:
         -----
         CheckpointWarning
             If records were removed.
+
+        Raises
+        ------
+        CheckpointError
+            If a file cannot be read, or its name is that of a folder.
         """
         self._check()
-        stored = _joined(self._good_parts())
-        self._is_read = True
-        self._tidy()
+        with self._named_errors("read"):
+            stored = _joined(self._good_parts())
+            self._is_read = True
+            self._tidy()
         return stored if self._segments else None
 
     def append(self, draws: Arrays, state: Arrays) -> None:
@@ -104,17 +110,34 @@ class ChainJournal:
 
         Raises
         ------
-        OSError
-            If the record cannot be written, for example because the disk is full.
+        CheckpointError
+            If the record cannot be written, for example because the disk is full. It is then not
+            there, and those before it are.
         ValueError
             If an array has Python objects.
         """
         self._check()
         if not self._is_read:
             self.read()
-        number = self._n_records()
-        self._segments.append(self._write(number, number, draws, state))
-        self._tidy()
+        with self._named_errors("written"):
+            number = self._n_records()
+            self._segments.append(self._write(number, number, draws, state))
+            self._tidy()
+
+    @contextmanager
+    def _named_errors(self, what: str) -> Iterator[None]:
+        """Say of an error of the file system where it was, and what is kept."""
+        try:
+            yield
+        except CheckpointError:
+            raise
+        except OSError as error:
+            n_kept = self._n_records()
+            raise CheckpointError(
+                f"{error.filename or self._path}: record {n_kept + 1} of the chain cannot be "
+                f"{what} ({error.strerror or error}). The {n_kept} before it are kept: when that "
+                "is mended, the same call resumes after them"
+            ) from error
 
     def _n_records(self) -> int:
         return self._segments[-1].last + 1 if self._segments else 0
@@ -203,7 +226,7 @@ class ChainJournal:
     def _load_again(self, segment: _Segment) -> StoredChain:
         part = self._load(segment)
         if part is None:
-            raise OSError(
+            raise CheckpointError(
                 f"{segment.path} was damaged after it had been written; the same call resumes from "
                 f"the records before it"
             )

@@ -11,6 +11,7 @@ from pymc_statespace_filters.lower_chains import LowerChain
 from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
 from pymc_statespace_filters.sampling.kernel.state import failure_reason
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, Convergence
+from pymc_statespace_filters.sampling.output.datatree import most_iterations
 from pymc_statespace_filters.sampling.output.warnings import (
     PhaseStatistics,
     sampler_warning,
@@ -63,6 +64,35 @@ def until_ess_warning(
         f"until_ess={until_ess:g} was not reached with max_draws={draws} draws in each chain: it "
         f"asks for that bulk effective sample size and R-hat of at most {MAX_RHAT} for every "
         f"parameter{reached}. Give a larger max_draws, or make the chains mix better."
+    )
+
+
+def left_out_warnings(lengths: Sequence[int], skipped: int) -> list[SamplerWarning]:
+    """Warn of the chains that the result of an interrupted run lacks.
+
+    ``lengths`` are the iterations of each chain, of which the first ``skipped`` are not kept.
+    """
+    kept, length = most_iterations([n - skipped for n in lengths])
+    if length <= 0 or len(kept) == len(lengths):
+        return []
+    left_out = [
+        f"chain {i} had made {n} iterations" if n else f"chain {i} had not begun"
+        for i, n in enumerate(lengths)
+        if i not in kept
+    ]
+    return [
+        sampler_warning(
+            f"The run was interrupted: the result has {len(kept)} of {len(lengths)} chains, with "
+            f"{length} iterations of each. It lacks the others: {', '.join(left_out)}."
+        )
+    ]
+
+
+def no_draws_warning(name: str) -> SamplerWarning:
+    """Warn of a model that the results of an interrupted run lack."""
+    return sampler_warning(
+        f"The run was interrupted before the chains of model {name!r} had made a draw: the results "
+        "lack this model."
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK
 from pymc_statespace_filters.sampling.kernel.state import (
     ACCEPTANCE,
@@ -83,7 +84,8 @@ class ChainArrays:
         """
         random, first = self._random_numbers(iteration)
         n = min(n, BLOCK - first)
-        done = self._iterate(self._phase_settings(tune), random, first, row, n)
+        with held_interrupts():
+            done = self._iterate(self._phase_settings(tune), random, first, row, n)
         if done < n and not self.control[PAUSE_REQUESTED]:
             self._raise_error()
             raise RuntimeError("the model's log-density raised an error that did not occur again")

@@ -19,6 +19,7 @@ from contextlib import ExitStack
 from functools import partial
 
 from pymc.model import Model
+from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
 from pymc_statespace_filters.compiler.native.compilation import COMPILATION
@@ -26,6 +27,7 @@ from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.parallel.cpu_affinity import allowed_cores, cores_per_process
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import join_checkpoint, open_checkpoint
+from pymc_statespace_filters.sampling.output.report import no_draws_warning
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import ExecutionOptions, SamplingRequest
 from pymc_statespace_filters.sampling.run.scheduler import run_chains
@@ -106,10 +108,16 @@ def _run(
         check = options.compute_convergence_checks
         # Who wants no progress bar wants no report on the screen either.
         level = "info" if options.progressbar else "debug"
+        # After an interruption a model may have no draws: the others have theirs.
+        kept = [task for task in tasks if task.has_draws]
+        if not kept and not all(task.is_complete for task in tasks):
+            raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
+        kept = kept or list(tasks)
+        log_warnings([no_draws_warning(task.name) for task in tasks if task not in kept])
         with COMPILATION:
             return {
                 task.name: task.to_datatree(check_convergence=check, report_level=level)
-                for task in tasks
+                for task in kept
             }
 
     return comm.run_collectively(trees) if options.gather == "all" else trees()

@@ -29,6 +29,7 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import (
 from pymc_statespace_filters.sampling.output.report import (
     closing_report,
     element_names,
+    left_out_warnings,
     until_ess_warning,
 )
 from pymc_statespace_filters.sampling.output.sample_stats import stat_dims, whole_chain
@@ -247,6 +248,21 @@ class ModelTask:
         for index in set(range(self.request.chains)) - set(self._results):
             self._results[index] = self.chain_task(index).result()
 
+    @property
+    def has_draws(self) -> bool:
+        """Whether a chain has made an iteration that is kept."""
+        return any(n > self._n_skipped for n in self._lengths)
+
+    @property
+    def _n_skipped(self) -> int:
+        """Iterations of warm-up that are not kept."""
+        return 0 if self.request.keeps_warmup else self.request.tune
+
+    @property
+    def _lengths(self) -> list[int]:
+        """Iterations made by each chain."""
+        return [len(self._results[i][0].positions) for i in range(self.request.chains)]
+
     def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
         """Make the DataTree of the results of all chains, log warnings and a report about them.
 
@@ -255,6 +271,7 @@ class ModelTask:
         """
         target, request = self.prepare(), self.request
         closing = self._closing_messages(check_convergence, report_level)
+        closing += left_out_warnings(self._lengths, self._n_skipped)
         results = [self._results.pop(index) for index in range(self.request.chains)]
         warnings = chain_warnings(target, results, request.tune)
         attrs, noise_warnings = self._measure_noise(target, results)

@@ -22,6 +22,7 @@ from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.pymc_model.graph_rewrites import (
     autoregressive_noise,
     with_filter,
@@ -227,7 +228,8 @@ class BoundLogDensity:
         self.native.seeds[:] = seeds
         for mine, value in zip(self.others, others, strict=True):
             mine[...] = value
-        result = evaluate(self.native)
+        with held_interrupts():
+            result = evaluate(self.native)
         if result.failure == RAISED:
             self.raise_error()
         return result

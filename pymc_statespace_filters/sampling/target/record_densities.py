@@ -16,6 +16,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
 from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
@@ -116,7 +117,8 @@ class BoundRecordDensities:
         self.native.position[:] = position
         self.native.seeds[:] = seeds
         estimates = np.empty(self.n_terms)
-        found = evaluate_likelihoods(self.native, estimates)
+        with held_interrupts():
+            found = evaluate_likelihoods(self.native, estimates)
         if found.failure == RAISED:
             self.raise_error()
         return estimates, found
@@ -125,7 +127,9 @@ class BoundRecordDensities:
         """All other terms (G + 1,) at a position; an exception is raised."""
         self.native.position[:] = position
         priors = np.empty(self.n_terms)
-        if not evaluate_priors(self.native, priors):
+        with held_interrupts():
+            found = evaluate_priors(self.native, priors)
+        if not found:
             self.raise_error()
         return priors
 

@@ -14,6 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
+from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
 from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
@@ -111,7 +112,12 @@ class Target(SampledModel):
     def evaluation(self) -> Callable[[], object]:
         """A function that evaluates the log-density once, to measure what it costs."""
         bound = self.density.bind()
-        return lambda: evaluate(bound.native)
+
+        def evaluation() -> None:
+            with held_interrupts():
+                evaluate(bound.native)
+
+        return evaluation
 
     def prepare(self) -> None:
         """Load the machine code, and read data and fixed seeds as they are now."""

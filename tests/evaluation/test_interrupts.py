@@ -1,0 +1,130 @@
+"""Ctrl-C while machine code runs: a KeyboardInterrupt, at once, and nothing else."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.compile.ops import wrap_py
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.density import ModelDensity
+
+pytestmark = pytest.mark.usefixtures("interrupts_arrive")
+
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q, a: [a * x[0] + q[0]],
+    process_noise=[[1.0]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.5]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+STEPS = np.arange(1, 301)
+DATA = np.sin(STEPS)
+
+
+def batch():
+    psf.log_likelihood(SYSTEM, psf.EKF(), {"a": np.linspace(0.1, 0.9, 64)}, DATA, steps=STEPS)
+
+
+def particles():
+    psf.log_likelihood(SYSTEM, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
+
+
+def run():
+    psf.run_filter(SYSTEM, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
+
+
+def path():
+    psf.simulate(SYSTEM, {"a": 0.5}, steps=[90_000], random_seed=1)
+
+
+def interrupt_in(seconds):
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    return timer
+
+
+@pytest.mark.parametrize("call", [batch, particles, run, path])
+def test_an_interrupt_at_any_moment(call):
+    """Numba makes the arrays of a result by calls of Python, where a SystemError came of it."""
+    call()
+    for moment in np.linspace(0.01, 0.1, 12):
+        timer = interrupt_in(moment)
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            while True:
+                call()
+        timer.join()
+
+
+@pytest.mark.filterwarnings("ignore:Numba will use object mode")
+@pytest.mark.parametrize("mode", ["NUMBA", "FAST_COMPILE"])
+def test_an_interrupt_of_python_in_machine_code(mode):
+    """It was lost in the function that machine code calls, and its value was minus infinity."""
+
+    @wrap_py([pt.dscalar], [pt.dscalar])
+    def slow(mu):
+        return np.asarray(-float(sum(range(2000))) * mu**2)
+
+    with pm.Model() as model:
+        pm.Potential("slow", slow(pm.Normal("mu")))
+    with pytensor.config.change_flags(mode=mode):
+        density = ModelDensity(model)
+    for moment in np.linspace(0.01, 0.1, 12):
+        timer = interrupt_in(moment)
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            while True:
+                assert np.isfinite(density.evaluate(np.zeros((1, 1)))).all()
+        timer.join()
+
+
+LONG = """
+import signal, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
+import numpy as np
+import pymc_statespace_filters as psf
+from tests.evaluation.test_interrupts import SYSTEM
+{prepare}
+print("go", flush=True)
+try:
+    {call}
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+BATCH = 'psf.log_likelihood(SYSTEM, psf.EKF(), {"a": np.full(%d, 0.5)}, [0.1], steps=[%d])'
+PARTICLES = 'psf.log_likelihood(SYSTEM, psf.BootstrapPF(1000), {"a": 0.5}, [0.1], steps=[%d])'
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("prepare", "call"),
+    [
+        (BATCH % (2, 10), BATCH % (1000, 10**8)),
+        (PARTICLES % 10, PARTICLES % 10**9),
+        ("", PARTICLES % 10**9),
+    ],
+)
+def test_a_long_call_ends_at_once_and_so_does_the_process(prepare, call):
+    """Alone each call takes an hour; the limits are for a machine with other things to do."""
+    script = LONG.format(prepare=prepare, call=call)
+    child = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    watchdog = threading.Timer(120.0, child.kill)
+    watchdog.start()
+    with child:
+        assert child.stdout.readline() == "go\n"
+        time.sleep(3.0 if not prepare else 0.7)
+        begun = time.monotonic()
+        child.send_signal(signal.SIGINT)
+        assert child.stdout.readline() == "interrupted\n"
+        assert time.monotonic() - begun < 3.0
+        assert child.wait() == 0
+        assert time.monotonic() - begun < 6.0
+    watchdog.cancel()
