@@ -25,7 +25,7 @@ EXECUTE = cache
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
-.PHONY: help environment demo demo-quick thesis thesis-quick test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
+.PHONY: help environment demo demo-quick thesis thesis-quick published test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -43,6 +43,9 @@ thesis: $(VENV)/.installed  ## run the studies of the thesis at its settings, in
 
 thesis-quick: $(VENV)/.installed  ## the same in a short form; takes minutes, fails if a verdict does not hold
 	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py --quick $(ARGS) || exit 1; done
+
+published: $(VENV)/.installed  ## compute what others published, and compare; takes two minutes, fails if a number is off
+	$(IN)/python examples/published/run.py $(ARGS)
 
 test: $(VENV)/.installed  ## run the tests, in two processes
 	$(IN)/python $(PYTEST)
