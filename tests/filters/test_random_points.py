@@ -1,0 +1,94 @@
+"""A hundred thousand random points per filter: a failure is -inf and a counted reason, never NaN.
+
+FIGURES
+"""
+
+import re
+import warnings
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.filters.outcomes import FAILURES
+from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM
+
+pytestmark = pytest.mark.slow
+
+N_POINTS = 100_000
+RECORD = {"observed": [1.0, -0.5, np.nan, 0.8], "steps": [0, 10, 20, 40]}
+FILTERS = [
+    psf.EKF(),
+    psf.UKF(),
+    psf.IPLF(),
+    psf.EnKF(30),
+    psf.BootstrapPF(30),
+    psf.GuidedPF(30),
+    psf.PFEnKF(30),
+    psf.GridFilter(),
+]
+# Powers of ten between which the size of each parameter is drawn, uniformly in its logarithm.
+POWERS = {
+    "alpha": (-2, 6),
+    "beta": (-2, 6),
+    "sigma": (-6, 4),
+    "initial_var": (-8, 4),
+    "noise_var": (-8, 4),
+    "initial_mean": (-4, 3),
+}
+SIGNED = ("alpha", "beta", "initial_mean")
+
+
+def random_points(n):
+    rng = np.random.default_rng(41)
+    points = {name: 10 ** rng.uniform(*powers, n) for name, powers in POWERS.items()}
+    for name in SIGNED:
+        points[name] *= rng.choice([-1, 1], n)
+    return points
+
+
+def evaluate(filter, points):
+    """Terms (n, J), how many points the warnings say failed, and for which of the reasons."""
+    n = points["alpha"].size
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        terms = psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, points, **RECORD, seed=np.arange(n))
+    assert {one.category for one in caught} == {psf.FilterWarning}
+    said = [str(one.message) for one in caught if "gave -inf" in str(one.message)]
+    assert len(said) == 1
+    number, total = map(int, re.search(r"gave -inf in (\d+) of (\d+) evaluations", *said).groups())
+    assert total == n
+    reasons = {
+        reason: int(count)
+        for reason in FAILURES.values()
+        for count in re.findall(rf"(\d+) times {re.escape(reason)}", *said)
+    }
+    return terms, number, reasons
+
+
+@pytest.mark.parametrize("filter", FILTERS, ids=lambda one: type(one).__name__)
+def test_no_point_gives_nan(filter, record_property):
+    # A grid takes 6 ms a point: all of them would take ten minutes.
+    points = random_points(20_000 if isinstance(filter, psf.GridFilter) else N_POINTS)
+    started = perf_counter()
+    terms, number, reasons = evaluate(filter, points)
+    seconds = perf_counter() - started
+    assert not np.isnan(terms).any()
+    assert not (terms == np.inf).any()
+    lost = terms == -np.inf
+    failed = lost.any(axis=1)
+    # Once it is lost, a record is lost to its end.
+    assert (lost[:, 1:] >= lost[:, :-1]).all()
+    # A row that is wholly missing has the term 0, of those that came so far.
+    assert (terms[:, 2][~lost[:, 2]] == 0.0).all()
+    assert number == failed.sum() == sum(reasons.values())
+    record_property("finite", int((~failed).sum()))
+    record_property("failed", reasons)
+    record_property("seconds", round(seconds, 1))
+    # Nothing moves far, so that there is no reason to fail: only a grid may have to be too fine.
+    tame = np.all([np.abs(points[name]) < 1 for name in POWERS if name != "noise_var"], axis=0)
+    assert tame.sum() > 200
+    if not isinstance(filter, psf.GridFilter):
+        assert not failed[tame].any()
+    assert 0.5 < failed.mean() < 0.97
