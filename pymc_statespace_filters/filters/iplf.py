@@ -38,6 +38,8 @@ from pymc_statespace_filters.system.checks import check_count
 from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.system.model import StateSpaceModel
 
+_MOST_ITERATIONS = 1000
+
 
 @dataclass(frozen=True, kw_only=True)
 class IPLF(GaussianFilterBase):
@@ -58,7 +60,7 @@ class IPLF(GaussianFilterBase):
     Raises
     ------
     ModelError
-        If ``n_iterations`` is not an integer of at least 1.
+        If ``n_iterations`` is not an integer from 1 to 1000.
 
     Notes
     -----
@@ -79,7 +81,7 @@ class IPLF(GaussianFilterBase):
     n_iterations: int = 5
 
     def __post_init__(self) -> None:
-        check_count("n_iterations", self.n_iterations, 1)
+        check_count("n_iterations", self.n_iterations, 1, _MOST_ITERATIONS)
 
     @property
     def linearization(self) -> "PosteriorLinearization":

@@ -29,6 +29,6 @@ def check_fraction(name: str, value: object) -> float:
 def check_choice(name: str, value: object, allowed: Iterable[str]) -> None:
     """Raise unless ``value`` is one of the allowed words."""
     words = list(allowed)
-    if value not in words:
+    if not isinstance(value, str) or value not in words:
         listed = ", ".join(repr(word) for word in words)
         raise ModelError(f"{name} must be one of {listed}, got {value!r}.")

@@ -247,7 +247,8 @@ def _check_score_from(score_from: Any, n_observations: int) -> int:
 def _dims(dims: Sequence[str] | None, of_rows: str) -> tuple[str, str]:
     if dims is None:
         return of_rows, "observable"
-    if isinstance(dims, str) or len(dims) != 2 or not all(isinstance(d, str) for d in dims):
+    is_pair = isinstance(dims, list | tuple) and len(dims) == 2
+    if not is_pair or not all(isinstance(d, str) for d in dims):
         raise ModelError(f"dims must be two names ({of_rows}, observable), got {dims!r}")
     row_dim, component_dim = dims
     return row_dim, component_dim

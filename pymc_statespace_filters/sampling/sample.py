@@ -14,6 +14,7 @@ from pymc_statespace_filters.sampling.checkpoint.checkpoint import folder_name
 from pymc_statespace_filters.sampling.run.driver import sample_models
 from pymc_statespace_filters.sampling.run.request import ExecutionOptions, sampling_request
 from pymc_statespace_filters.sampling.run.warm_start import warm_started, warm_started_models
+from pymc_statespace_filters.system.checks import check_flag
 
 
 @overload
@@ -185,7 +186,7 @@ def sample_dram(
         chains,
         random_seed,
         initvals,
-        not discard_tuned_samples,
+        not check_flag("discard_tuned_samples", discard_tuned_samples),
         until_ess,
         max_draws,
         dram_settings,
@@ -297,7 +298,7 @@ def run_models(
         chains,
         random_seed,
         initvals,
-        not discard_tuned_samples,
+        not check_flag("discard_tuned_samples", discard_tuned_samples),
         until_ess,
         max_draws,
         dram_settings,

@@ -1,5 +1,6 @@
 """Checks of numbers that users give: integers, positive numbers, seeds, arrays."""
 
+import math
 from numbers import Integral, Real
 from typing import Any, TypeGuard
 
@@ -15,14 +16,20 @@ def is_integer(value: Any) -> TypeGuard[int]:
 
 def is_finite(value: Any) -> bool:
     """Whether a value is a finite real number, Python's or NumPy's, and not a truth value."""
-    is_real = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-    return is_real and bool(np.isfinite(value))
+    if not isinstance(value, Real) or isinstance(value, bool | np.bool_):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond the largest float
+        return False
 
 
-def check_count(name: str, value: Any, least: int) -> int:
-    """Return ``value`` as an int of at least ``least``."""
+def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """Return ``value`` as an int of at least ``least`` and at most ``most``."""
     if not is_integer(value) or value < least:
         raise ModelError(f"{name} must be an integer of at least {least}, got {value!r}")
+    if most is not None and value > most:
+        raise ModelError(f"{name} must be at most {most}, got {value!r}")
     return int(value)
 
 

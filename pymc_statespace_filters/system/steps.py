@@ -105,7 +105,7 @@ def check_steps(steps: Any) -> np.ndarray:
 
 def check_at(at: Any) -> None:
     """Raise unless ``at`` is one of `ROWS_AT`."""
-    if at not in list(ROWS_AT):
+    if not isinstance(at, str) or at not in list(ROWS_AT):
         raise ModelError(f"at must be one of {list(ROWS_AT)}, got {at!r}")
 
 

@@ -19,9 +19,15 @@ from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     model_fingerprint,
 )
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.system.checks import check_count, check_positive, is_integer
+from pymc_statespace_filters.system.checks import (
+    check_count,
+    check_flag,
+    check_positive,
+    is_integer,
+)
 
 _GATHER = ("root", "all")
+_MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory
 _MAX_GROWTH = 20  # default of max_draws, in draws
 _FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
 
@@ -96,7 +102,12 @@ class ExecutionOptions(NamedTuple):
 
     def check(self) -> None:
         """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""
-        if self.gather not in _GATHER:
+        if not isinstance(self.progressbar, bool | str):
+            raise ModelError(
+                f"progressbar must be True, False or a bar of pm.sample, got {self.progressbar!r}"
+            )
+        check_flag("compute_convergence_checks", self.compute_convergence_checks)
+        if not isinstance(self.gather, str) or self.gather not in _GATHER:
             raise ModelError(f"gather must be one of {_GATHER}, got {self.gather!r}")
         if self.cores is not None and (not is_integer(self.cores) or self.cores < 1):
             raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
@@ -127,8 +138,9 @@ def sampling_request(
     TypeError
         If a setting has an unknown name.
     """
-    for name, value, least in (("draws", draws, 0), ("tune", tune, 0), ("chains", chains, 1)):
-        check_count(name, value, least)
+    check_count("draws", draws, 0, _MOST_ITERATIONS)
+    check_count("tune", tune, 0, _MOST_ITERATIONS)
+    check_count("chains", chains, 1, _MOST_CHAINS)
     if draws + tune * keeps_warmup == 0:
         raise ModelError(
             f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, tune={tune}, "

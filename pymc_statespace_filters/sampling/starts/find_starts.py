@@ -8,7 +8,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
 from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
 from pymc_statespace_filters.sampling.starts.population import N_POINTS, population_of
-from pymc_statespace_filters.system.checks import check_count, check_random_seed
+from pymc_statespace_filters.system.checks import check_count, check_flag, check_random_seed
 
 
 def find_starts(
@@ -78,6 +78,7 @@ def find_starts(
     """
     model = modelcontext(model)
     check_count("chains", chains, 1)
+    check_flag("progressbar", progressbar)
     if chains > N_POINTS:
         raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
