@@ -42,6 +42,7 @@ def forced(**changes):
 
 PAIR = pair()
 FORCED = forced()
+FREE = forced(transition=lambda x, q, a: [a * x[0] + q[0]], inputs=())
 
 
 def pair_terms(a, b=0.2, observed=PAIR_DATA, steps=STEPS):

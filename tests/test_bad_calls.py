@@ -15,6 +15,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from tests.small_systems import FREE
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
@@ -32,16 +33,8 @@ VALUES = {
     "a cube": np.zeros((2, 2, 2)),
     "a dictionary": {1: 2},
 }
-SYSTEM = psf.StateSpaceModel(
-    transition=lambda x, q, a: [a * x[0] + q[0]],
-    process_noise=[[1.0]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.5]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
 RECORD = {"observed": [0.1, 0.2], "steps": [1, 2]}
-AT = {"system": SYSTEM, "params": {"a": 0.5}}
+AT = {"system": FREE, "params": {"a": 0.5}}
 
 
 def drift(x, a):
@@ -54,7 +47,7 @@ def with_model(call):
     def inside(**arguments):
         with pm.Model():
             pm.Uniform("a", 0.0, 1.0)
-            psf.StateSpace("d", SYSTEM, psf.EKF(), **RECORD)
+            psf.StateSpace("d", FREE, psf.EKF(), **RECORD)
             return call(**arguments)
 
     inside.__signature__ = inspect.signature(call)
@@ -80,7 +73,7 @@ def in_system(integrator):
 def variable(**arguments):
     with pm.Model():
         pm.Uniform("a", 0.0, 1.0)
-        return psf.StateSpace(**{"name": "d", "system": SYSTEM, "filter": psf.EKF()} | arguments)
+        return psf.StateSpace(**{"name": "d", "system": FREE, "filter": psf.EKF()} | arguments)
 
 
 SHORT = {"draws": 2, "tune": 2, "chains": 1, "cores": 1, "progressbar": False}

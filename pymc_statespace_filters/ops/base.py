@@ -88,9 +88,11 @@ class FilterOp(Op):
         """Compile the function of the inputs."""
         raise NotImplementedError
 
-    @staticmethod
-    def n_steps(theta: np.ndarray, steps: np.ndarray) -> int:
-        """Steps of an evaluation, roughly; of a panel, ``steps`` are its rows."""
+    def n_steps(self, inputs: Sequence[np.ndarray]) -> int:
+        """Steps of an evaluation, roughly; the steps of a panel are a column of its rows."""
+        if self.input_types[0][0] != "theta":  # nothing is filtered, as where normals are drawn
+            return 0
+        theta, steps = inputs[:2]
         if not steps.size:
             return 0
         last = steps[-1] if steps.ndim == 1 else steps[-1, STEP]
@@ -145,7 +147,7 @@ def evaluator(op: FilterOp) -> Any:
         if op.is_collective:
             results = call_machine_code(machine_code, *arrays)
         else:
-            results = call(arrays, op.n_steps(*arrays[:2]))
+            results = call(arrays, op.n_steps(arrays))
         return results if isinstance(results, tuple) else (results,)
 
     return evaluate

@@ -16,35 +16,28 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.density import ModelDensity
+from tests.small_systems import FREE
 
 pytestmark = pytest.mark.usefixtures("interrupts_arrive")
 
-SYSTEM = psf.StateSpaceModel(
-    transition=lambda x, q, a: [a * x[0] + q[0]],
-    process_noise=[[1.0]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[0.5]],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
 STEPS = np.arange(1, 301)
 DATA = np.sin(STEPS)
 
 
 def batch():
-    psf.log_likelihood(SYSTEM, psf.EKF(), {"a": np.linspace(0.1, 0.9, 64)}, DATA, steps=STEPS)
+    psf.log_likelihood(FREE, psf.EKF(), {"a": np.linspace(0.1, 0.9, 64)}, DATA, steps=STEPS)
 
 
 def particles():
-    psf.log_likelihood(SYSTEM, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
+    psf.log_likelihood(FREE, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
 
 
 def run():
-    psf.run_filter(SYSTEM, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
+    psf.run_filter(FREE, psf.BootstrapPF(100), {"a": 0.5}, DATA, steps=STEPS)
 
 
 def path():
-    psf.simulate(SYSTEM, {"a": 0.5}, steps=[90_000], random_seed=1)
+    psf.simulate(FREE, {"a": 0.5}, steps=[90_000], random_seed=1)
 
 
 def interrupt_in(seconds):
@@ -91,7 +84,7 @@ import signal, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
 import numpy as np
 import pymc_statespace_filters as psf
-from tests.evaluation.test_interrupts import SYSTEM
+from tests.small_systems import FREE
 {prepare}
 print("go", flush=True)
 try:
@@ -99,8 +92,8 @@ try:
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """
-BATCH = 'psf.log_likelihood(SYSTEM, psf.EKF(), {"a": np.full(%d, 0.5)}, [0.1], steps=[%d])'
-PARTICLES = 'psf.log_likelihood(SYSTEM, psf.BootstrapPF(1000), {"a": 0.5}, [0.1], steps=[%d])'
+BATCH = 'psf.log_likelihood(FREE, psf.EKF(), {"a": np.full(%d, 0.5)}, [0.1], steps=[%d])'
+PARTICLES = 'psf.log_likelihood(FREE, psf.BootstrapPF(1000), {"a": 0.5}, [0.1], steps=[%d])'
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

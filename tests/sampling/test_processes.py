@@ -17,6 +17,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from tests.small_systems import FREE
 
 pytestmark = pytest.mark.slow
 
@@ -26,18 +27,10 @@ SECONDS = 120
 
 def draws():
     """Of two chains on a small record, by two threads."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, a: [a * x[0] + q[0]],
-        process_noise=[[1.0]],
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.5]],
-        initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )
     with pm.Model():
         pm.Uniform("a", 0.0, 1.0)
         record = {"steps": range(1, 21), "observed": np.sin(np.arange(20.0))}
-        psf.StateSpace("d", system, psf.BootstrapPF(30), **record)
+        psf.StateSpace("d", FREE, psf.BootstrapPF(30), **record)
         idata = psf.sample_dram(
             50, tune=50, chains=2, cores=2, random_seed=1, progressbar=False,
             compute_convergence_checks=False,
