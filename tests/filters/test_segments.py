@@ -237,6 +237,29 @@ def test_one_run_has_terms_and_filtered_states():
     np.testing.assert_allclose(run["mean"].values[1:, 0], law.mean[1:], atol=1e-7)
 
 
+@pytest.mark.parametrize("sd", [1e-4, 1e-6, 1e-8])
+def test_a_fine_sensor_reads_the_density(sd):
+    """Between the points of the first segments, its likelihood is below any double."""
+    system = psf.StateSpaceModel(
+        lambda x, q: [x[0] + 0.1 * pt.log(x[0]) + q[0]],
+        lambda x: [x[0]],
+        process_noise=[[0.01]],
+        observation_noise=[[sd**2]],
+        initial_mean=[0.5],
+        initial_cov=[[0.09]],
+    )
+    mean, start = lambda x: x + 0.1 * np.log(x), lambda x: norm.pdf(x, 0.5, 0.3)
+    reference = FixedNodes(edges(-3.0, 4.0, 0.04), mean, lambda x: 0.1, start, [None] * 3)
+    before, density = reference.predicted_density[1:]
+    log_density = np.log(density) + np.log(before @ reference.weights)  # what is not lost
+    for d in (-0.4, 0.0, 0.1, 0.45, 1.2):
+        i = np.argmin(np.abs(reference.x - d))
+        (term,) = psf.log_likelihood(
+            system, psf.GridFilter(), {}, [reference.x[i]], steps=np.array([2])
+        )
+        np.testing.assert_allclose(term, log_density[i], rtol=0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("far", [30.0, 1e6])
 def test_an_observation_beyond_what_doubles_hold_is_named(far):
     with pytest.warns(psf.FilterWarning, match=FAILURES[TOO_FAR]):

@@ -28,7 +28,8 @@ from pymc_statespace_filters.filters.system_table import log_density, step_momen
 # Of a segment, in standard deviations of the noise: of the step before, and of the next one.
 _WIDEST = 4.0
 _DEPTH = 2200  # bisections of the range of doubles
-_ROUNDING = 1e-14
+_ROUNDING = 1e-14  # of a log-likelihood and of a point, relative
+_MOST_ROUNDING = 1e-3  # far from the peak of a fine sensor it would excuse everything
 _RESOLVED, _SPLIT, _NO_NOISE = range(3)
 
 
@@ -225,19 +226,18 @@ def _verdict(segments, p, step, top, total, accuracy):
     if b - a <= _ROUNDING * max(abs(a), abs(b)):
         return _RESOLVED
     least = accuracy.floor * total / (b - a)
-    if step.observes:
-        if not _may_matter(segments, p, top, least):
-            return _RESOLVED
     largest, size = 0.0, 0.0
     for i in range(POINTS):
         largest = max(largest, segments.mass[p, i])
-        if segments.log_likelihood[p, i] > -np.inf:
+        if segments.mass[p, i] > 0.0:
             size = max(size, abs(segments.log_likelihood[p, i]))
-    if not step.observes and largest <= least:
-        return _RESOLVED
-    if tail(segments.mass[p]) > (accuracy.relative + _ROUNDING * size) * largest:
+    if largest <= least:
+        hides = step.observes and _may_matter(segments, p, top, least)
+        return _SPLIT if hides else _RESOLVED  # the peak of a fine sensor, between the points
+    rounding = min(_ROUNDING * (size + max(abs(a), abs(b)) / (b - a)), _MOST_ROUNDING)
+    if tail(segments.mass[p]) > (accuracy.relative + rounding) * largest:
         return _SPLIT
-    if step.moves and largest > least:
+    if step.moves:
         return _verdict_on_step(segments.mean[p], segments.sd[p], accuracy.relative)
     return _RESOLVED
 
