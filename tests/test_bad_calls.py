@@ -136,7 +136,10 @@ def cases():
 
 
 @pytest.mark.parametrize(("call", "arguments", "argument", "value"), list(cases()))
-def test_a_senseless_argument_is_refused_by_name(call, arguments, argument, value):
+def test_a_senseless_argument_is_refused_by_name(
+    call, arguments, argument, value, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # a call that takes a path for good must not write elsewhere
     names = f"{argument}|{ALSO_NAMED.get(argument, argument)}"
     with pytest.raises((psf.StateSpaceFiltersError, TypeError, ValueError)) as caught:
         call(**arguments | {argument: value})

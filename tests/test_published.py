@@ -55,7 +55,7 @@ def test_particles_agree_with_the_exact_value_of_ricker():
 def test_a_number_that_is_off_ends_the_run_with_its_name(monkeypatch):
     comparison, run = import_module("comparison"), import_module("run")
     wrong = comparison.Comparison("a number", 1.0, 0.1, 1.5)
-    study = comparison.Study("a study", "nobody", [wrong], 0.0)
+    study = comparison.Study("a study", "nobody", [wrong], 0.0, "")
     monkeypatch.setattr(run, "import_module", lambda name: type("m", (), {"study": lambda: study}))
     with pytest.raises(SystemExit, match=r"a study: a number \(z = \+5\.00\)"):
         run.main(["any"])

@@ -74,8 +74,8 @@ def study() -> Study:
             comparisons.append(Comparison(what, stored, sd, found.mean(), sd / N_RUNS**0.5))
     return Study(
         "blowflies, 193 counts",
-        "R package pomp 6.4; Nicholson (1957)",
+        "Nicholson (1957), after Brillinger et al. (1980); R package pomp 6.4",
         comparisons,
         seconds[0],
-        f"Ours is the mean of {N_RUNS} such runs; the error of the published one their spread.",
+        f"Ours is the mean of {N_RUNS} such runs, the error of the published one their spread.",
     )

@@ -32,7 +32,7 @@ class Study(NamedTuple):
     source: str
     comparisons: list[Comparison]
     seconds: float
-    notes: str = ""
+    notes: str
 
 
 @contextmanager
@@ -45,19 +45,14 @@ def cpu_seconds() -> Iterator[list[float]]:
 
 
 def table(studies: Iterable[Study]) -> str:
-    """Markdown, a row for each number."""
+    """Markdown: a row for each number, and what is to be said of each study."""
     lines = ["| what | published | error | ours | error | z | CPU s |", "| --- " * 7 + "|"]
     for study in studies:
         title, seconds = f"{study.title}: ", f"{study.seconds:.0f}"
         for c in study.comparisons:
-            ours = (
-                f"{c.ours:.5g} | {c.our_error:.2g}"
-                if abs(c.ours) < 100
-                else f"{c.ours:.3f} | {c.our_error:.2g}"
-            )
-            lines.append(
-                f"| {title}{c.quantity} | {c.published:.7g} | {c.published_error:.2g} | {ours} | "
-                f"{c.z:+.2f} | {seconds} |"
-            )
+            ours = f"{c.ours:.3f}" if abs(c.ours) > 100.0 else f"{c.ours:.5g}"
+            cells = f"{c.published:.7g}", f"{c.published_error:.2g}", ours, f"{c.our_error:.2g}"
+            lines.append(f"| {title}{c.quantity} | {' | '.join(cells)} | {c.z:+.2f} | {seconds} |")
             title = seconds = ""
-    return "\n".join(lines) + "\n"
+    notes = [f"- {study.title}: {study.source}. {study.notes}" for study in studies]
+    return "\n".join([*lines, "", *notes]) + "\n"

@@ -38,4 +38,5 @@ def study() -> Study:
             Comparison("the same, controlled SMC, one run", -250.695, 0.143, exact),
         ],
         seconds[0],
+        "The state has two modes.",
     )

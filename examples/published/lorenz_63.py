@@ -61,9 +61,11 @@ def study() -> Study:
     their_rate = THEIR_EFFECTIVE / THEIR_SECONDS
     return Study(
         "Lorenz 63, 30 observations",
-        "Drovandi et al. (2022)",
+        "Drovandi, Everitt, Golightly and Prangle, Bayesian Analysis 17 (2022)",
         comparisons,
         seconds[0],
-        f"{rate:.1f} effective draws per CPU second (the least of six parameters), theirs "
-        f"{their_rate:.3f} per second: {rate / their_rate:.0f} times as many.",
+        f"`GuidedPF(30)` and `sample_dram`; theirs is a bootstrap filter of 2500 particles. The "
+        f"error of a standard deviation counts the kurtosis. Ours gives {rate:.0f} effective draws "
+        f"per CPU second (the least of six parameters), theirs {their_rate:.3f} per second: "
+        f"{rate / their_rate:.0f} times as many.",
     )

@@ -57,10 +57,19 @@ def posterior() -> dict[str, tuple[float, float]]:
     }
 
 
+def spread(filter, sigma2: float) -> float:
+    """Standard deviation of the log-likelihood at alpha = 0.99 over runs of a particle filter."""
+    given, steps = {"alpha": 0.99, "sigma2": sigma2}, np.arange(len(COUNTS))
+    seeds = np.arange(N_RUNS)
+    terms = psf.log_likelihood(neurons, filter, given, COUNTS, steps=steps, seed=seeds)
+    return terms.sum(axis=-1).std(ddof=1)
+
+
 def study() -> Study:
     with cpu_seconds() as seconds:
         ours = log_likelihood(0.99, STORED.sigma2.to_numpy())
         found = posterior()
+        spreads = [spread(psf.GuidedPF(128), 0.12), spread(psf.BootstrapPF(5529), 0.12)]
     comparisons = [
         Comparison(
             f"log-likelihood at sigma^2 = {row.sigma2:g}", row.log_mean, row.sd / N_RUNS**0.5, value
@@ -78,7 +87,14 @@ def study() -> Study:
         )
     return Study(
         "neurons, 3000 counts",
-        "Heng et al. (2020); counts of Temereanca et al. (2008)",
+        "counts of Temereanca, Brown and Simons (2008); Heng, Bishop, Deligiannidis and Doucet, "
+        "Annals of Statistics 48 (2020)",
         comparisons,
         seconds[0],
+        "Their log-likelihoods are of 100 runs of controlled SMC with 128 particles, their "
+        "posterior of 100 000 iterations of particle Metropolis-Hastings, whose error assumes 2000 "
+        "independent draws. We took the priors alpha uniform and sigma^2 InverseGamma(1, 0.1). At "
+        f"sigma^2 = 0.12 a run has the standard deviation {spreads[0]:.2f} with `GuidedPF(128)`, "
+        "0.21 with their 128 particles in four passes; "
+        f"{spreads[1]:.2f} with `BootstrapPF(5529)`, 0.60 with theirs.",
     )

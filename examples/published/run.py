@@ -1,4 +1,4 @@
-"""Compute what others published, and compare: the table of ``docs/published.md``.
+"""Compute what others published, and compare: the table of ``docs/reference/published.md``.
 
 Run it with ``make published``. It fails if a number is more than three standard errors off. Names
 of studies behind it select some of them.
@@ -16,9 +16,9 @@ TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 
 def main(names: list[str]) -> None:
     studies = [import_module(name).study() for name in names or STUDIES]
-    found = table(studies) + "\n" + "\n".join(f"{s.title}: {s.notes}" for s in studies if s.notes)
+    found = table(studies)
     if not names:
-        TABLE.write_text(found + "\n")
+        TABLE.write_text(found)
     print(found)
     wrong = [
         f"{study.title}: {c.quantity} (z = {c.z:+.2f})"

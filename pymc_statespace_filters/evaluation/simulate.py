@@ -252,10 +252,12 @@ def simulate(
     )
 
 
-def _call(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *of: Any) -> Any:
+def _call(
+    run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *rest: Any
+) -> Any:
     """Call a simulator; in a thread if it takes long, so that an interrupt ends the wait."""
     is_long = steps.size > 0 and steps[-1] > _MANY_STEPS
-    return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *of)
+    return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *rest)
 
 
 def _simulate_panel(

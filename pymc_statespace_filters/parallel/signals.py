@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C where an exception could leave ranks waiting for each other."""
+"""Handling of Ctrl-C where an exception could be lost, or leave ranks waiting for each other."""
 
 import signal
 from collections.abc import Iterator

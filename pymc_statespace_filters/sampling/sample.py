@@ -164,6 +164,8 @@ def sample_dram(
         shape or outside its support.
     ParallelError
         If another rank has failed; the message names the rank, the chain and the error.
+    CheckpointError
+        If a file of the checkpoint cannot be written or read.
 
     Examples
     --------
@@ -267,7 +269,7 @@ def run_models(
 
     Raises
     ------
-    ModelError, DataMismatchError, ParallelError
+    ModelError, DataMismatchError, ParallelError, CheckpointError
         As `sample_dram`.
 
     Examples

@@ -23,8 +23,6 @@ importance, 0              95 %  93.5 to 96.0 % 94.5 to 96.0 % 93.5 to 96.5 %
 importance, 1              68 %  67.5 to 73.0 % 69.0 to 71.5 % 69.0 to 70.5 %
 importance, 1              95 %  95.5 to 97.5 % 95.0 to 97.0 % 95.5 to 98.0 %
 ========================== ===== ============== ============== ==============
-
-The bridge's errors without noise are right within sampling error, if short by some 8 %.
 """
 
 from functools import cache

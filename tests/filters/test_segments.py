@@ -38,43 +38,43 @@ def counted(d, rate):
     return lambda x: poisson.pmf(d, np.maximum(rate(x), 0.0)) * (rate(x) >= 0.0)
 
 
-LOG = psf.StateSpaceModel(
-    lambda x, q: [x[0] + 0.1 * pt.log(x[0]) + q[0]],
-    lambda x: [x[0]],
-    process_noise=[[0.01]],
-    observation_noise=[[0.04]],
-    initial_mean=[0.5],
-    initial_cov=[[0.09]],
+def system(transition, *, start, spread, noise=0.1, sensor=0.2, rate=None):
+    """One state, from N(start, spread^2), seen with normal errors or as counts at a rate."""
+    seen = {"observation": lambda x: [x[0]], "observation_noise": [[sensor**2]]}
+    if rate is not None:
+        seen = {"observation_dist": lambda x: [pm.Poisson.dist(mu=rate(x[0]))]}
+    return psf.StateSpaceModel(
+        lambda x, q: [transition(x[0], q[0])],
+        process_noise=[[noise**2]],
+        initial_mean=[start],
+        initial_cov=[[spread**2]],
+        **seen,
+    )
+
+
+def logarithmic(**settings):
+    return system(lambda x, q: x + 0.1 * pt.log(x) + q, start=0.5, spread=0.3, **settings)
+
+
+LOG = logarithmic()
+ROOT = system(lambda x, q: 0.9 * x + 0.2 * pt.sqrt(x) + q, start=0.3, spread=0.2)
+ROOT_NOISE = system(
+    lambda x, q: x + 0.1 * (1.0 - x) + 0.2 * pt.sqrt(x) * q, start=1.0, spread=0.1, noise=1.0
 )
-ROOT = psf.StateSpaceModel(
-    lambda x, q: [0.9 * x[0] + 0.2 * pt.sqrt(x[0]) + q[0]],
-    lambda x: [x[0]],
-    process_noise=[[0.01]],
-    observation_noise=[[0.04]],
-    initial_mean=[0.3],
-    initial_cov=[[0.04]],
+COUNTED = system(lambda x, q: 0.9 * x + q, start=0.4, spread=0.3, noise=0.2, rate=lambda x: 4.0 * x)
+RICKER = system(
+    lambda x, q: LOG_GROWTH + x - pt.exp(x) + q,
+    start=np.log(7.0),
+    spread=0.0,
+    noise=0.3,
+    rate=lambda x: 10.0 * pt.exp(x),
 )
-ROOT_NOISE = psf.StateSpaceModel(
-    lambda x, q: [x[0] + 0.1 * (1.0 - x[0]) + 0.2 * pt.sqrt(x[0]) * q[0]],
-    lambda x: [x[0]],
-    process_noise=[[1.0]],
-    observation_noise=[[0.04]],
-    initial_mean=[1.0],
-    initial_cov=[[0.01]],
-)
-COUNTED = psf.StateSpaceModel(
-    lambda x, q: [0.9 * x[0] + q[0]],
-    observation_dist=lambda x: [pm.Poisson.dist(mu=4.0 * x[0])],
-    process_noise=[[0.04]],
-    initial_mean=[0.4],
-    initial_cov=[[0.09]],
-)
-RICKER = psf.StateSpaceModel(
-    lambda x, q: [LOG_GROWTH + x[0] - pt.exp(x[0]) + q[0]],
-    observation_dist=lambda x: [pm.Poisson.dist(mu=10.0 * pt.exp(x[0]))],
-    process_noise=[[0.09]],
-    initial_mean=[np.log(7.0)],
-    initial_cov=[[0.0]],
+CLIPPED = system(
+    lambda x, q: 0.8 * x + q,
+    start=0.5,
+    spread=1.0,
+    noise=0.5,
+    rate=lambda x: pt.clip(3.0 * x, 0.1, 5.0),
 )
 
 STEPS, DATA = np.array([0, 1, 2, 3, 5, 8]), np.array([0.45, 0.5, np.nan, 0.2, 0.4, 0.5])
@@ -136,9 +136,9 @@ ATOL = {"root noise": 1e-6}
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-3])
 @pytest.mark.parametrize("name", CASES)
 def test_terms_are_those_of_dense_matrices(name, tolerance):
-    system, steps, observed, reference = case(name)
+    model, steps, observed, reference = case(name)
     terms = psf.log_likelihood(
-        system, psf.GridFilter(tolerance=tolerance), {}, observed, steps=steps
+        model, psf.GridFilter(tolerance=tolerance), {}, observed, steps=steps
     )
     atol = max(ATOL.get(name, 1e-8), tolerance)
     np.testing.assert_allclose(terms, np.array(reference.terms)[steps], rtol=0.0, atol=atol)
@@ -146,8 +146,8 @@ def test_terms_are_those_of_dense_matrices(name, tolerance):
 
 def compiled(name, method, *arguments):
     """A compiled function of the filter, as a function of further arguments."""
-    system, steps, observed, _ = case(name)
-    function = getattr(psf.GridFilter(), method)(compile_system(system), *arguments).function
+    model, steps, observed, _ = case(name)
+    function = getattr(psf.GridFilter(), method)(compile_system(model), *arguments).function
     record = np.empty(0), steps.astype(np.int64), observed[:, None], np.empty((steps[-1] + 1, 0))
     return lambda *rest: function(*record, 0.0, 0, *rest)
 
@@ -230,8 +230,8 @@ def test_laws_of_observations():
 
 
 def test_one_run_has_terms_and_filtered_states():
-    system, steps, observed, reference = case("ricker")
-    run = psf.run_filter(system, psf.GridFilter(), {}, observed, steps=steps)
+    model, steps, observed, reference = case("ricker")
+    run = psf.run_filter(model, psf.GridFilter(), {}, observed, steps=steps)
     np.testing.assert_allclose(run["log_likelihood"], np.array(reference.terms), atol=1e-8)
     law = reference.law("filtered")
     np.testing.assert_allclose(run["mean"].values[1:, 0], law.mean[1:], atol=1e-7)
@@ -240,14 +240,6 @@ def test_one_run_has_terms_and_filtered_states():
 @pytest.mark.parametrize("sd", [1e-4, 1e-6, 1e-8])
 def test_a_fine_sensor_reads_the_density(sd):
     """Between the points of the first segments, its likelihood is below any double."""
-    system = psf.StateSpaceModel(
-        lambda x, q: [x[0] + 0.1 * pt.log(x[0]) + q[0]],
-        lambda x: [x[0]],
-        process_noise=[[0.01]],
-        observation_noise=[[sd**2]],
-        initial_mean=[0.5],
-        initial_cov=[[0.09]],
-    )
     mean, start = lambda x: x + 0.1 * np.log(x), lambda x: norm.pdf(x, 0.5, 0.3)
     reference = FixedNodes(edges(-3.0, 4.0, 0.04), mean, lambda x: 0.1, start, [None] * 3)
     before, density = reference.predicted_density[1:]
@@ -255,7 +247,7 @@ def test_a_fine_sensor_reads_the_density(sd):
     for d in (-0.4, 0.0, 0.1, 0.45, 1.2):
         i = np.argmin(np.abs(reference.x - d))
         (term,) = psf.log_likelihood(
-            system, psf.GridFilter(), {}, [reference.x[i]], steps=np.array([2])
+            logarithmic(sensor=sd), psf.GridFilter(), {}, [reference.x[i]], steps=np.array([2])
         )
         np.testing.assert_allclose(term, log_density[i], rtol=0.0, atol=1e-6)
 
@@ -270,13 +262,6 @@ def test_an_observation_beyond_what_doubles_hold_is_named(far):
 
 def test_a_sensor_may_have_kinks_and_jumps():
     """A detector that sees nothing below zero, and a limit of its range."""
-    system = psf.StateSpaceModel(
-        lambda x, q: [0.8 * x[0] + q[0]],
-        observation_dist=lambda x: [pm.Poisson.dist(mu=pt.clip(3.0 * x[0], 0.1, 5.0))],
-        process_noise=[[0.25]],
-        initial_mean=[0.5],
-        initial_cov=[[1.0]],
-    )
     counts = np.array([2.0, 0.0, 7.0, 1.0])
     breaks = [*np.linspace(-8.0, 0.1 / 3.0, 160), *np.linspace(0.1 / 3.0, 5.0 / 3.0, 40)[1:]]
     reference = FixedNodes(
@@ -286,5 +271,5 @@ def test_a_sensor_may_have_kinks_and_jumps():
         lambda x: norm.pdf(x, 0.5, 1.0),
         [counted(d, lambda x: np.clip(3.0 * x, 0.1, 5.0)) for d in counts],
     )
-    terms = psf.log_likelihood(system, psf.GridFilter(), {}, counts, steps=np.arange(4))
+    terms = psf.log_likelihood(CLIPPED, psf.GridFilter(), {}, counts, steps=np.arange(4))
     np.testing.assert_allclose(terms, reference.terms, rtol=0.0, atol=1e-5)

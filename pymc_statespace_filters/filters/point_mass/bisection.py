@@ -29,7 +29,7 @@ from pymc_statespace_filters.filters.system_table import log_density, step_momen
 _WIDEST = 4.0
 _DEPTH = 2200  # bisections of the range of doubles
 _ROUNDING = 1e-14  # of a log-likelihood and of a point, relative
-_MOST_ROUNDING = 1e-3  # far from the peak of a fine sensor it would excuse everything
+_MOST_ROUNDING = 1e-3  # where log-likelihoods are large, far from the peak of a fine sensor
 _RESOLVED, _SPLIT, _NO_NOISE = range(3)
 
 
@@ -232,8 +232,9 @@ def _verdict(segments, p, step, top, total, accuracy):
         if segments.mass[p, i] > 0.0:
             size = max(size, abs(segments.log_likelihood[p, i]))
     if largest <= least:
-        hides = step.observes and _may_matter(segments, p, top, least)
-        return _SPLIT if hides else _RESOLVED  # the peak of a fine sensor, between the points
+        # The peak of a fine sensor may lie between the points.
+        hides_peak = step.observes and _may_matter(segments, p, top, least)
+        return _SPLIT if hides_peak else _RESOLVED
     rounding = min(_ROUNDING * (size + max(abs(a), abs(b)) / (b - a)), _MOST_ROUNDING)
     if tail(segments.mass[p]) > (accuracy.relative + rounding) * largest:
         return _SPLIT

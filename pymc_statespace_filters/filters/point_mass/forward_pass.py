@@ -55,7 +55,7 @@ def discard(tape, k, grid, updated):
 
 @njit_internal
 def first_grid(system, steps, t0, tolerance):
-    """Of the first attempt: the spacing that the first step requires.
+    """The settings of the first attempt, with the spacing that the first step requires.
 
     The step is taken from the initial mean and one standard deviation to either side, see
     `grid.aliasing`.

@@ -96,7 +96,8 @@ def _attempt(system, steps, observed, t0, reach, floor, tolerance, terms, keep, 
     one = np.zeros((1, POINTS))
     one[0, 0] = 1.0
     source = mixture(np.full((1, POINTS), mean), np.full((1, POINTS), sd), one, reach, 0.0, 0.0)
-    most_surprise, log_left = np.inf, 0.0  # log of the mass that remains since the last observation
+    most_surprise = np.inf
+    log_left = 0.0  # log of the mass that remains since the last observation
     j, n_cuts = np.int64(0), 0
     for k in range(steps[-1] + 1):
         is_row = steps[j] == k
