@@ -78,6 +78,7 @@ CLIPPED = system(
 )
 
 STEPS, DATA = np.array([0, 1, 2, 3, 5, 8]), np.array([0.45, 0.5, np.nan, 0.2, 0.4, 0.5])
+SURPRISING = np.array([0.45, 0.5, np.nan, 2.3, 0.4, 0.5])  # needs a longer reach
 COUNTS = np.array([1.0, 0.0, np.nan, 2.0, 0.0, 3.0])
 # Towards zero ever narrower: there the logarithm and the root bend without limit.
 NEAR_ZERO = np.append(0.0, 0.5 ** np.arange(40, 5, -1.0))
@@ -110,10 +111,11 @@ def case(name):
             [counted(d, lambda x: 10.0 * np.exp(x)) for d in counts],
         )
         return RICKER, np.arange(counts.size), counts, reference
-    if name == "log":
+    if name.startswith("log"):
+        data = SURPRISING if name == "log, surprise" else DATA
         mean, sd = lambda x: x + 0.1 * np.log(x), lambda x: 0.1
-        start, rows = lambda x: norm.pdf(x, 0.5, 0.3), by_step(gaussian)
-        return LOG, STEPS, DATA, FixedNodes(edges(-3.0, 4.0, 0.04), mean, sd, start, rows)
+        start, rows = lambda x: norm.pdf(x, 0.5, 0.3), by_step(gaussian, data)
+        return LOG, STEPS, data, FixedNodes(edges(-3.0, 4.0, 0.04), mean, sd, start, rows)
     if name == "root":
         mean, sd = lambda x: 0.9 * x + 0.2 * np.sqrt(x), lambda x: 0.1
         start, rows = lambda x: norm.pdf(x, 0.3, 0.2), by_step(gaussian)
@@ -128,7 +130,7 @@ def case(name):
     return COUNTED, STEPS, COUNTS, FixedNodes(edges(-4.0, 5.0, 0.04), mean, sd, start, rows)
 
 
-CASES = ("ricker", "log", "root", "root noise", "counted")
+CASES = ("ricker", "log", "log, surprise", "root", "root noise", "counted")
 # Beside the root, dense matrices with noise that vanishes are themselves good to 1e-7.
 ATOL = {"root noise": 1e-6}
 
@@ -214,9 +216,10 @@ def test_smoothed_draws_are_trajectories():
     assert abs(product.mean() - reference.mean_product(4)) < 4.5 * error
 
 
-def test_laws_of_observations():
-    _, steps, observed, reference = case("log")
-    mean, cov, below, above = compiled("log", "compile_predictions")()
+@pytest.mark.parametrize("name", ["log", "log, surprise"])
+def test_laws_of_observations(name):
+    _, steps, observed, reference = case(name)
+    mean, cov, below, above = compiled(name, "compile_predictions")()
     x, weights = reference.x, reference.weights
     for j, k in enumerate(steps):
         mass = reference.law("predicted").density[k] * weights
@@ -250,6 +253,28 @@ def test_a_fine_sensor_reads_the_density(sd):
             logarithmic(sensor=sd), psf.GridFilter(), {}, [reference.x[i]], steps=np.array([2])
         )
         np.testing.assert_allclose(term, log_density[i], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("sd", [1e-4, 1e-6])
+def test_a_fine_sensor_that_loses_the_sign_reads_both_densities(sd):
+    """Of the second peak no point has any mass beside the first."""
+    model = psf.StateSpaceModel(
+        lambda x, q: [x[0] + 0.1 * pt.log(x[0]) + q[0]],
+        lambda x: [x[0] ** 2],
+        process_noise=[[0.01]],
+        observation_noise=[[sd**2]],
+        initial_mean=[0.3],
+        initial_cov=[[0.09]],
+    )
+    mean, start = lambda x: x + 0.1 * np.log(x), lambda x: norm.pdf(x, 0.3, 0.3)
+    for root in (0.2, 0.31, 0.4):
+        ends = np.unique([*edges(-3.0, 4.0, 0.04), -root, root])
+        at = FixedNodes(ends, mean, lambda x: 0.1, start, [None] * 3)
+        before, density = at.predicted_density[1:]
+        both = np.interp([-root, root], at.x, density).sum() / (2.0 * root)
+        (term,) = psf.log_likelihood(model, psf.GridFilter(), {}, [root**2], steps=np.array([2]))
+        exact = np.log(both * (before @ at.weights))
+        np.testing.assert_allclose(term, exact, rtol=0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("far", [30.0, 1e6])

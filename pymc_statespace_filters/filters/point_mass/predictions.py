@@ -82,7 +82,6 @@ def _grid_predictions(
     place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
     terms, tape = np.empty(J), (system, at, record, t0, laws)
     while place != END:
-        laws.next[0] = 0
         if place == ON_SEGMENTS:
             code, j = pass_on_segments(
                 system, at, record, t0, tolerance, terms, _predict_on_segments, tape
@@ -114,10 +113,7 @@ def _predict(tape, k, grid, updated):
 
 @njit_internal
 def _predict_on_segments(tape, k, segments):
-    """The same from segments; a pass may be repeated from step 0 on."""
-    laws = tape[4]
-    if k == 0:
-        laws.next[0] = 0
+    """The same from segments."""
     n = segments.low.size
     X = np.empty((1, n * POINTS))
     for p in range(n):
@@ -132,6 +128,8 @@ def _write_law(tape, k, X, mass, n_together):
     So many points in turn lie beside each other, and the next ones may be elsewhere.
     """
     system, steps, observed, t0, laws = tape
+    if k == 0:  # the first pass, or a repeated one
+        laws.next[0] = 0
     j = laws.next[0]
     if j == steps.size or steps[j] != k:
         return

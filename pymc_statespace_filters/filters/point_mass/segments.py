@@ -93,7 +93,6 @@ def points_of(low, high, out):
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     for i in range(POINTS):
         out[i] = centre + half * _NODES[i]
-    out[0], out[POINTS - 1] = low, high
 
 
 @njit_internal
