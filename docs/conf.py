@@ -21,6 +21,7 @@ author = "The pymc-statespace-filters developers"
 release = version = installed_version(project)
 
 extensions = [
+    "gallery",  # docs/gallery.py
     "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
@@ -73,7 +74,7 @@ html_theme_options = {
     "navbar_end": ["theme-switcher"],
     # A field would wrap the header at 1280 px.
     "navbar_persistent": ["search-button"],
-    "secondary_sidebar_items": ["page-toc"],
+    "secondary_sidebar_items": {"**": ["page-toc"], "index": []},
     "show_nav_level": 2,
 }
 
