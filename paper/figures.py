@@ -60,7 +60,7 @@ def along_alpha(axes: Axes, case, alphas: np.ndarray, n_seeds: int) -> None:
     axes.plot(alphas, exact[:, 0], "k--", label="GridFilter (exact)")
     axes.axvline(case.given["alpha"], color="k", lw=0.6, ls=":")
     axes.set(xlabel="α", ylabel="log-likelihood [nats]", xlim=alphas[[0, -1]], ylim=(-58, -11))
-    axes.legend(frameon=False, fontsize=8, handlelength=1.5, loc="lower left")
+    axes.legend(frameon=False, fontsize=8, handlelength=1.3, borderaxespad=0.2, loc="lower left")
 
 
 def error_against_time(axes: Axes, case, sizes: tuple[int, ...]) -> None:
@@ -81,7 +81,7 @@ def error_against_time(axes: Axes, case, sizes: tuple[int, ...]) -> None:
         xscale="log",
         yscale="log",
     )
-    axes.legend(frameon=False, fontsize=8, handlelength=1.5, loc="lower left")
+    axes.legend(frameon=False, fontsize=8, handlelength=1.3, borderaxespad=0.2, loc="lower left")
 
 
 def draw(
