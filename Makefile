@@ -4,6 +4,8 @@ VENV   ?= .venv
 LATEST ?= .venv-latest
 # Environments of the packages that `make bench` compares with; benchmarks/ looks for these names.
 BENCH  := .venv-bench
+# Environment of pandoc and typst, which `make preview` alone needs.
+PREVIEW := .venv-preview
 
 # Use the first of these that runs, has a version supported by PyMC and can create environments.
 CANDIDATES = python3 python3.14 python3.13 python3.12
@@ -25,7 +27,7 @@ EXECUTE = cache
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
-.PHONY: help environment demo demo-quick thesis thesis-quick published test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
+.PHONY: help environment demo demo-quick thesis thesis-quick published paper preview test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -46,6 +48,12 @@ thesis-quick: $(VENV)/.installed  ## the same in a short form; takes minutes, fa
 
 published: $(VENV)/.installed  ## compute what others published, and compare; takes three minutes, fails if a number is off
 	$(IN)/python examples/published/run.py $(ARGS)
+
+paper: $(VENV)/.installed  ## draw the figure of the paper, in paper/; takes half a minute
+	$(IN)/python -m paper.figures
+
+preview: $(PREVIEW)/.installed  ## render the paper as out/paper.pdf
+	$(PREVIEW)/bin/python paper/preview.py
 
 test: $(VENV)/.installed  ## run the tests, in two processes
 	$(IN)/python $(PYTEST)
@@ -107,6 +115,12 @@ $(BENCH)/.installed $(BENCH)-pymc-extras/.installed:
 	$(@D)/bin/pip install --quiet --disable-pip-version-check -r $< || \
 	  while read -r line; do case $$line in \#*) ;; *) \
 	    $(@D)/bin/pip install --quiet --disable-pip-version-check --no-deps "$$line" || true;; esac; done < $<
+	touch $@
+
+$(PREVIEW)/.installed: paper/requirements.txt
+	@$(if $(PYTHON),,$(NO_PYTHON))
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check -r $<
 	touch $@
 
 $(LATEST)/.exists:
