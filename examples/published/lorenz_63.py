@@ -12,8 +12,7 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
-from scipy.stats import kurtosis
+from comparison import Study, correlation_of_moments, cpu_seconds, moments
 
 import pymc_statespace_filters as psf
 
@@ -48,15 +47,12 @@ def study() -> Study:
             idata = psf.sample_dram(5000, tune=2000, chains=4, random_seed=1, progressbar=False)
     draws = {name: np.log(idata["posterior"][name].values) for name in NAMES}
     effective = {name: float(az.ess(x)) for name, x in draws.items()}
-    comparisons = []
-    for name, mean, sd in zip(NAMES, MEANS, SDS, strict=True):
-        x, n = draws[name], effective[name]
-        theirs, ours = sd / THEIR_EFFECTIVE**0.5, x.std() / n**0.5
-        comparisons.append(Comparison(f"mean of log {name}", mean, theirs, x.mean(), ours))
-        # Of a standard deviation, relative to that of a mean: by the kurtosis.
-        relative = 0.5 * np.sqrt(kurtosis(x, axis=None, fisher=False) - 1.0)
-        errors = relative * theirs, relative * ours
-        comparisons.append(Comparison("its standard deviation", sd, errors[0], x.std(), errors[1]))
+    stored = zip(NAMES, MEANS, SDS, strict=True)
+    comparisons = [
+        comparison
+        for name, mean, sd in stored
+        for comparison in moments(f"log {name}", draws[name], mean, sd, THEIR_EFFECTIVE)
+    ]
     rate = min(effective.values()) / seconds[0]
     their_rate = THEIR_EFFECTIVE / THEIR_SECONDS
     return Study(
@@ -68,4 +64,5 @@ def study() -> Study:
         f"error of a standard deviation counts the kurtosis. Ours gives {rate:.0f} effective draws "
         f"per CPU second (the least of six parameters), theirs {their_rate:.3f} per second: "
         f"{rate / their_rate:.0f} times as many.",
+        correlation_of_moments(draws.values()),
     )

@@ -79,12 +79,11 @@ def study() -> Study:
     # Of a chain of 100 000 that accepts a fifth: some 2000 independent draws.
     independent = 2000
     for name, mean, sd in (("alpha", 0.99802, 0.00102), ("sigma2", 0.1018, 0.0099)):
-        comparisons.append(
-            Comparison(f"posterior mean of {name}", mean, sd / independent**0.5, found[name][0])
-        )
-        comparisons.append(
-            Comparison("its standard deviation", sd, sd / (2 * independent) ** 0.5, found[name][1])
-        )
+        for what, published, error, ours in (
+            (f"posterior mean of {name}", mean, sd / independent**0.5, found[name][0]),
+            ("its standard deviation", sd, sd / (2 * independent) ** 0.5, found[name][1]),
+        ):
+            comparisons.append(Comparison(what, published, error, ours, by_chance=False))
     return Study(
         "neurons, 3000 counts",
         "counts of Temereanca, Brown and Simons (2008); Heng, Bishop, Deligiannidis and Doucet, "
