@@ -28,6 +28,7 @@ def scripts(monkeypatch):
         "kitagawa",
         "ricker",
         "blowflies",
+        "kangaroos",
         pytest.param("neurons", marks=pytest.mark.slow),
         pytest.param("lorenz_63", marks=pytest.mark.slow),
     ],

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from comparison import LARGEST_Z, table
 
-STUDIES = ("neurons", "lorenz_63", "kitagawa", "ricker", "blowflies")
+STUDIES = ("neurons", "lorenz_63", "kitagawa", "ricker", "blowflies", "kangaroos")
 TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 
 
