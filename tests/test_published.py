@@ -29,6 +29,7 @@ def scripts(monkeypatch):
         "ricker",
         "blowflies",
         "armadillo",
+        "kangaroos",
         pytest.param("neurons", marks=pytest.mark.slow),
         pytest.param("lorenz_63", marks=pytest.mark.slow),
         pytest.param("measles", marks=pytest.mark.slow),

@@ -20,6 +20,7 @@ STUDIES = (
     "measles",
     "lynx_hare",
     "armadillo",
+    "kangaroos",
 )
 TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 
