@@ -17,7 +17,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.experimental.buffer_callback import buffer_callback
 from pytensor.link.jax.dispatch import jax_funcify
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.base import HEALTH_SIZE
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood
 from pymc_statespace_filters.ops.likelihood import (
@@ -50,8 +50,9 @@ def _likelihood(op: LogLikelihood, **_: Any) -> Callable:
     def forward(*inputs):
         check_has_gradient(op)
         if any(given.perturbed for given in inputs[1:]):
-            raise NotImplementedError(
-                f"{op} has a gradient by its parameters only, not by data, inputs or t0"
+            raise GradientUnavailableError(
+                "The likelihood has a gradient by the parameters of the system only, not by its "
+                "data, inputs or t0."
             )
         numbers = [given.value for given in inputs]
         return likelihood(*numbers), numbers
@@ -102,33 +103,39 @@ def _pullback(op: TapePullback, **_: Any) -> Callable:
     return lambda *inputs: gradient(*inputs[:-2], inputs[-1])
 
 
-def _on_host(function: Callable, shapes: Shapes, *inputs: Any) -> list[Any]:
-    """Results of these shapes, by a function of NumPy arrays; a `jax.vmap` calls it once.
-
-    `jax.pure_callback` would take ten times as long for its copies of arrays. On the processor they
-    would also be made by the threads that wait for the function, so that chains in parallel could
-    wait for each other forever. Other devices have memory of their own, and need the copies.
-    """
+def _on_host(function: Callable, shapes: Shapes, *inputs: Any) -> Sequence[Any]:
+    """Results of these shapes, by a function of NumPy arrays; a `jax.vmap` calls it once."""
     if not jax.config.jax_enable_x64:
         raise ModelError(
-            "JAX computes in single precision here, which would lose the digits of the "
-            "likelihood; keep jax.config.update('jax_enable_x64', True), which PyTensor sets "
-            "where pytensor.config.floatX is 'float64'"
+            "JAX computes in single precision here, which would lose digits of the likelihood; "
+            "keep jax.config.update('jax_enable_x64', True), which PyTensor sets where "
+            "pytensor.config.floatX is 'float64'"
         )
     results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
-    in_place = buffer_callback(partial(_write, function), results, vmap_method="expand_dims")
-
-    def by_copies(*numbers):
-        call = partial(_call, function)
-        return jax.pure_callback(call, results, *numbers, vmap_method="expand_dims")
-
-    return jax.lax.platform_dependent(*inputs, cpu=in_place, default=by_copies)
+    return jax.lax.platform_dependent(
+        *inputs, cpu=_in_place(function, results), default=_by_copies(function, results)
+    )
 
 
-def _call(function: Callable, *inputs: Any) -> list[np.ndarray]:
-    return function(*map(np.asarray, inputs))
+def _in_place(function: Callable, results: Sequence[jax.ShapeDtypeStruct]) -> Callable:
+    """The function in JAX on the processor, where it reads and writes the memory of JAX itself.
+
+    `_by_copies` takes ten times as long. And JAX makes the copies in the threads that run the
+    functions, which may then wait for each other forever if several chains are sampled at once.
+    """
+
+    def write(_, outputs, *inputs):
+        values = function(*map(np.asarray, inputs))
+        for output, value in zip(outputs, values, strict=True):
+            np.asarray(output)[...] = value
+
+    return buffer_callback(write, results, vmap_method="expand_dims")
 
 
-def _write(function: Callable, _: Any, results: Sequence[Any], *inputs: Any) -> None:
-    for result, value in zip(results, _call(function, *inputs), strict=True):
-        np.asarray(result)[...] = value
+def _by_copies(function: Callable, results: Sequence[jax.ShapeDtypeStruct]) -> Callable:
+    """The function in JAX on a device with a memory of its own, a GPU."""
+
+    def call(*inputs):
+        return function(*map(np.asarray, inputs))
+
+    return partial(jax.pure_callback, call, results, vmap_method="expand_dims")

@@ -10,7 +10,6 @@ from math import prod
 
 import numpy as np
 
-from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.protocol import BatchFilter, PanelFilter
 from pymc_statespace_filters.ops.base import FilterOp, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood
@@ -23,85 +22,96 @@ from pymc_statespace_filters.ops.panel import (
 from pymc_statespace_filters.system.panel import N_COLUMNS, RECORD, STEP
 
 type Arrays = Sequence[np.ndarray]
+type Shape = tuple[int, ...]
 
 
 def values(op: LogLikelihood, *arguments: np.ndarray) -> list[np.ndarray]:
     """Terms (.., J) and health (.., 3)."""
-    shape = _leading_shape(op, arguments)
-    theta, record = arguments[0], _shared(op, arguments[1:], shape)
-    if record is not None:
+    shape, cores = _shapes(op, arguments)
+    if prod(shape) > 1 and (record := _shared(arguments[1:], cores[1:])):
+        thetas = arguments[0].reshape(-1, *cores[0])
         if type(op) is LogLikelihood and isinstance(op.filter, BatchFilter):
-            batch = evaluator(BatchLogLikelihood(op.system, op.filter))
-            results = batch(theta.reshape(-1, theta.shape[-1]), *record)
-            return [result.reshape(*shape, result.shape[-1]) for result in results]
+            results = evaluator(BatchLogLikelihood(op.system, op.filter))(thetas, *record)
+            return [result.reshape(shape + result.shape[1:]) for result in results]
         if isinstance(op, PanelLogLikelihood) and isinstance(op.filter, PanelFilter):
-            terms, health = evaluator(op)(*_one_panel(theta, record))
-            # The health of a panel is that of its first failing record.
-            if health[1] == NONE:
-                return [terms.reshape(*shape, -1), np.broadcast_to(health, (*shape, *health.shape))]
-    return _in_turn(op, arguments, shape)
+            evaluate = evaluator(op)
+            terms, health = evaluate(*_one_panel(thetas, record))
+            terms, health = terms.reshape(len(thetas), -1), np.tile(health, (len(thetas), 1))
+            if not np.isfinite(terms).all():  # the health is that of the first record that fails
+                health[:] = [evaluate(theta, *record)[1] for theta in thetas]
+            return [result.reshape(shape + result.shape[1:]) for result in (terms, health)]
+    return _in_turn(op, arguments, shape, cores)
 
 
 def gradients(op: LogLikelihoodGradient, *arguments: np.ndarray) -> list[np.ndarray]:
-    """The cotangent of theta; the last argument is that of the terms (.., J)."""
-    shape = _leading_shape(op, arguments)
-    theta, terms_bar, record = arguments[0], arguments[-1], _shared(op, arguments[1:-1], shape)
-    if record is not None and isinstance(op.filter, PanelFilter):
-        thetas = np.broadcast_to(theta, shape + _core(op, theta, 0))
-        panel = _one_panel(thetas, record)
-        _, health, tape = evaluator(TapedPanelLogLikelihood(op.system, op.filter))(*panel)
-        # Where one record of a panel fails there is no tape of the others.
-        if health[1] == NONE:
-            bars = np.broadcast_to(terms_bar, (*shape, terms_bar.shape[-1])).ravel()
-            pullback = evaluator(PanelTapePullback(op.system, op.filter))
-            return [pullback(*panel, tape, bars)[0].reshape(thetas.shape)]
-    return _in_turn(op, arguments, shape)
+    """The cotangent of theta (.., k) or (.., G, k); the last argument is that of the terms."""
+    shape, cores = _shapes(op, arguments)
+    if prod(shape) > 1 and isinstance(op.filter, PanelFilter):
+        if record := _shared(arguments[1:-1], cores[1:-1]):
+            thetas, terms_bar = (
+                np.broadcast_to(arguments[i], shape + cores[i]).reshape(-1, *cores[i])
+                for i in (0, -1)
+            )
+            return [_side_by_side(op, thetas, record, terms_bar).reshape(shape + cores[0])]
+    return _in_turn(op, arguments, shape, cores)
 
 
-def _core(op: FilterOp, value: np.ndarray, i: int) -> tuple[int, ...]:
-    """The shape of argument ``i`` without its leading dimensions."""
-    return value.shape[value.ndim - op.input_types[i][2] :]
+def _side_by_side(
+    op: LogLikelihoodGradient, thetas: np.ndarray, record: Arrays, terms_bar: np.ndarray
+) -> np.ndarray:
+    """The gradients at several points; zero where the filter fails, as at a single one."""
+    panel = _one_panel(thetas, record)
+    terms, _, tape = evaluator(TapedPanelLogLikelihood(op.system, op.filter))(*panel)
+    succeeds = np.isfinite(terms.reshape(len(thetas), -1)).all(axis=1)
+    if succeeds.all():
+        pullback = evaluator(PanelTapePullback(op.system, op.filter))
+        return pullback(*panel, tape, terms_bar.ravel())[0]
+    theta_bar = np.zeros(thetas.shape)
+    if succeeds.any():  # a panel with a record that fails has no tape
+        theta_bar[succeeds] = _side_by_side(
+            op, thetas[succeeds], record, terms_bar[succeeds]
+        ).reshape(-1, *thetas.shape[1:])
+    return theta_bar
 
 
-def _leading_shape(op: FilterOp, arguments: Arrays) -> tuple[int, ...]:
-    ndims = [ndim for _, _, ndim in op.input_types]
-    leading = (a.shape[: a.ndim - n] for a, n in zip(arguments, ndims, strict=True))
-    return np.broadcast_shapes(*leading)
+def _shapes(op: FilterOp, arguments: Arrays) -> tuple[Shape, list[Shape]]:
+    """The leading shape of all arguments together, and the shape of each without it."""
+    n_leading = [a.ndim - n for a, (_, _, n) in zip(arguments, op.input_types, strict=True)]
+    cores = [a.shape[n:] for a, n in zip(arguments, n_leading, strict=True)]
+    if not any(n_leading):
+        return (), cores
+    leading = (a.shape[:n] for a, n in zip(arguments, n_leading, strict=True))
+    return np.broadcast_shapes(*leading), cores
 
 
-def _shared(op: FilterOp, record: Arrays, shape: tuple[int, ...]) -> list[np.ndarray] | None:
-    """The record of several points without leading dimensions, if they share one with rows."""
-    if prod(shape) < 2:
-        return None
-    cores = [_core(op, value, i) for i, value in enumerate(record, start=1)]
-    if not all(value.size == prod(core) for value, core in zip(record, cores, strict=True)):
-        return None
+def _shared(record: Arrays, cores: Sequence[Shape]) -> list[np.ndarray]:
+    """A record of these shapes; empty if it differs between points, or has no rows."""
+    if any(value.size != prod(core) for value, core in zip(record, cores, strict=True)):
+        return []
     shared = [value.reshape(core) for value, core in zip(record, cores, strict=True)]
-    return shared if len(shared[0]) else None
+    return shared if len(shared[0]) else []
 
 
-def _one_panel(theta: np.ndarray, record: Arrays) -> tuple[np.ndarray, ...]:
-    """The records of all points below each other, as one panel; theta (.., k) or (.., G, k)."""
+def _one_panel(thetas: np.ndarray, record: Arrays) -> tuple[np.ndarray, ...]:
+    """The records of all points below each other, as those of one panel."""
     steps, observed, *others = record
     rows = steps
     if steps.ndim == 1:
         rows = np.zeros((len(steps), N_COLUMNS), np.int64)
         rows[:, STEP] = steps
     number = np.cumsum(np.diff(rows[:, RECORD], prepend=rows[0, RECORD]) != 0)
-    n_records = number[-1] + 1
-    thetas = theta.reshape(-1, theta.shape[-1])
-    n_points = len(thetas) // n_records
+    n_points, n_records = len(thetas), number[-1] + 1
     table = np.tile(rows, (n_points, 1))
     table[:, RECORD] = np.add.outer(np.arange(n_points) * n_records, number).ravel()
-    return thetas, table, np.tile(observed, (n_points, 1)), *others
+    below = thetas.reshape(-1, thetas.shape[-1])
+    return below, table, np.tile(observed, (n_points, 1)), *others
 
 
-def _in_turn(op: FilterOp, arguments: Arrays, shape: tuple[int, ...]) -> list[np.ndarray]:
+def _in_turn(op: FilterOp, arguments: Arrays, shape: Shape, cores: list[Shape]) -> list[np.ndarray]:
     evaluate = evaluator(op)
-    if not shape:
-        return list(evaluate(*arguments))
-    at_points = [
-        np.broadcast_to(value, shape + _core(op, value, i)) for i, value in enumerate(arguments)
-    ]
-    results = [evaluate(*(value[i] for value in at_points)) for i in np.ndindex(shape)]
-    return [np.reshape(one, shape + one[0].shape) for one in zip(*results, strict=True)]
+    if prod(shape) == 1:
+        results = evaluate(*(a.reshape(core) for a, core in zip(arguments, cores, strict=True)))
+        return [result.reshape(shape + result.shape) for result in results]
+    each = [np.broadcast_to(a, shape + core) for a, core in zip(arguments, cores, strict=True)]
+    points = [evaluate(*(value[i] for value in each)) for i in np.ndindex(shape)]
+    return [np.reshape(of_all, shape + of_all[0].shape) for of_all in zip(*points, strict=True)]
