@@ -56,7 +56,9 @@ def imports_from_elsewhere():
 
 
 def test_imported_distributions_are_the_declared_dependencies():
-    declared = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependencies"]}
+    optional = [line for line in PROJECT["optional-dependencies"]["jax"] if line.startswith("jax")]
+    lines = [*PROJECT["dependencies"], *optional]
+    declared = {canonicalize_name(Requirement(line).name) for line in lines}
     imported = {
         canonicalize_name(module.partition(".")[0]) for module, _ in imports_from_elsewhere()
     }
@@ -68,6 +70,7 @@ INSIDES = ("llvmlite", "numba.core", "numba.extending", "pytensor.link")
 TOUCH_INSIDES = {
     # how operations and the random variable become machine code
     "ops/base.py": "pytensor.link",
+    "ops/jax.py": "pytensor.link",
     "pymc_model/dispatch.py": "pytensor.link",
     # the name of the processor that numba compiles for
     "parallel/environment.py": "numba.core",
@@ -91,8 +94,10 @@ def test_the_insides_of_numba_and_pytensor_are_met_in_the_compiler_alone():
     assert outside == set()
 
 
-def test_importing_is_silent_and_leaves_mpi_alone():
-    script = "import sys, pymc_statespace_filters; sys.exit('mpi4py' in sys.modules)"
+def test_importing_is_silent_and_leaves_mpi_and_jax_alone():
+    script = (
+        "import sys, pymc_statespace_filters; sys.exit(bool({'mpi4py', 'jax'} & set(sys.modules)))"
+    )
     command = [sys.executable, "-W", "error", "-c", script]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

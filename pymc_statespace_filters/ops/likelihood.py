@@ -59,16 +59,7 @@ class LogLikelihood(FilterOp):
         cotangents: Sequence[Variable],
     ) -> list[Variable]:
         """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
-        if not self.filter.has_gradient:
-            what = "is a random estimate without a" if self.filter.noisy else "does not come with a"
-            filters = filters_for(compile_system(self.system))
-            with_gradient = listed(f for f in filters if f.has_gradient)
-            remedy = f", or take a filter with a gradient: {with_gradient}" if with_gradient else ""
-            raise GradientUnavailableError(
-                f"The likelihood by {short_form(self.filter)} {what} gradient, so NUTS, HMC, "
-                f"nutpie and find_MAP cannot use it. Sample with psf.sample_dram() or "
-                f"pm.sample(step=psf.DRAM()){remedy}."
-            )
+        check_has_gradient(self)
         terms_bar = cotangents[0]
         if isinstance(terms_bar.type, DisconnectedType):
             theta_bar = pt.zeros_like(inputs[0])
@@ -79,6 +70,20 @@ class LogLikelihood(FilterOp):
     def gradient(self) -> "LogLikelihoodGradient":
         """The operation of the vector-Jacobian product."""
         return LogLikelihoodGradient(self.system, self.filter)
+
+
+def check_has_gradient(op: LogLikelihood) -> None:
+    """Raise, and name samplers that need none, unless the likelihood has a gradient."""
+    if op.filter.has_gradient:
+        return
+    what = "is a random estimate without a" if op.filter.noisy else "does not come with a"
+    with_gradient = listed(f for f in filters_for(compile_system(op.system)) if f.has_gradient)
+    remedy = f", or take a filter with a gradient: {with_gradient}" if with_gradient else ""
+    raise GradientUnavailableError(
+        f"The likelihood by {short_form(op.filter)} {what} gradient, so NUTS, HMC, "
+        f"nutpie and find_MAP cannot use it. Sample with psf.sample_dram() or "
+        f"pm.sample(step=psf.DRAM()){remedy}."
+    )
 
 
 class LogLikelihoodGradient(ThetaDerivative):
