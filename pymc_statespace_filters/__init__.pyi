@@ -62,6 +62,8 @@ from .system.panel_frame import panel_from
 from .system.second_order import second_order
 from .system.steps import nearest_steps
 
+__version__: str
+
 __all__ = [
     "DRAM",
     "EKF",

@@ -37,7 +37,7 @@ def _call_rows(call, argument, rows, results, control):
 
 _call_rows = cached_on_disk(
     njit(_call_rows, error_model="numpy", nogil=True),
-    digest("call_rows", Path(__file__).read_text()),
+    digest("call_rows", Path(__file__).read_text(encoding="utf-8")),
 )
 
 

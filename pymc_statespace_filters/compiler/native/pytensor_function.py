@@ -153,7 +153,8 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
             lines += [f"numbers[n] = results[{i}].item()", "n += 1"]
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
-    key = digest("adapter", Path(__file__).read_text(), source, str(signature), str(results))
+    own = Path(__file__).read_text(encoding="utf-8")
+    key = digest("adapter", own, source, str(signature), str(results))
     entry = EntryPoint(namespace["adapter"], {"table": I64_PTR, "out": F64_PTR}, "adapter", key)
     entry.compile()
     return entry.address

@@ -104,7 +104,7 @@ def _process_table() -> str:
     """
     table = platform.node()
     with suppress(OSError):
-        table += Path("/proc/sys/kernel/random/boot_id").read_text()
+        table += Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
         table += os.readlink("/proc/self/ns/pid")
     return blake2b(table.encode(), digest_size=8).hexdigest()
 

@@ -12,7 +12,8 @@ from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 
 def cached_with(*names: str) -> Callable[[Callable], Any]:
     """A decorator; the machine code depends on the files of this folder with these names."""
-    source = "".join(Path(__file__).parent.joinpath(name).read_text() for name in names)
+    files = [Path(__file__).parent / name for name in names]
+    source = "".join(file.read_text(encoding="utf-8") for file in files)
 
     def decorate(function: Callable) -> Any:
         key = digest(function.__name__, source)

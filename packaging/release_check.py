@@ -1,0 +1,208 @@
+"""Build the distributions, and test them where nothing of the checkout can be imported.
+
+Run by `make release-check`, with a network on which pip finds its packages. Needs git and nothing
+else beside Python; works on Linux, macOS and Windows. Leaves the wheel, the sdist and the recipe of
+conda-forge in dist/.
+"""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+import venv
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+
+ROOT = Path(__file__).parents[1]
+DIST = ROOT / "dist"
+PACKAGE = "pymc_statespace_filters"
+MAX_WHEEL_BYTES = 1_000_000
+
+# The parts of the suite that the installed package is held to: each layer once, and all that
+# depends on the operating system.
+TESTS = (
+    "tests/system",
+    "tests/parallel",
+    "tests/compiler/native",
+    "tests/filters/test_truth_ekf.py",
+    "tests/evaluation/test_log_likelihood.py",
+    "tests/evidence/test_bridge.py",
+    "tests/sampling/test_checkpoint_file.py",
+    "tests/sampling/test_folder_lease.py",
+    "tests/sampling/test_interrupts.py",
+    "tests/sampling/test_results.py",
+)
+RENDER = """
+import sys
+from rattler_build import Stage0Recipe
+for variant in Stage0Recipe.from_file(sys.argv[1]).render():
+    recipe = variant.recipe
+    print(recipe.package.name, recipe.package.version)
+"""
+
+
+class Environment:
+    """A virtual environment; what runs in it sees no variable that could lead to the checkout."""
+
+    def __init__(self, folder: Path, **variables: str):
+        venv.create(folder, with_pip=True)
+        self.folder = folder
+        self._scripts = folder / ("Scripts" if os.name == "nt" else "bin")
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTENSOR"))}
+        path = os.pathsep.join([str(self._scripts), os.environ.get("PATH", "")])
+        self._variables = kept | {"PATH": path} | variables
+
+    def run(self, *command: str | Path, cwd: Path | None = None) -> None:
+        """Run a command of the environment, as ``python -m pip``."""
+        program = shutil.which(str(command[0]), path=str(self._scripts))
+        if program is None:
+            sys.exit(f"there is no {command[0]} in {self._scripts}")
+        done = subprocess.run(
+            [program, *map(str, command[1:])],
+            cwd=cwd or self.folder,
+            env=self._variables,
+            check=False,
+        )
+        if done.returncode:
+            sys.exit(f"release-check: {' '.join(map(str, command))} has failed")
+
+    def install(self, *what: str | Path) -> None:
+        """Install by pip, with all that it needs."""
+        self.run("python", "-m", "pip", "install", "-q", "--disable-pip-version-check", *what)
+
+
+@contextmanager
+def step(name: str) -> Iterator[None]:
+    """Say what is done, and how long it took."""
+    print(f"=== {name}", flush=True)
+    begin = perf_counter()
+    yield
+    print(f"=== {name}: good, {perf_counter() - begin:.0f} s", flush=True)
+
+
+def require(condition: bool, message: str) -> None:
+    """End with this message unless the condition holds."""
+    if not condition:
+        sys.exit(f"release-check: {message}")
+
+
+def tracked_files() -> set[str]:
+    """What git tracks."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, encoding="utf-8"
+    )
+    return set(listed.stdout.split("\0")) - {""}
+
+
+def check_wheel(wheel: Path) -> None:
+    """The package, its metadata and its licence; nothing else, and not much of it."""
+    size = wheel.stat().st_size
+    print(f"{wheel.name}: {size} bytes")
+    require(size < MAX_WHEEL_BYTES, f"{wheel.name} has {size} bytes, not below {MAX_WHEEL_BYTES}")
+    info = "-".join(wheel.name.split("-")[:2]) + ".dist-info/"
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    sources = {name for name in tracked_files() if name.startswith(f"{PACKAGE}/")}
+    metadata = {info + name for name in ("METADATA", "WHEEL", "RECORD", "licenses/LICENSE")}
+    compare(wheel, names, sources | metadata)
+
+
+def check_sdist(sdist: Path) -> None:
+    """All that git tracks, and so all that the tests and the guide need; nothing else."""
+    print(f"{sdist.name}: {sdist.stat().st_size} bytes")
+    top = sdist.name.removesuffix(".tar.gz") + "/"
+    with tarfile.open(sdist) as archive:
+        names = {member.name.removeprefix(top) for member in archive if member.isfile()}
+    compare(sdist, names, tracked_files() | {"PKG-INFO"})
+
+
+def compare(archive: Path, names: set[str], wanted: set[str]) -> None:
+    """Name the files that are missing, and those that should not be there."""
+    missing, more = sorted(wanted - names), sorted(names - wanted)
+    require(not missing, f"{archive.name} lacks {', '.join(missing)}")
+    require(not more, f"{archive.name} holds {', '.join(more)}, which git does not track")
+
+
+def write_recipe(sdist: Path) -> Path:
+    """The recipe of conda-forge with the checksum of the sdist, and the script of its test."""
+    checksum = hashlib.sha256(sdist.read_bytes()).hexdigest()
+    recipe = (ROOT / "packaging" / "recipe.yaml").read_text(encoding="utf-8")
+    head, url, tail = recipe.partition(".tar.gz\n")
+    target = DIST / "recipe" / "recipe.yaml"
+    target.parent.mkdir()
+    target.write_text(f"{head}{url}  sha256: {checksum}\n{tail}", encoding="utf-8", newline="\n")
+    shutil.copy(ROOT / "packaging" / "smoke.py", target.parent)
+    return target
+
+
+def check_files(tools: Environment, recipe: Path) -> None:
+    """The recipe is rendered; workflows and citation are held to their schemas."""
+    tools.run("python", "-c", RENDER, recipe)
+    workflows = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    check = ("check-jsonschema", "--builtin-schema")
+    tools.run(*check, "vendor.github-workflows", *workflows)
+    tools.run(*check, "vendor.citation-file-format", ROOT / "CITATION.cff")
+
+
+def check_origin(environment: Environment) -> None:
+    """The package that is imported is the installed one."""
+    code = f"import sys, {PACKAGE} as p; sys.exit(not p.__file__.startswith(sys.prefix))"
+    environment.run("python", "-c", code)
+
+
+def unpacked(sdist: Path, folder: Path) -> Path:
+    """The sdist without the package, which could be imported in place of the installed one."""
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    (top,) = folder.iterdir()
+    shutil.rmtree(top / PACKAGE)
+    return top
+
+
+def main() -> None:
+    """Run all steps; the first that fails ends the run."""
+    begin = perf_counter()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+        work = Path(name).resolve()
+        with step("build"):
+            shutil.rmtree(DIST, ignore_errors=True)
+            tools = Environment(work / "tools")
+            tools.install("-r", ROOT / "packaging" / "requirements.txt")
+            tools.run("python", "-m", "build", "--outdir", DIST, ROOT)
+            (wheel,), (sdist,) = DIST.glob("*.whl"), DIST.glob("*.tar.gz")
+        with step("contents"):
+            tools.run("twine", "check", "--strict", wheel, sdist)
+            check_wheel(wheel)
+            check_sdist(sdist)
+            check_files(tools, write_recipe(sdist))
+        with step("install the wheel"):
+            user = Environment(
+                work / "user", PYTENSOR_FLAGS=f"base_compiledir={work / 'code'}", MPLBACKEND="agg"
+            )
+            user.install(wheel)
+            user.run("python", "-m", "pip", "check")
+            check_origin(user)
+        with step("first run"):
+            shutil.copy(ROOT / "packaging" / "smoke.py", work)
+            user.run("python", "-W", "error", work / "smoke.py")
+        with step("doctests of the wheel"):
+            user.install(f"{wheel}[test]")
+            tests = unpacked(sdist, work / "unpacked")
+            pytest = ["python", "-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider"]
+            settings = ["-c", tests / "pyproject.toml", "-o", "pythonpath="]
+            user.run(*pytest, *settings, "--pyargs", PACKAGE)
+        with step("tests of the sdist"):
+            user.install("--force-reinstall", "--no-deps", sdist)
+            check_origin(user)
+            user.run(*pytest, "--dist", "loadfile", *TESTS, cwd=tests)
+    print(f"release-check: all good, {perf_counter() - begin:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
