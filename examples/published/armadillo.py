@@ -6,8 +6,8 @@ has two temperatures, of the envelope and of the room, between two resistances; 
 noise. Inputs are linear between samples. pySIP's documentation (``fit_frequentist``, 2023) prints
 the maximum of the likelihood, found by BFGS.
 
-Time is in days, so capacities are in watt days per kelvin. Without the resistance of a wall of
-their own, the sun's gains are noise here as there.
+Time is in days, so capacities are in watt days per kelvin. The last row of the record is left out
+and the sun is not in the model, as there.
 """
 
 from pathlib import Path
@@ -84,7 +84,8 @@ def study() -> Study:
         scale = 7.0 if name == "start" else estimate
         left = np.hypot(error**2 * slope / scale, 0.5e-6 / 3**0.5)
         ours = float(found.estimate[name])
-        comparisons.append(Comparison(name, estimate, left, ours, by_chance=False))
+        what = f"estimate of {name}"
+        comparisons.append(Comparison(what, estimate, left, ours, by_chance=False))
         ratios.append(error / float(found.standard_errors[name]))
     return Study(
         "building, 232 half hours",

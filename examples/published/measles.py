@@ -26,7 +26,7 @@ CASES = pd.read_csv(DATA / "measles.csv", index_col="day")  # days after 1 Janua
 PEOPLE = pd.read_csv(DATA / "measles_people.csv").set_index("town")
 FITS = pd.read_csv(DATA / "measles_fits.csv", index_col="town")
 DT = 1 / 365.25  # years: a day
-N_RUNS, N_PARTICLES = 8, 2000
+N_RUNS, N_PARTICLES = 8, 4000
 
 
 def noise(x, u, R0, sigma, gamma, mu, alpha, iota, sigmaSE, cohort, amplitude):
