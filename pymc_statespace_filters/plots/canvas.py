@@ -15,7 +15,8 @@ from pymc_statespace_filters.plots.legend import DOTS_PER_INCH
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
-N_TICKS = 8  # at most, between which labels of years have room
+# Of an axis, at most: between them labels of years have room.
+N_TICKS, TICKS_PER_INCH = 8, 1.4
 
 
 def canvas(
@@ -64,10 +65,13 @@ def canvas(
     given["aes"] = {**aes, **pc_kwargs.get("aes", {})}
     collection = PlotCollection.wrap(data, **given)
     if backend == "matplotlib":  # the others write numbers in full
-        for axes in collection.viz["figure"].item().axes:
+        drawn = collection.viz["figure"].item()
+        in_line = min(n_panels, panels_in_line)
+        n_ticks = min(N_TICKS, max(2, int(TICKS_PER_INCH * drawn.get_figwidth() / in_line)))
+        for axes in drawn.axes:
             axes.ticklabel_format(useOffset=False)
             # Its own ticks, such as 1902.5, touch each other.
-            axes.locator_params(axis="x", nbins=N_TICKS, steps=STEPS)
+            axes.locator_params(axis="x", nbins=n_ticks, steps=STEPS)
     return collection
 
 

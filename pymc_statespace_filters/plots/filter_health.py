@@ -145,7 +145,7 @@ def plot_filter_health(
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={},
-        size=(3.6 * in_line, 0.6 + 2.5 * -(-n_panels // in_line)),
+        size=(3.8 * in_line, 0.6 + 2.6 * -(-n_panels // in_line)),
         n_panels=n_panels,
         panels_in_line=in_line,
         cols=["__variable__", "observable"],
@@ -284,7 +284,7 @@ def _label_panels(collection: PlotCollection, data: xr.Dataset, time: str) -> No
     axes = {
         "residual": (time, "standardised residual"),
         "autocorrelation": ("lag (observations)", "autocorrelation"),
-        "pit": ("PIT: predicted probability below", "share below − expected"),
+        "pit": ("PIT: probability of less", "share below − expected"),
         "inputs": ("lag (observations)", "correlation with inputs"),
         "effective": (time, "effective number"),
     }

@@ -28,7 +28,7 @@ TAIL = 1.96  # of the 95 % band of a standard normal
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
 ZERO = {"color": "B2", "width": 0.8}
-WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.1  # inches of a column, of a single one, of a panel
+WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.6  # inches of a column, of a single one, of a panel
 N_TICKS = 4  # of the axis of predictions
 
 

@@ -1,5 +1,8 @@
 """Residuals, their autocorrelation, PIT and effective particles, as drawn."""
 
+from itertools import pairwise
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -133,7 +136,7 @@ def test_names_of_axes_and_panels(diagnostics):
     assert found[:3] == [
         ("position", "time", "standardised residual"),
         ("position", "lag (observations)", "autocorrelation"),
-        ("position", "PIT: predicted probability below", "share below − expected"),
+        ("position", "PIT: probability of less", "share below − expected"),
     ]
     assert found[3][1:] == ("time", "effective number")
 
@@ -145,3 +148,16 @@ def test_what_is_refused(diagnostics):
         plot_filter_health(xr.DataTree())
     with pytest.raises(ModelError, match=r"var_name must be one of \['d'\], got 'e'"):
         plot_filter_health(diagnostics, var_name="e")
+
+
+def test_years_do_not_touch_where_panels_are_side_by_side(diagnostics):
+    of_years = diagnostics["filter_diagnostics"].to_dataset()
+    of_years = of_years.assign_coords(d_time=np.linspace(1973.5, 1984.5, of_years.sizes["d_time"]))
+    tree = xr.DataTree.from_dict({"filter_diagnostics": of_years})
+    with plt.rc_context({"font.size": 14.0}):
+        figure = plot_filter_health(tree, backend="matplotlib").viz["figure"].item()
+        figure.canvas.draw()
+    for axes in figure.axes[:2]:
+        boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+        assert len(boxes) > 1
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
