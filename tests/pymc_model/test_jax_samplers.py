@@ -8,6 +8,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, FREE, STEPS, forced_terms
+from tests.test_readme import run_code_of
 
 jax = pytest.importorskip("jax")
 # Before the samplers: PyMC sets the number of JAX's devices here, and they make JAX count them.
@@ -125,3 +126,13 @@ def test_pathfinder(distribution_function):
     state, _ = blackjax.vi.pathfinder.approximate(key, logp, [jax.numpy.array(0.5)])
     draws, _ = blackjax.vi.pathfinder.sample(key, state, 1000)
     assert_fits(draws[0], distribution_function)
+
+
+def test_the_page_on_jax_runs():
+    names = run_code_of("docs/howto/jax.md")
+    means = [
+        float(names[f"by_{sampler}"]["posterior"]["rate"].mean())
+        for sampler in ("numpyro", "blackjax", "nutpie")
+    ]
+    posterior_sd = float(names["by_numpyro"]["posterior"]["rate"].std())
+    assert np.ptp(means) < 0.5 * posterior_sd
