@@ -17,11 +17,13 @@ from packaging.utils import canonicalize_name
 import pymc_statespace_filters as psf
 
 ROOT = Path(__file__).parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+LOCK_OF = {"sys_platform": "linux"}
 
 
 def locked_versions():
-    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
     pins = [Requirement(line) for line in lines if line and not line.startswith("#")]
     return {canonicalize_name(pin.name): str(pin.specifier) for pin in pins}
 
@@ -36,6 +38,8 @@ def test_lock_holds_every_dependency_within_its_bounds():
     wanted = [Requirement(line) for line in lines if not line.startswith(PROJECT["name"])]
     locked = locked_versions()
     for requirement in wanted:
+        if requirement.marker is not None and not requirement.marker.evaluate(LOCK_OF):
+            continue  # of another system than the lock's
         version = locked[canonicalize_name(requirement.name)].removeprefix("==")
         assert version in requirement.specifier, f"{requirement}, locked at {version}"
 
@@ -43,7 +47,7 @@ def test_lock_holds_every_dependency_within_its_bounds():
 def imports_from_elsewhere():
     """Every module that the package imports from elsewhere, and the file that does."""
     for file in (ROOT / "pymc_statespace_filters").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 modules = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
@@ -92,6 +96,35 @@ def test_the_insides_of_numba_and_pytensor_are_met_in_the_compiler_alone():
         and not module.startswith(TOUCH_INSIDES.get(file, ("nothing",)))
     }
     assert outside == set()
+
+
+def opened_without_encoding(file):
+    """The lines of a file that read or write text in the encoding of the system."""
+    opening = {"open", "read_text", "write_text", "fdopen", "NamedTemporaryFile", "TemporaryFile"}
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call):
+            continue
+        name = getattr(node.func, "attr", getattr(node.func, "id", None))
+        given = {keyword.arg for keyword in node.keywords}
+        values = [*node.args, *(keyword.value for keyword in node.keywords)]
+        modes = [value.value for value in values if isinstance(value, ast.Constant)]
+        is_binary = any(
+            isinstance(mode, str) and mode in {"rb", "wb", "ab", "xb"} for mode in modes
+        )
+        is_call = isinstance(getattr(node.func, "value", None), ast.Name) and name == "open"
+        of_os = is_call and node.func.value.id in {"os", "tarfile", "zipfile", "webbrowser"}
+        text = name in opening and not is_binary and not of_os
+        if (text or given & {"text", "universal_newlines"}) and "encoding" not in given:
+            yield f"{file.relative_to(ROOT).as_posix()}:{node.lineno}"
+
+
+def test_text_is_utf8_on_every_system():
+    """Without an encoding, Windows reads UTF-8 as something else, or not at all."""
+    folders = ("pymc_statespace_filters", "docs", "examples", "packaging")
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    assert [line for file in files for line in opened_without_encoding(file)] == []
+    # lazy_loader reads the stub in the encoding of the system.
+    assert (ROOT / psf.__name__ / "__init__.pyi").read_bytes().isascii()
 
 
 def test_importing_is_silent_and_leaves_mpi_and_jax_alone():
