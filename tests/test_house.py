@@ -114,7 +114,10 @@ def opened_without_encoding(file):
         is_call = isinstance(getattr(node.func, "value", None), ast.Name) and name == "open"
         of_os = is_call and node.func.value.id in {"os", "tarfile", "zipfile", "webbrowser"}
         text = name in opening and not is_binary and not of_os
-        if (text or given & {"text", "universal_newlines"}) and "encoding" not in given:
+        decodes = any(
+            k.arg == "text" and getattr(k.value, "value", 0) is True for k in node.keywords
+        )
+        if (text or decodes) and "encoding" not in given:
             yield f"{file.relative_to(ROOT).as_posix()}:{node.lineno}"
 
 

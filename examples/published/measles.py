@@ -123,6 +123,6 @@ def study() -> Study:
             for town, fit in FITS.iterrows()
         ],
         seconds[0],
-        f"Ours is the logarithm of the mean of {N_RUNS} runs of 4000 particles, or of 10 000 in towns "
-        "of more than 50 000 people.",
+        f"Ours is the logarithm of the mean of {N_RUNS} runs of 4000 particles, or of 10 000 in "
+        "towns of more than 50 000 people.",
     )
