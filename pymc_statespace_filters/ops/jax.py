@@ -120,8 +120,9 @@ def _on_host(function: Callable, shapes: Shapes, *inputs: Any) -> Sequence[Any]:
 def _in_place(function: Callable, results: Sequence[jax.ShapeDtypeStruct]) -> Callable:
     """The function in JAX on the processor, where it reads and writes the memory of JAX itself.
 
-    `_by_copies` takes ten times as long. And JAX makes the copies in the threads that run the
-    functions, which may then wait for each other forever if several chains are sampled at once.
+    `_by_copies` takes ten times as long. And JAX may make the copies in the threads that wait for
+    them: with some releases, long arrays made chains in parallel wait for each other forever
+    (github.com/jax-ml/jax/issues/24255).
     """
 
     def write(_, outputs, *inputs):

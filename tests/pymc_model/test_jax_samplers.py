@@ -92,7 +92,7 @@ def test_each_sampler_refuses_estimates_and_names_others(name):
 
 
 def test_chains_of_a_long_record_run_at_once():
-    """Copies of arrays as long as these would have to wait for the threads of the chains."""
+    """Where JAX copies arrays for a call, long ones have made such chains wait forever."""
     steps = np.arange(1, 5001)
     record = psf.simulate(FREE, {"a": 0.7}, steps=steps, random_seed=1)["observations"]
     with pm.Model():
