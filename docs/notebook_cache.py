@@ -44,7 +44,9 @@ def _quiet_kernels(profiles: Path) -> None:
     """Have kernels write errors only: each warns that it is reached by TCP, the default."""
     config = profiles / "profile_default" / "ipython_kernel_config.py"
     config.parent.mkdir(parents=True, exist_ok=True)
-    config.write_text('get_config().IPKernelApp.log_level = "ERROR"\n')
+    config.write_text(
+        'get_config().IPKernelApp.log_level = "ERROR"\n', encoding="utf-8"
+    )
     os.environ["IPYTHONDIR"] = str(profiles)
 
 

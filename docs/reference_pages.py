@@ -35,10 +35,12 @@ def write(folder: Path) -> None:
     folder.mkdir(parents=True)
     groups = _grouped()
     for title, names in groups.items():
-        (folder / f"{_slug(title)}.rst").write_text(_group(title, names))
+        (folder / f"{_slug(title)}.rst").write_text(
+            _group(title, names), encoding="utf-8"
+        )
         for name in names:
-            (folder / f"{name}.rst").write_text(_page(name))
-    (folder / "index.rst").write_text(_index(groups))
+            (folder / f"{name}.rst").write_text(_page(name), encoding="utf-8")
+    (folder / "index.rst").write_text(_index(groups), encoding="utf-8")
 
 
 def _grouped() -> dict[str, list[str]]:

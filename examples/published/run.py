@@ -18,7 +18,7 @@ def main(names: list[str]) -> None:
     studies = [import_module(name).study() for name in names or STUDIES]
     found = table(studies)
     if not names:
-        TABLE.write_text(found)
+        TABLE.write_text(found, encoding="utf-8")
     print(found)
     wrong = [
         f"{study.title}: {c.quantity} (z = {c.z:+.2f})"

@@ -94,9 +94,9 @@ class Study:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_suffix(".part")
-            unfinished.write_text(json.dumps(find()))
+            unfinished.write_text(json.dumps(find()), encoding="utf-8")
             os.replace(unfinished, path)  # written as a whole, even if the run is interrupted
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
 
     def table(self, name: str, table: pd.DataFrame, digits: int = 2) -> None:
         """Write a table as CSV in full, and as Markdown with this many digits after the point."""
@@ -105,7 +105,7 @@ class Study:
         rows = [cells.columns, ["---"] * cells.shape[1]]
         rows += [[_cell(value, digits) for value in row] for row in cells.itertuples(index=False)]
         lines = ["| " + " | ".join(map(str, row)) + " |" for row in rows]
-        (self.out / f"{name}.md").write_text("\n".join(lines) + "\n")
+        (self.out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def picture(self, name: str, figure: Figure) -> None:
         """Write a figure as PNG."""
