@@ -4,12 +4,16 @@ Here are the quick ones; CONTRIBUTING.md says how to run any test without what L
 """
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytensor.tensor as pt
 import pytest
 
+import pymc_statespace_filters as psf
 from tests.elsewhere import PLAIN
 
 ROOT = Path(__file__).parents[1]
@@ -38,3 +42,37 @@ def test_without_what_linux_has():
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def numbers():
+    """What is written in vectors, or in instructions that not every processor has.
+
+    A scalar recursion, a loop over members with normals, and densities in vectors of four.
+    """
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, a: [a * pt.sin(x[0]) + pt.tanh(x[0] - 1.0) + q[0]],
+        process_noise=[[0.3]],
+        observation=lambda x: [pt.exp(0.3 * x[0])],
+        observation_noise=[[0.1]],
+        initial_mean=[0.5],
+        initial_cov=[[0.2]],
+    )
+    record = {"steps": np.arange(1, 31), "observed": np.exp(0.3 * np.sin(np.arange(30.0)))}
+    filters = psf.EKF(), psf.BootstrapPF(200), psf.PFEnKF(64)
+    return np.array([psf.log_likelihood(system, f, {"a": 1.3}, **record, seed=2) for f in filters])
+
+
+def test_machine_code_of_another_processor():
+    """Without AVX and FMA, or NEON's newer instructions: the same to rounding."""
+    name = "x86-64" if platform.machine().lower() in {"x86_64", "amd64"} else "generic"
+    script = "import sys; from tests.test_portability import numbers; sys.stdout.buffer.write("
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script + "numbers().tobytes())"],
+        cwd=ROOT,
+        env=os.environ | {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""},
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    here = numbers()
+    there = np.frombuffer(done.stdout).reshape(here.shape)
+    np.testing.assert_allclose(there, here, rtol=1e-11, atol=1e-11)

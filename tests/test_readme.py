@@ -15,11 +15,19 @@ NOTEBOOKS = sorted(path for path in (ROOT / "docs").rglob("*.ipynb") if "_build"
 
 
 def cells_of(notebook: Path) -> list[dict]:
-    return [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"]
+    return [
+        c
+        for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        if c["cell_type"] == "code"
+    ]
 
 
 def code_of(page: str) -> str:
-    return "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL))
+    return "\n".join(
+        re.findall(
+            r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL
+        )
+    )
 
 
 def run_code_of(*pages: str) -> dict:
@@ -43,7 +51,7 @@ def test_the_example(capsys: pytest.CaptureFixture) -> None:
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_kept_without_outputs(notebook: Path) -> None:
-    kernel = json.loads(notebook.read_text())["metadata"]["kernelspec"]["name"]
+    kernel = json.loads(notebook.read_text(encoding="utf-8"))["metadata"]["kernelspec"]["name"]
     assert kernel == "python3"  # that of any Jupyter
     for cell in cells_of(notebook):
         assert not cell["outputs"]

@@ -16,6 +16,7 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.density import ModelDensity
+from tests.interrupts import interrupt_in
 from tests.small_systems import FREE
 
 pytestmark = pytest.mark.usefixtures("interrupts_arrive")
@@ -38,12 +39,6 @@ def run():
 
 def path():
     psf.simulate(FREE, {"a": 0.5}, steps=[90_000], random_seed=1)
-
-
-def interrupt_in(seconds):
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
-    return timer
 
 
 @pytest.mark.parametrize("call", [batch, particles, run, path])

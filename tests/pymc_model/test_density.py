@@ -1,8 +1,5 @@
 """A log-density at many points: the model's own, whoever evaluates it and in how many threads."""
 
-import os
-import signal
-import threading
 import time
 
 import numpy as np
@@ -16,6 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native import parallel_map as many_calls
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
+from tests.interrupts import interrupt_in
 from tests.sampling.autoregression import autoregression
 
 DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])
@@ -116,8 +114,7 @@ def test_an_interrupt_stops_all_threads():
 
     with pytensor.config.change_flags(mode="FAST_COMPILE"):
         density = ModelDensity(python_model(slow))
-    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+    interrupt_in(0.3)
     start = time.perf_counter()
     with pytest.raises(KeyboardInterrupt):
         density.evaluate(np.zeros((10_000, 1)), np.empty((10_000, 0)))

@@ -19,6 +19,12 @@ from pymc_statespace_filters.sampling.checkpoint import journal
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.checkpoint.journal import ChainJournal
 
+# Windows has no words of its own for these.
+IS_FOLDER = "Permission denied" if os.name == "nt" else "Is a directory"
+INSIDE_FILE = r"inside' cannot be written to \(Not a directory\)"
+if os.name == "nt":
+    INSIDE_FILE = "draws.nc' is a file: expected a folder"
+
 SETTINGS = {"draws": 1000, "chains": 2, "model": "5f2c", "stages": [2, 1], "step": None}
 
 
@@ -297,7 +303,7 @@ def test_a_folder_in_the_place_of_a_record_is_named(tmp_path, number):
     content = path.read_bytes()
     path.unlink()
     path.mkdir()
-    message = rf"{path.name}: record {number + 1} of the chain cannot be read \(Is a directory\)"
+    message = rf"{path.name}: record {number + 1} of the chain cannot be read \({IS_FOLDER}\)"
     with open_checkpoint(tmp_path, SETTINGS) as checkpoint:
         with pytest.raises(CheckpointError, match=message):
             checkpoint.journal(0).read()
@@ -310,7 +316,7 @@ def test_a_folder_in_the_place_of_a_record_is_named(tmp_path, number):
 @pytest.mark.parametrize("name", ["run.json", "run.json.unfinished", "lease.x"])
 def test_a_folder_in_the_place_of_another_file_is_named(tmp_path, name):
     (tmp_path / name).mkdir()
-    message = rf"cannot be written to \(Is a directory at {name}\)"
+    message = rf"cannot be written to \({IS_FOLDER} at {name}\)"
     with pytest.raises(ModelError, match=message):
         open_checkpoint(tmp_path, SETTINGS)
 
@@ -387,7 +393,7 @@ def test_paths_that_cannot_be_folders_are_refused(tmp_path):
     file.write_text("x")
     with pytest.raises(ModelError, match=r"draws.nc' is a file: expected a folder"):
         open_checkpoint(file, SETTINGS)
-    with pytest.raises(ModelError, match=r"inside' cannot be written to \(Not a directory\)"):
+    with pytest.raises(ModelError, match=INSIDE_FILE):
         open_checkpoint(file / "inside", SETTINGS)
 
 

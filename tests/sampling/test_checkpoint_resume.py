@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -62,7 +61,7 @@ def kill_after(kind, folder, iterations):
     )
     with child:
         assert child.stdout.readline() == "there\n"
-        child.send_signal(signal.SIGKILL)
+        child.kill()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

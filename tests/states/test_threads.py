@@ -1,8 +1,5 @@
 """Many draws at once: in any number of threads, watched, stopped, and failing."""
 
-import os
-import signal
-import threading
 import time
 
 import numpy as np
@@ -19,6 +16,7 @@ from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws
+from tests.interrupts import interrupt_in
 from tests.small_systems import PAIR, PAIR_DATA, STEPS
 from tests.states.models import EKF, pair_model, posterior
 
@@ -153,8 +151,7 @@ def test_an_interrupt_stops_the_work():
 
     with pytensor.config.change_flags(mode="FAST_COMPILE"):
         at_draws = at_draws_of(slow, 10_000)
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
+        interrupt_in(0.3)
         with pytest.raises(KeyboardInterrupt):
             _ = at_draws.theta
     assert len(calls) < 2_000  # of 10 000, 100 s of them

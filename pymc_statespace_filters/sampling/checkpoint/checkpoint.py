@@ -127,8 +127,8 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
         except BaseException:
             lease.release()
             raise
-    except FileExistsError:
-        raise ModelError(f"checkpoint={str(folder)!r} is a file: expected a folder") from None
+    except FileExistsError as error:  # on Windows, also of a folder above
+        raise ModelError(f"checkpoint={error.filename!r} is a file: expected a folder") from None
     except OSError as error:
         inside = error.filename and Path(error.filename).parent == folder
         at = f" at {Path(error.filename).name}" if inside else ""

@@ -1,7 +1,7 @@
 """PyTensor functions called by address: the same numbers, whatever the types, and no exception."""
 
 import gc
-import resource
+import sys
 
 import numpy as np
 import pytensor
@@ -141,6 +141,8 @@ def test_an_operation_that_needs_python():
 
 def test_results_are_released():
     """Two thousand results of a megabyte each would be noticed."""
+    resource = pytest.importorskip("resource")  # Windows has no such module
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
     x = pt.dvector("x")
     at = np.ones(125_000)
     bound, _ = NativeFunction(compiled([x], [x * 2.0]), [at]).bind([at])
@@ -148,4 +150,5 @@ def test_results_are_released():
     gc.collect()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     call_often(bound, 2000)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kilobytes
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown * unit < 1e8
