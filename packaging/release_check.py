@@ -27,16 +27,17 @@ MAX_WHEEL_BYTES = 1_000_000
 # The parts of the suite that the installed package is held to: each layer once, and all that
 # depends on the operating system.
 TESTS = (
-    "tests/system",
     "tests/parallel",
     "tests/compiler/native",
+    "tests/system/test_model.py",
     "tests/filters/test_truth_ekf.py",
+    "tests/filters/test_truth_unbiased.py",
     "tests/evaluation/test_log_likelihood.py",
     "tests/evidence/test_bridge.py",
     "tests/sampling/test_checkpoint_file.py",
     "tests/sampling/test_folder_lease.py",
     "tests/sampling/test_interrupts.py",
-    "tests/sampling/test_results.py",
+    "tests/sampling/test_run_models.py",
 )
 RENDER = """
 import sys
