@@ -9,12 +9,12 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model.compilation import compile_density
 from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters, with_filter
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 
@@ -56,7 +56,7 @@ class RowFunction:
         start = model.initial_point()
         (output,), joined = join_nonshared_inputs(start, [output], values, seeds)
         inputs = [joined, *seeds.values()]
-        function = compile_pymc(inputs, [output], on_unused_input="ignore")
+        function = compile_density(inputs, [output], on_unused_input="ignore")
         function.trust_input = True
         point = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
         self.calls = ParallelMap(function, [point, *self.model_seeds])

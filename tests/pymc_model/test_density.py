@@ -57,6 +57,23 @@ def test_each_point_has_its_own_seeds(noisy, points):
         assert found[i] == pytest.approx(log_density({"phi": x[i]}), rel=1e-12)
 
 
+def test_many_parameters_without_a_compiler_of_c():
+    with pm.Model() as model, pytensor.config.change_flags(cxx=""):
+        rates = [pm.LogNormal(f"rate_{i}") for i in range(16)]
+        psf.StateSpace(
+            "d",
+            autoregression(process_noise=[[0.5]]),
+            psf.EKF(),
+            params={"phi": 1 / (1 + sum(rates))},
+            steps=range(1, 9),
+            observed=DATA,
+        )
+        with pytest.warns(UserWarning, match="Loop fusion failed"):
+            model.compile_logp()
+        ModelDensity(model)  # warns of nothing, which here is an error
+        psf.sample_dram(draws=4, tune=4, chains=1, progressbar=False, compute_convergence_checks=False)
+
+
 @pytest.mark.parametrize("n_threads", [1, 2, 5, 40])
 def test_threads_do_not_matter(noisy, points, n_threads, monkeypatch):
     expected = noisy.evaluate(*points)

@@ -23,6 +23,7 @@ from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunc
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.parallel.signals import held_interrupts
+from pymc_statespace_filters.pymc_model.compilation import compile_density
 from pymc_statespace_filters.pymc_model.graph_rewrites import (
     autoregressive_noise,
     with_filter,
@@ -116,7 +117,7 @@ class LogDensity:
             point, outputs, variables, shared_inputs=seed_inputs
         )
         inputs = [joined, *seed_inputs.values(), *others, *noise_inputs]
-        self._function = compile_pymc(inputs, outputs, **(compile_kwargs or {}))
+        self._function = compile_density(inputs, outputs, **(compile_kwargs or {}))
         self._function.trust_input = True
         self._n_seeds = len(seeds)
         self._start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
