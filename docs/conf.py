@@ -14,6 +14,7 @@ sys.path.insert(0, str(HERE))
 from pymc_statespace_filters import DRAM  # noqa: E402
 
 import notebook_cache  # noqa: E402
+import page_order  # noqa: E402
 import reference_pages  # noqa: E402
 
 project = "pymc-statespace-filters"
@@ -86,4 +87,5 @@ linkcheck_anchors = False
 def setup(app: Sphinx) -> None:
     reference_pages.write(HERE / "reference" / "api")
     notebook_cache.prepare(Path(nb_execution_cache_path))
+    app.connect("env-before-read-docs", page_order.spread_notebooks)
     app.connect("build-finished", notebook_cache.report_failures)

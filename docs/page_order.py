@@ -1,0 +1,36 @@
+"""The order in which the pages are read, so that no process of the build waits for another.
+
+Sphinx deals runs of neighbours in its list of pages to the processes. By name, all tutorials are
+neighbours: one process would run most notebooks, and the others end minutes before it.
+"""
+
+import json
+from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util.parallel import make_chunks
+
+
+def spread_notebooks(
+    app: Sphinx, env: BuildEnvironment, docnames: list[str]
+) -> None:
+    """Reorder the list in place: each run of neighbours has its share of long notebooks."""
+    if not docnames:
+        return
+    n_runs = len(make_chunks(docnames, app.parallel))
+    longest_first = sorted(
+        docnames, key=lambda page: -_number_of_cells(env.doc2path(page))
+    )
+    docnames[:] = [
+        page for run in range(n_runs) for page in longest_first[run::n_runs]
+    ]
+
+
+def _number_of_cells(page: Path) -> int:
+    """Count the cells that run; their number grows with the time that a notebook takes."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        return sum(cell["cell_type"] == "code" for cell in cells)
+    return text.count("{code-cell}")
