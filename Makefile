@@ -80,7 +80,7 @@ docs: $(VENV)/.installed  ## build the guide in docs/_build/html; notebooks run 
 linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
 
-release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes N minutes, needs git and a registry
+release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes six minutes, needs git and a registry
 	@$(if $(PYTHON),,$(NO_PYTHON))
 	$(PYTHON) packaging/release_check.py
 
