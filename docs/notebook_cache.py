@@ -17,6 +17,7 @@ from sphinx.util import logging
 SOURCES = (
     "pymc_statespace_filters/**/*.py",
     "docs/**/*.csv",
+    "docs/_static/matplotlibrc",
     "requirements.lock",
 )
 
@@ -34,7 +35,7 @@ def folder(root: Path) -> Path:
 def prepare(cache: Path) -> None:
     """Make the cache before two processes use it, and remove those of other sources."""
     for other in cache.parent.glob("*"):
-        if other != cache:
+        if other != cache and other.is_dir():
             shutil.rmtree(other)
     get_cache(cache).db  # noqa: B018 - reading it makes its tables
     _set_up_kernels(cache.parent.with_name("ipython"))

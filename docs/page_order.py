@@ -16,15 +16,20 @@ def spread_notebooks(
     app: Sphinx, env: BuildEnvironment, docnames: list[str]
 ) -> None:
     """Reorder the list in place: each run of neighbours has its share of long notebooks."""
-    if not docnames:
-        return
-    n_runs = len(make_chunks(docnames, app.parallel))
     longest_first = sorted(
         docnames, key=lambda page: -_number_of_cells(env.doc2path(page))
     )
-    docnames[:] = [
-        page for run in range(n_runs) for page in longest_first[run::n_runs]
-    ]
+    runs = make_chunks(docnames, app.parallel)
+    rows = sorted(
+        (row, run)
+        for run, pages in enumerate(runs)
+        for row in range(len(pages))
+    )
+    dealt = sorted(
+        (run, row, page)
+        for (row, run), page in zip(rows, longest_first, strict=True)
+    )
+    docnames[:] = [page for _, _, page in dealt]
 
 
 def _number_of_cells(page: Path) -> int:

@@ -184,7 +184,9 @@ def main() -> None:
             check_files(tools, write_recipe(sdist))
         with step("install the wheel"):
             user = Environment(
-                work / "user", PYTENSOR_FLAGS=f"base_compiledir={work / 'code'}", MPLBACKEND="agg"
+                work / "user",
+                PYTENSOR_FLAGS=f"base_compiledir={(work / 'code').as_posix()}",
+                MPLBACKEND="agg",
             )
             user.install(wheel)
             user.run("python", "-m", "pip", "check")

@@ -33,7 +33,7 @@ def main() -> None:
     with pm.Model():
         pm.Uniform("a", -1, 1)
         psf.StateSpace("d", system, psf.EKF(), **record)
-        idata = psf.sample_dram(1000, tune=500, random_seed=1, progressbar=False)
+        idata = psf.sample_dram(1000, tune=500, random_seed=1)
         evidence = psf.chib_jeliazkov(idata, random_seed=1)
     # The likelihood is that of a linear system, so a sum over a fine grid gives the evidence.
     a = np.linspace(-1, 1, 2001)

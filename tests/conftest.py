@@ -15,7 +15,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 # No C compiler: numba needs none, and each operation that C code is made of takes a second. No BLAS
 # to link C code against either: the search for one ends in a warning.
 CACHE = Path(__file__).parents[1] / ".cache" / "pytensor"
-os.environ.setdefault("PYTENSOR_FLAGS", f"base_compiledir={CACHE},blas__ldflags=,cxx=")
+os.environ.setdefault("PYTENSOR_FLAGS", f"base_compiledir={CACHE.as_posix()},blas__ldflags=,cxx=")
 
 # Compilation makes millions of objects that stay, which the garbage collector would visit over and
 # over: a twentieth of the time.

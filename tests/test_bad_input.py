@@ -286,6 +286,9 @@ RECORDS = {
     ),
     "durations": (dict(steps=None, times=np.arange(2).astype("timedelta64[h]")), "times .*dates"),
     "index of dates": (dict(steps=None, times=pd.date_range("2020", periods=2)), "times .*dates"),
+    "dates as text": (
+        dict(steps=None, times=["2020-01-01", "2020-01-02"]), r"times .*text.*pd\.to_datetime",
+    ),
     "times too far": (dict(steps=None, times=[0.0, 1e30]), "at most 1e.09, .*got 1e.30"),
     "steps too far": (dict(steps=[0, 10**12]), "at most 1e.09, .*got 1e.12"),
     "steps beyond 64 bits": (dict(steps=[0, 2**70]), "at most 1e.09"),

@@ -102,7 +102,7 @@ def run(tmp_path):
     cache = tmp_path / "cache"
 
     def run(*cases):
-        flags = f"base_compiledir={cache},blas__ldflags=,cxx="
+        flags = f"base_compiledir={cache.as_posix()},blas__ldflags=,cxx="
         done = subprocess.run(
             [sys.executable, "-W", "error", "-c", SCRIPT, json.dumps(cases)],
             cwd=ROOT,

@@ -32,5 +32,5 @@ def start(n_ranks: int, module: str, *arguments: str, cache: Path | None = None)
         command = [launcher(), "-n", str(n_ranks), *command, "mpi4py", "-m"]
     environment = os.environ | ONE_THREAD | AS_ROOT | {"PYTHONPATH": str(ROOT)}
     if cache is not None:
-        environment["PYTENSOR_FLAGS"] = f"base_compiledir={cache}"
+        environment["PYTENSOR_FLAGS"] = f"base_compiledir={cache.as_posix()}"
     subprocess.run([*command, module, *arguments], cwd=ROOT, env=environment, check=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pymc as pm
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 
 import pymc_statespace_filters as psf
 
@@ -96,3 +96,7 @@ def study() -> Study:
         f"standard errors, by BFGS, are {min(ratios):.2f} to {max(ratios):.2f} of ours, by second "
         "differences.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

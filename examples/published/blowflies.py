@@ -2,7 +2,8 @@
 
 The record is the control culture of A. J. Nicholson (1957), after Brillinger et al. (1980). The R
 package pomp (6.4, ``blowflies1`` and ``blowflies2``) stores one run of 1000 particles for each of
-two steps, at parameters fitted there.
+two steps, at parameters fitted there. Last in `STORED` is the standard deviation of such a run, as
+40 of ours had once: it is fixed, so that a filter which scatters more is not allowed more.
 """
 
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 
 import pymc_statespace_filters as psf
 
@@ -24,11 +25,13 @@ STORED = {
         {"P": 3.2838, "delta": 0.16073, "N0": 679.94},
         {"sigma_P": 1.3512, "sigma_d": 0.74677, "sigma_y": 0.026649},
         -1467.82,
+        2.4,
     ),
     2: (
         {"P": 2.7319, "delta": 0.17377, "N0": 800.31},
         {"sigma_P": 1.442, "sigma_d": 0.76033, "sigma_y": 0.010846},
         -1473.66,
+        2.2,
     ),
 }
 
@@ -60,7 +63,7 @@ def study() -> Study:
     later = RECORD[RECORD.day > DELAY]
     comparisons = []
     with cpu_seconds() as seconds:
-        for dt, (rates, noise, stored) in STORED.items():
+        for dt, (rates, noise, stored, sd) in STORED.items():
             found = psf.log_likelihood(
                 blowflies(dt),
                 psf.BootstrapPF(1000),
@@ -69,13 +72,18 @@ def study() -> Study:
                 steps=((later.day - DELAY) // dt).to_numpy(),
                 seed=np.arange(N_RUNS),
             ).sum(axis=1)
-            sd = found.std(ddof=1)
             what = f"log-likelihood, one run of 1000 particles, step of {dt} d"
-            comparisons.append(Comparison(what, stored, sd, found.mean(), sd / N_RUNS**0.5))
+            ours = found.mean(), sd / N_RUNS**0.5
+            comparisons.append(Comparison(what, stored, sd, *ours, by_chance=False))
     return Study(
         "blowflies, 193 counts",
         "Nicholson (1957), after Brillinger et al. (1980); R package pomp 6.4",
         comparisons,
         seconds[0],
-        f"Ours is the mean of {N_RUNS} such runs, the error of the published one their spread.",
+        f"Ours is the mean of {N_RUNS} such runs. The errors are not theirs: such runs of ours had "
+        "this standard deviation, and a system slightly off would pass.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

@@ -133,9 +133,12 @@ def table(studies: list[Study]) -> str:
             cells = numbers[0], f"{c.published_error:.2g}", numbers[1], f"{c.our_error:.2g}"
             lines.append(f"| {title}{c.quantity} | {' | '.join(cells)} | {c.z:+.2f} | {seconds} |")
             title = seconds = ""
-    lines += ["", f"| errors by chance | numbers | worth | mean z² | {100 * LEVEL:g} % interval |"]
-    lines.append("| --- " * 5 + "|")
-    for s in spreads(studies):
+    found = spreads(studies)
+    if found:
+        interval = f"{100 * LEVEL:g} % interval"
+        lines += ["", f"| errors by chance | numbers | worth | mean z² | {interval} |"]
+        lines.append("| --- " * 5 + "|")
+    for s in found:
         interval = f"{s.low:.2f} to {s.high:.2f}"
         lines.append(f"| {s.what} | {s.n} | {s.worth:.0f} | {s.mean_square:.2f} | {interval} |")
     notes = [f"- {study.title}: {study.source}. {study.notes}" for study in studies]

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 from scipy.special import logsumexp
 
 import pymc_statespace_filters as psf
@@ -88,3 +88,7 @@ def study() -> Study:
         "Theirs are means of the runs, with their standard errors; ours are sums over a grid of "
         "the parameters. Of the logistic diffusion no evidence was found with an error.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 
 import pymc_statespace_filters as psf
 
@@ -40,3 +40,7 @@ def study() -> Study:
         seconds[0],
         "The state has two modes.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

@@ -12,7 +12,7 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Study, correlation_of_moments, cpu_seconds, moments
+from comparison import Study, correlation_of_moments, cpu_seconds, moments, table
 
 import pymc_statespace_filters as psf
 
@@ -66,3 +66,7 @@ def study() -> Study:
         f"{rate / their_rate:.0f} times as many.",
         correlation_of_moments(draws.values()),
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

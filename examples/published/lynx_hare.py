@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Study, correlation_of_moments, cpu_seconds, moments
+from comparison import Study, correlation_of_moments, cpu_seconds, moments, table
 
 import pymc_statespace_filters as psf
 
@@ -85,3 +85,7 @@ def study() -> Study:
         "least of eight parameters), compilation included.",
         correlation_of_moments(draws.values()),
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 from scipy.interpolate import make_smoothing_spline
 
 import pymc_statespace_filters as psf
@@ -126,3 +126,7 @@ def study() -> Study:
         f"Ours is the logarithm of the mean of {N_RUNS} runs of 4000 particles, or of 10 000 in "
         "towns of more than 50 000 people.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

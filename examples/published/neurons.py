@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
-from comparison import Comparison, Study, cpu_seconds
+from comparison import Comparison, Study, cpu_seconds, table
 from scipy.stats import invgamma
 
 import pymc_statespace_filters as psf
@@ -97,3 +97,7 @@ def study() -> Study:
         "0.21 with their 128 particles in four passes; "
         f"{spreads[1]:.2f} with `BootstrapPF(5529)`, 0.60 with theirs.",
     )
+
+
+if __name__ == "__main__":
+    print(table([study()]))

@@ -28,8 +28,6 @@ TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 def main(names: list[str]) -> None:
     studies = [import_module(name).study() for name in names or STUDIES]
     found = table(studies)
-    if not names:
-        TABLE.write_text(found, encoding="utf-8")
     print(found)
     wrong = [
         f"{study.title}: {c.quantity} (z = {c.z:+.2f})"
@@ -44,6 +42,8 @@ def main(names: list[str]) -> None:
     ]
     if wrong:
         raise SystemExit("not what others published, or the errors are wrong:\n" + "\n".join(wrong))
+    if not names:
+        TABLE.write_text(found, encoding="utf-8")
 
 
 if __name__ == "__main__":

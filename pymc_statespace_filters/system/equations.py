@@ -23,6 +23,8 @@ RESERVED = {
     "u": "the inputs",
     "t": "the time",
 }
+# What has a row for each state, whose number is that of the initial mean.
+ROWS_ARE_STATES = ("transition", "drift", "diffusion", "A", "B", "offset")
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,8 @@ def _of_length(role: str, symbol: TensorVariable, expected: Sequence[int | None]
         return pt.specify_shape(symbol, tuple(expected))
     wanted = tuple(s if e is None else e for e, s in zip(expected, shape, strict=True))
     if shape != wanted:
-        raise ModelError(f"{role} must have shape {wanted}, got {shape}")
+        states = f"; initial_mean has {wanted[0]} states" if role in ROWS_ARE_STATES else ""
+        raise ModelError(f"{role} must have shape {wanted}, got {shape}{states}")
     return symbol if symbol.type.shape == shape else pt.specify_shape(symbol, shape)
 
 

@@ -44,7 +44,8 @@ def symbolic_panel_parameters(
     others: Sequence[str],
 ) -> TensorVariable:
     """Parameter values, numbers or symbols, as a symbolic matrix (G, k)."""
-    check_complete(system, values, f"the model's variables are {sorted(others)}")
+    names = f"the model's variables are {sorted(others)}: name one so, or give the value in params"
+    check_complete(system, values, names)
     n_records = len(panel.records.labels)
     parts: list[Any] = [np.zeros((n_records, 0))] if not system.parameters else []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):

@@ -55,7 +55,8 @@ def symbolic_parameters(
 
     ``others`` are the names among which a missing one may be, misspelt.
     """
-    check_complete(system, values, f"the model's variables are {sorted(others)}")
+    names = f"the model's variables are {sorted(others)}: name one so, or give the value in params"
+    check_complete(system, values, names)
     parts = [
         _symbol(name, values[name], shape).ravel()
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)

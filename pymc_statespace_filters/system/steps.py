@@ -35,7 +35,7 @@ def steps_of(steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
     if (off > GRID_TOLERANCE).any():
         at = int(np.argmax(off))
         raise ModelError(
-            f"times[{at}] = {array[at]!r} is off the grid t0 + k*dt with t0 = {t0:g} and "
+            f"times[{at}] = {array[at]:.15g} is off the grid t0 + k*dt with t0 = {t0:g} and "
             f"dt = {dt:g} by {off[at]:.3g} steps; round with psf.nearest_steps(times, dt, t0=t0)"
         )
     return check_steps(whole.astype("int64"))
@@ -89,8 +89,8 @@ def check_steps(steps: Any) -> np.ndarray:
         raise _too_many_steps(float(max(array.tolist())))
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise ModelError(
-            f"steps must be a vector of integers (give real timestamps as times), got "
-            f" {shortened(steps)}"
+            "steps must be a vector of integers (convert whole floats with .astype(int), give real "
+            f"timestamps as times), got {shortened(steps)}"
         )
     if array[0] < 0:
         raise ModelError(f"steps must not be negative, got {array[0]}")
@@ -116,9 +116,12 @@ def rows_at(at: str, steps: np.ndarray) -> np.ndarray:
 
 def _numbers_of_time(times: Any) -> np.ndarray:
     """Times as floats; dates are refused, because their unit is not that of ``dt``."""
-    if np.asarray(times).dtype.kind in "mM":
+    array = np.asarray(times)
+    is_text = array.dtype.kind in "SUO" and any(isinstance(t, str | bytes) for t in array.flat)
+    if is_text or array.dtype.kind in "mM":
+        what = "text: read dates with pd.to_datetime, then" if is_text else "dates or durations:"
         raise ModelError(
-            "times must be numbers in the unit of dt, got dates or durations: write "
+            f"times must be numbers in the unit of dt, got {what} write "
             "(times - times[0]) / np.timedelta64(1, 's') if dt is in seconds, and round them with "
             f"psf.nearest_steps; got {shortened(times)}"
         )

@@ -96,7 +96,8 @@ def test_without_the_rights_of_root(tmp_path, may_write):
     tmp_path.chmod(0o755 if may_write else 0o555)
     run = subprocess.run(
         [*plain, sys.executable, "-c", CHILD.format(root=str(ROOT))],
-        env=os.environ | {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path},blas__ldflags=,cxx="},
+        env=os.environ
+        | {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path.as_posix()},blas__ldflags=,cxx="},
         capture_output=True,
         text=True,
         timeout=4 * SECONDS,

@@ -565,7 +565,7 @@ BAD = {
     ),
     "A not square": (
         lambda: system_of(psf.ExactLinear([[1.0, 2.0]], np.eye(2), dt=0.1)),
-        r"A must have shape \(2, 2\), got \(1, 2\)",
+        r"A must have shape \(2, 2\), got \(1, 2\); initial_mean has 2 states",
     ),
     "A not finite": (
         lambda: psf.ExactLinear([[np.nan]], [[1.0]], dt=0.1),

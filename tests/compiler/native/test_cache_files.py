@@ -45,7 +45,7 @@ print(pytensor.function([x], pt.sum(pt.exp(x)), mode="NUMBA")([0.0, 0.0]))
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_damaged_files_of_pytensor_are_compiled_anew(tmp_path, ending):
     def run():
-        flags = {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path},blas__ldflags=,cxx="}
+        flags = {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path.as_posix()},blas__ldflags=,cxx="}
         command = [sys.executable, "-c", SUM]
         return subprocess.run(
             command, env=os.environ | flags, capture_output=True, text=True, check=True
@@ -62,7 +62,7 @@ def test_damaged_files_of_pytensor_are_compiled_anew(tmp_path, ending):
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
-    flags = f"base_compiledir={tmp_path / 'file'},cxx="
+    flags = f"base_compiledir={(tmp_path / 'file').as_posix()},cxx="
     run = subprocess.run(
         [sys.executable, "-c", "import pymc_statespace_filters as psf; psf.EKF()"],
         env=os.environ | {"PYTENSOR_FLAGS": flags},
