@@ -46,7 +46,7 @@ thesis: $(VENV)/.installed  ## run the studies of the thesis at its settings, in
 thesis-quick: $(VENV)/.installed  ## the same in a short form; takes minutes, fails if a verdict does not hold
 	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py --quick $(ARGS) || exit 1; done
 
-published: $(VENV)/.installed  ## compute what others published, and compare; takes five minutes, fails if a number is off
+published: $(VENV)/.installed  ## compute what others published, and compare; takes four to ten minutes, fails if a number is off
 	$(IN)/python examples/published/run.py $(ARGS)
 
 paper: $(VENV)/.installed  ## draw the figure of the paper, in paper/; takes half a minute

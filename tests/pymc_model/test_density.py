@@ -1,6 +1,7 @@
 """A log-density at many points: the model's own, whoever evaluates it and in how many threads."""
 
 import time
+import warnings
 
 import numpy as np
 import pymc as pm
@@ -11,6 +12,7 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native import parallel_map as many_calls
+from pymc_statespace_filters.pymc_model import compilation
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.interrupts import interrupt_in
@@ -74,6 +76,17 @@ def test_many_parameters_without_a_compiler_of_c():
         psf.sample_dram(
             draws=4, tune=4, chains=1, progressbar=False, compute_convergence_checks=False
         )
+
+
+def test_other_warnings_of_a_compilation_are_shown(monkeypatch):
+    def compile_and_warn(inputs, outputs):
+        warnings.warn("Loop fusion failed because of the number of operands", stacklevel=1)
+        warnings.warn("something else", stacklevel=1)
+
+    monkeypatch.setattr(compilation, "compile_pymc", compile_and_warn)
+    with pytest.warns(UserWarning, match="something else") as shown:
+        compilation.compile_density([], [])
+    assert [str(warning.message) for warning in shown] == ["something else"]
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 5, 40])
