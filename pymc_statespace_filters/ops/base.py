@@ -215,8 +215,8 @@ def check_observed(p: int) -> Any:
         if observed.shape[0] != steps.shape[0] or observed.shape[1] != p:
             raise ModelError(
                 "observed must have a row for each step and a column for each observable; for a "
-                "record of another length give the variable steps=pm.Data(...), "
-                "observed=pm.Data(...) and dims=(..., ...), and replace both in one pm.set_data"
+                "record of another length give the variable steps and observed as pm.Data with "
+                "dims=(..., ...), as StateSpace says, and replace both in one pm.set_data"
             )
 
     return check
