@@ -67,7 +67,8 @@ def test_imported_distributions_are_the_declared_dependencies():
     imported = {
         canonicalize_name(module.partition(".")[0]) for module, _ in imports_from_elsewhere()
     }
-    assert imported == declared
+    assert imported | {"matplotlib"} == declared  # PyMC imports it, without depending on it
+    assert "matplotlib" not in imported
 
 
 # import-linter sees only whole external packages.
