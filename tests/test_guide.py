@@ -3,7 +3,9 @@
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -95,3 +97,18 @@ def test_notebooks_run_again_if_the_package_has_changed(guide, first):
     assert build(guide).returncode == 0
     assert (guide / "runs").read_text() == "ran\nran\n"
     assert len(list((guide / ".cache" / "notebooks").iterdir())) == 1
+
+
+def test_each_process_has_its_share_of_the_notebooks(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    page_order = import_module("page_order")
+    cells = {f"page_{i:03}": 0 for i in range(130)} | {f"tutorial_{i}": 3 * i for i in range(8)}
+    for page, n in cells.items():
+        (tmp_path / page).write_text("```{code-cell}\n```\n" * n)
+    pages = sorted(cells)
+    app, env = SimpleNamespace(parallel=2), SimpleNamespace(doc2path=tmp_path.joinpath)
+    page_order.spread_notebooks(app, env, pages)
+    assert sorted(pages) == sorted(cells)
+    of_runs = [sum(map(cells.get, run)) for run in page_order.make_chunks(pages, app.parallel)]
+    assert len(of_runs) > 2
+    assert max(of_runs) - min(of_runs) <= max(cells.values())

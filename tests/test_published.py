@@ -1,8 +1,11 @@
 """Numbers that others published, by the scripts of ``make published`` that take seconds."""
 
+import subprocess
 import sys
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
+from shutil import copy
 
 import numpy as np
 import pytest
@@ -62,10 +65,29 @@ def made_up(z, correlation=None):
     return comparison.Study("a study, of old", "nobody", numbers, 0.0, "", correlation)
 
 
-def run_with(monkeypatch, study):
+def run_with(monkeypatch, study, names=("any",)):
     run = import_module("run")
     monkeypatch.setattr(run, "import_module", lambda name: type("m", (), {"study": lambda: study}))
-    run.main(["any"])
+    run.main(list(names))
+
+
+@pytest.mark.parametrize("z", [1.0, 5.0])
+def test_the_table_of_the_guide_has_only_numbers_that_hold(monkeypatch, tmp_path, z):
+    table = tmp_path / "table.inc"
+    monkeypatch.setattr(import_module("run"), "TABLE", table)
+    with pytest.raises(SystemExit) if z > 3.0 else nullcontext():
+        run_with(monkeypatch, made_up([z]), names=())
+    assert table.exists() == (z < 3.0)
+
+
+def test_a_script_that_was_copied_prints_its_comparison(tmp_path):
+    for part in ("kitagawa.py", "comparison.py", "data/kitagawa.csv"):
+        (tmp_path / part).parent.mkdir(exist_ok=True)
+        copy(FOLDER / part, tmp_path / part)
+    command = [sys.executable, tmp_path / "kitagawa.py"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "-250.62" in printed
+    assert "errors by chance" not in printed  # too few numbers for a statement
 
 
 def test_a_number_that_is_off_ends_the_run_with_its_name(monkeypatch):

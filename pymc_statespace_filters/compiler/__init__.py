@@ -6,6 +6,6 @@ except OSError as error:
     raise OSError(
         error.errno,
         f"PyTensor cannot write compiled code to {error.filename!r} ({error.strerror}): set "
-        "PYTENSOR_FLAGS=base_compiledir=FOLDER, a folder that you may write to, with / in its path "
-        "on Windows too",
+        "PYTENSOR_FLAGS=base_compiledir=FOLDER, a folder that you may write to; its path has "
+        "forward slashes, on Windows too",
     ) from error

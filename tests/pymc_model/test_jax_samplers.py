@@ -26,6 +26,7 @@ QUIET = {
     "compute_convergence_checks": False,
 }  # fmt: skip
 PRIOR_MEAN, PRIOR_SD = 0.5, 0.4
+GRID = np.linspace(-1.5, 2.0, 701)
 
 
 def forced_model(filter=psf.EKF()):  # noqa: B008 (settings are frozen)
@@ -57,9 +58,6 @@ SAMPLERS = {
     "nutpie, gradient by JAX": lambda draws: by_nutpie(draws, "jax"),
     "nutpie, gradient by PyTensor": lambda draws: by_nutpie(draws, "pytensor"),
 }
-
-
-GRID = np.linspace(-1.5, 2.0, 701)
 
 
 @pytest.fixture(scope="module")
