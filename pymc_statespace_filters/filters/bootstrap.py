@@ -13,7 +13,7 @@ from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFil
 from pymc_statespace_filters.filters.ensemble.reductions import count
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters.system_table import log_density
+from pymc_statespace_filters.filters.plan import log_density
 
 
 @njit_internal

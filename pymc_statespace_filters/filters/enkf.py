@@ -1,17 +1,22 @@
 """Ensemble Kalman filter with perturbed observations (thesis, section 4.3, Eqs. 4.15-4.26)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.plan import Plan
 from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.ancestral_smoother import NO_LAG, ancestral_smoother
+from pymc_statespace_filters.filters.ensemble.ancestral_smoother import (
+    CARRY_PAST,
+    NO_LAG,
+    SMOOTH,
+)
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
 from pymc_statespace_filters.filters.ensemble.kalman_update import (
     Moments,
@@ -30,9 +35,9 @@ from pymc_statespace_filters.filters.outcomes import (
     NONE,
     ZERO_WEIGHTS,
 )
-from pymc_statespace_filters.filters.protocol import StatesFunction, System
+from pymc_statespace_filters.filters.plan import log_density, observe
+from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.filters.settings import check_choice, check_count
-from pymc_statespace_filters.filters.system_table import log_density, observe
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0
@@ -179,15 +184,15 @@ class EnKF(EnsembleFilterBase):
         """Return how many normals the filter takes where."""
         return super().noise_sizes(system.with_gaussian_steps)
 
-    def evaluation(self, system: System) -> CompiledFunction:
-        """Bind the filter to one system, with normal variables in place of ``process_dist``."""
-        return super().evaluation(system.with_gaussian_steps)
+    def plan(
+        self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
+    ) -> Plan:
+        """Plan a function of this filter, with normal variables in place of ``process_dist``."""
+        return super().plan(system.with_gaussian_steps, run, functions, **others)
 
-    def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
-        """Compile the ensemble Kalman smoother for one system."""
-        return ancestral_smoother(
-            self.with_callback(system), system, self.n_members, updates=True, lag=NO_LAG
-        )
+    def smoother(self, system: System) -> Plan:
+        """Plan the ensemble Kalman smoother for one system."""
+        return self.observed(system, SMOOTH, observer=CARRY_PAST, updates=1, lag=NO_LAG)
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""

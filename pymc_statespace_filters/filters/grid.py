@@ -11,28 +11,22 @@ short, the evaluation starts again with a finer or a longer one. Where no unifor
 starts again on segments, see `point_mass.segments`.
 """
 
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import carray, types
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    arguments_class,
-)
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.plan import Plan
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NONE,
-    OUT_OF_MEMORY,
-    TOO_FAR,
-)
+from pymc_statespace_filters.filters.calls import OK, likelihood_entry
+from pymc_statespace_filters.filters.functions import likelihood, predictions, run, states
+from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE
+from pymc_statespace_filters.filters.plan import make_plan, read_system, settings_of
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     END,
     ON_GRID,
@@ -41,37 +35,20 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     discard,
     first_grid,
     next_attempt,
+    write_outcome,
 )
-from pymc_statespace_filters.filters.point_mass.predictions import predictions_function
+from pymc_statespace_filters.filters.point_mass.predictions import GRID_PREDICTIONS
 from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
+from pymc_statespace_filters.filters.point_mass.rows import FILTERED, MOMENTS
 from pymc_statespace_filters.filters.point_mass.segment_pass import (
     discard_segments,
     pass_on_segments,
 )
-from pymc_statespace_filters.filters.point_mass.states import run_function, states_function
-from pymc_statespace_filters.filters.protocol import (
-    LogLikelihoodFunction,
-    PredictionsFunction,
-    RunFunction,
-    StatesFunction,
-    System,
-)
-from pymc_statespace_filters.filters.system_table import (
-    SYSTEM_ARGUMENTS,
-    read_system,
-    system_table,
-)
-
-POINT_MASS_ARGUMENTS = SYSTEM_ARGUMENTS | {
-    "tolerance": types.float64,
-    "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
-    "terms": F64_PTR, "health": F64_PTR,
-}  # fmt: skip
+from pymc_statespace_filters.filters.point_mass.states import GRID_RUN, GRID_STATES
+from pymc_statespace_filters.filters.protocol import System
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
 _WITH_KINKS = 1e-5
-
-PointMassArguments = arguments_class("PointMassArguments", POINT_MASS_ARGUMENTS, __name__)
 
 
 @dataclass(frozen=True)
@@ -173,63 +150,43 @@ class GridFilter:
         """Whether the likelihood is that of the system, to the tolerance."""
         return system.has_exact_observation_density and system.has_smooth_transition
 
-    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+    def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        POINT_MASS.compile()
-        table = system_table(system, ("step_moments", "log_density"))
-        evaluate, make_table, dt = POINT_MASS.external, table.make, system.dt
-        tolerance = self._tolerance_for(system)
+        return likelihood(self._plan(system, POINT_MASS))
 
-        @njit_callable
-        def run(theta, steps, observed, inputs, t0, noise):
-            terms, health = np.full(steps.size, -np.inf), np.empty(3)
-            health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
-            table = make_table()
-            arguments = PointMassArguments(
-                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
-                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], tolerance=tolerance,
-                steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
-                t0=t0, terms=terms.ctypes.data, health=health.ctypes.data,
-            )  # fmt: skip
-            evaluate(*arguments)
-            keep_alive(table)
-            return terms, health
-
-        return CompiledFunction(run, key_of(repr(self), table.key, POINT_MASS.key))
-
-    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+    def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states.
 
         The draws of one ``draw_seed`` are independent; if smoothed, they are a path.
         """
-        return states_function(system, self._tolerance_for(system), moment)
+        return states(self._plan(system, GRID_STATES, MOMENTS[moment]))
 
-    def compile_predictions(self, system: System) -> CompiledFunction[PredictionsFunction]:
+    def compile_predictions(self, system: System) -> PlannedFunction:
         """Compile the law of every observation given those before it."""
-        return predictions_function(system, self._tolerance_for(system))
+        return predictions(self._plan(system, GRID_PREDICTIONS, others=("observe",)))
 
-    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+    def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        return run_function(system, self._tolerance_for(system))
+        return run(self._plan(system, GRID_RUN, FILTERED))
+
+    def _plan(
+        self, system: System, run: EntryPoint, *settings: int, others: Sequence[str] = ()
+    ) -> Plan:
+        functions = ("step_moments", "log_density", *others)
+        return make_plan(system, run, functions, (self._tolerance_for(system), *settings))
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
         return "point masses, forward and backward"
 
 
-def _point_mass(
-    table, dt, theta, n_theta, inputs, n_rows, tolerance, steps, n_observations, observed, t0,
-    terms, health,
-):  # fmt: skip
-    """The filter as one function for all systems; it writes terms and health."""
-    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    record = carray(observed, (n_observations, system.p))
-    out, state = carray(terms, (n_observations,)), carray(health, (3,))
-    code, j = _evaluate(system, carray(steps, (n_observations,)), record, t0, tolerance, out)
-    for failed in range(j, n_observations):
-        out[failed] = -np.inf
-    failure = code if code >= NONE else TOO_FAR
-    state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
+@njit_internal
+def _point_mass(plan, record, request, seed, to):
+    """Write terms and health of one record."""
+    system, tolerance = read_system(plan, record.theta, record.inputs), settings_of(plan)[0]
+    code, j = _evaluate(system, record.steps, record.observed, record.t0, tolerance, to.terms)
+    write_outcome(code, j, to.terms, to.health)
+    return OK
 
 
 @njit_internal
@@ -251,4 +208,4 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
     return code, j
 
 
-POINT_MASS = EntryPoint(_point_mass, POINT_MASS_ARGUMENTS, "point_mass", digest("point_mass"))
+POINT_MASS = likelihood_entry("point_mass", _point_mass, digest("point_mass"))

@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import carray
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.plan import NORMALS
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.bootstrap import update
+from pymc_statespace_filters.filters.calls import OK, likelihood_entry
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
     RESAMPLED,
@@ -31,7 +33,7 @@ from pymc_statespace_filters.filters.ensemble.defence import (
     is_doubtful,
     unguided_at_start,
 )
-from pymc_statespace_filters.filters.ensemble.guide import Record, make_guide
+from pymc_statespace_filters.filters.ensemble.guide import make_guide
 from pymc_statespace_filters.filters.ensemble.guided_moves import (
     begin_interval,
     emit_forecast,
@@ -48,81 +50,76 @@ from pymc_statespace_filters.filters.ensemble.guided_predictions import (
     start_copies,
 )
 from pymc_statespace_filters.filters.ensemble.loop import (
-    FILTER_ARGUMENTS,
     N_LEADING,
     n_sums,
     noise_of_rank,
+    observer_of,
+    rank_of,
 )
 from pymc_statespace_filters.filters.ensemble.noise import initial_rows, resampling_normals
 from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.ensemble.resampling import resampler
 from pymc_statespace_filters.filters.outcomes import NONE, is_missing
+from pymc_statespace_filters.filters.plan import PLAN, read_system, settings_of
 from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.filters.system_table import read_system
 
 
-def _run(
-    table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
-    seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
-    terms, n_effective, health,
-):  # fmt: skip
-    given = carray(settings, (N_LEADING + 2,))
-    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    layout = RankLayout(rank, n_ranks, exchange)
-    local = local_partition(layout, int(given[0]), n_sums(system))
-    at = carray(steps, (n_observations,))
-    record = Record(at, carray(observed, (n_observations, system.p)), t0)
-    out, state = carray(terms, (n_observations,)), carray(health, (3,))
-    numbers = carray(n_effective, (n_observations,))
-    noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
+@njit_internal
+def _evaluate(plan, record, request, seed, to):
+    given, steps, dt = settings_of(plan), record.steps, plan.view(np.float64)[PLAN.dt]
+    system = read_system(plan, record.theta, record.inputs)
+    local = local_partition(rank_of(request), int(given[0]), n_sums(system))
+    noise, fits = noise_of_rank(seed, request, given, steps, local)
+    if not fits:
+        return NORMALS
     scheme = int(given[N_LEADING + 1])
-    resampling = resampler(given[N_LEADING], scheme, order, system.n, local)
+    resampling = resampler(given[N_LEADING], scheme, plan[PLAN.order], system.n, local)
     particles = guided_particles(system.n, system.m, system.p, local)
     guide = make_guide(system, record)
-    members, to = particles.members, (callback, integers, reals)
-    state[0], state[1], state[2] = given[0], NONE, -1
+    members, observer, health = particles.members, observer_of(request), to.health
+    health[0], health[1], health[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
     unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
     share = unguided_at_start(local.n_members)
     start(system, guide, initial_rows(noise), unguided, particles, local)
-    copies = start_copies(system, noise, members, to, local)
-    emit_forecast(to, -1, k, unguided, share, particles, nothing, ancestors)
-    predict(system, record, noise, -1, k, copies, to, nothing, ancestors, local)
-    for j in range(n_observations):
-        while k < at[j]:
-            until = at[j] if callback == 0 else k + 1
+    copies = start_copies(system, noise, members, observer, local)
+    emit_forecast(observer, -1, k, unguided, share, particles, nothing, ancestors)
+    predict(system, record, noise, -1, k, copies, observer, nothing, ancestors, local)
+    for j in range(steps.size):
+        while k < steps[j]:
+            until = steps[j] if observer[0] == 0 else k + 1
             move(system, guide, record, noise, k, until, unguided, particles, local)
             k = until
-            emit_forecast(to, j, k, unguided, share, particles, nothing, ancestors)
-            predict(system, record, noise, j, k, copies, to, nothing, ancestors, local)
+            emit_forecast(observer, j, k, unguided, share, particles, nothing, ancestors)
+            predict(system, record, noise, j, k, copies, observer, nothing, ancestors, local)
         if is_missing(record.observed, j):
-            out[j] = 0.0
+            to.terms[j] = 0.0
             continue
         weigh_moves(particles, unguided, share, members.log_w)
         begin_interval(particles)
         d = record.observed[j]
-        found = update(system, j, k, t0 + k * dt, d, noise, members, local, ())
+        found = update(system, j, k, record.t0 + k * dt, d, noise, members, local, ())
         if found.failure != NONE:
-            state[0], state[1], state[2], numbers[j] = 0.0, found.failure, j, 0.0
+            health[0], health[1], health[2], to.n_effective[j] = 0.0, found.failure, j, 0.0
             break
-        out[j] = found.increment
-        log_total, numbers[j] = look_ahead(guide, j, k, particles, local)
-        state[0] = min(state[0], numbers[j])
-        emit(to, UPDATED, j, k, members, d, ancestors)
+        to.terms[j] = found.increment
+        log_total, to.n_effective[j] = look_ahead(guide, j, k, particles, local)
+        health[0] = min(health[0], to.n_effective[j])
+        emit(observer, UPDATED, j, k, members, d, ancestors)
         doubtful, unguided, share = is_doubtful(guide, j + 1), NOBODY, UNGUIDED
-        if resampling.always or doubtful or numbers[j] < resampling.threshold:
+        if resampling.always or doubtful or to.n_effective[j] < resampling.threshold:
             z = resampling_normals(noise, j, k)
             if doubtful:
                 unguided = first_unguided(z)
             mixed = UNGUIDED if doubtful else 0.0
             resample_ahead(guide, j, k, log_total, resampling, z, mixed, particles, local)
-            emit(to, RESAMPLED, j, k, members, nothing, ancestors)
-        copy_again(members, copies, to)
-    if state[1] == NONE:
-        emit(to, ENDED, n_observations, k, members, nothing, ancestors)
+            emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
+        copy_again(members, copies, observer)
+    if health[1] == NONE:
+        emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
+    return OK
 
 
 @dataclass(frozen=True)
@@ -202,8 +199,8 @@ class GuidedPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = EntryPoint(
-        _run, FILTER_ARGUMENTS, "guided_pf", digest("guided_pf"), needs=(FILL_NORMALS,)
+    entry: ClassVar[EntryPoint] = likelihood_entry(
+        "guided_pf", _evaluate, digest("guided_pf"), needs=(FILL_NORMALS,)
     )
     resample_below: float = 0.5
 

@@ -27,9 +27,9 @@ from pymc_statespace_filters.filters.kernel_density.importance_weights import (
     reweight,
 )
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.plan import log_density, observe
 from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.filters.settings import check_choice
-from pymc_statespace_filters.filters.system_table import log_density, observe
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 

@@ -5,7 +5,7 @@ outputs. No data are closed over, so neither PyTensor's merging of equal nodes n
 machine code on disk can confuse two data sets.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
@@ -27,6 +27,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.native.python_call import TimedCall, call_machine_code
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter, check_filter
@@ -66,13 +67,16 @@ class FilterOp(Op):
     __props__ = ("system", "filter")
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = RECORD_INPUTS
     output_types: ClassVar[tuple[TensorType, ...]]
+    # The names of the outputs as results of a plan.
+    result_names: ClassVar[tuple[str, ...]] = ("terms", "health")
     # Calls of the checks of what `pm.set_data` may have replaced; kernels do not check bounds.
     record_checks: ClassVar[tuple[str, ...]] = (
         "check(steps, inputs)",
         "check_observed(steps, observed)",
     )
-    # How an input is written in the call of the kernel, where not as a number or a copy.
-    argument_code: ClassVar[Mapping[str, str]] = {}
+    # How an input is written in the call of a kernel without a plan, where not as a number or a
+    # copy; None if it is left out.
+    argument_code: ClassVar[Mapping[str, str | None]] = {}
     # Whether its machine code exchanges numbers with other ranks, from the thread that calls it.
     is_collective: ClassVar[bool] = False
 
@@ -84,9 +88,15 @@ class FilterOp(Op):
         # The default would print every equation of the system.
         return f"{type(self).__name__}{{{self.filter}}}"
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> CompiledFunction | PlannedFunction:
         """Compile the function of the inputs."""
         raise NotImplementedError
+
+    @property
+    def results(self) -> list[tuple[str, int]]:
+        """Names and dimensions of the outputs."""
+        kinds = zip(self.result_names, self.output_types, strict=True)
+        return [(name, kind.ndim) for name, kind in kinds]
 
     def n_steps(self, inputs: Sequence[np.ndarray]) -> int:
         """Steps of an evaluation, roughly; the steps of a panel are a column of its rows."""
@@ -126,31 +136,42 @@ def _checked(value: Variable, name: str, dtype: str, ndim: int) -> Variable:
 
 @cache
 def evaluator(op: FilterOp) -> Any:
-    """A compiled Python function of the operation's inputs; its machine code is cached on disk.
+    """A Python function of the operation's inputs, arrays or numbers.
 
-    It is compiled without PyTensor's function around it, which would take as long to compile again,
-    and whose object stores the arguments of a call in cells that all threads would overwrite.
+    It goes without PyTensor's function, which would take as long to compile again, and whose object
+    stores the arguments of a call in cells that all threads would overwrite.
     """
     with COMPILATION:
-        function, key = _call(op)
-    compiled = jit(function)
-    machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
+        compiled = kernel(op)
     kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]
-    call = TimedCall(machine_code)
+    function = compiled if isinstance(compiled, PlannedFunction) else _jitted(op)
+    call = TimedCall(function)
 
     def evaluate(*values: Any) -> tuple:
         # Other types of arrays (in another order, or read-only) would be compiled again.
         arrays = [np.require(v, kind, ("C", "W")) for v, kind in zip(values, kinds, strict=True)]
-        if not machine_code.overloads:
-            with held_interrupts(), slow_compilation(f"{type(op.filter).__name__} for this system"):
-                machine_code.compile(tuple(map(typeof, arrays)))
         if op.is_collective:
-            results = call_machine_code(machine_code, *arrays)
+            results = call_machine_code(function, *arrays)
         else:
             results = call(arrays, op.n_steps(arrays))
         return results if isinstance(results, tuple) else (results,)
 
     return evaluate
+
+
+def _jitted(op: FilterOp) -> Callable:
+    """A compiled function of an operation whose filter has no plan; on disk if it has a key."""
+    function, key = _call(op)
+    compiled = jit(function)
+    machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
+
+    def call(*arrays: np.ndarray) -> Any:
+        if not machine_code.overloads:
+            with held_interrupts(), slow_compilation(f"{type(op.filter).__name__} for this system"):
+                machine_code.compile(tuple(map(typeof, arrays)))
+        return machine_code(*arrays)
+
+    return call
 
 
 def check_record(system: StateSpaceModel) -> Any:
@@ -229,15 +250,20 @@ def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None
 
 
 @cache
-def kernel(op: FilterOp) -> CompiledFunction:
+def kernel(op: FilterOp) -> CompiledFunction | PlannedFunction:
     """The compiled function of an operation, made once."""
-    return op.compile(compile_system(op.system))
+    compiled = op.compile(compile_system(op.system))
+    if isinstance(compiled, PlannedFunction):
+        arguments = [(name, ndim) for name, _, ndim in op.input_types]
+        return PlannedFunction(compiled.plan, arguments, op.results)
+    return compiled
 
 
 class ThetaDerivative(FilterOp):
     """An operation whose result is a cotangent of theta."""
 
     output_types = (pt.dvector,)
+    result_names = ("theta_bar",)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """The shape of theta."""
@@ -256,6 +282,9 @@ def theta_cotangent_only(op: Op, inputs: Sequence[Variable], theta_bar: Variable
 @register_funcify_and_cache_key(FilterOp)
 def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     """The compiled function of an operation, and its key."""
+    compiled = kernel(op)
+    if isinstance(compiled, PlannedFunction):
+        return numba_njit(compiled.source()), compiled.key
     function, key = _call(op)
     return numba_njit(function), key
 
@@ -270,11 +299,12 @@ def _call(op: FilterOp) -> tuple[Any, str | None]:
     """
     compiled = kernel(op)
     names = [name for name, _, _ in op.input_types]
-    arguments = [
+    codes = [
         op.argument_code.get(name, f"{name}.copy()" if ndim else f"{name}.item()")
         for name, _, ndim in op.input_types
     ]
-    lines = [*op.record_checks, f"return run({', '.join(arguments)})"]
+    arguments = ", ".join(code for code in codes if code is not None)
+    lines = [*op.record_checks, f"return run({arguments})"]
     source = f"def call({', '.join(names)}):\n" + "".join(f"    {line}\n" for line in lines)
     namespace = {
         "__name__": __name__,

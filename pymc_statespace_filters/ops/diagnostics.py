@@ -12,6 +12,7 @@ class TermHealth(FilterOp):
     """Terms (J,) of the likelihood, the effective number (J,) behind each, and health (3,)."""
 
     output_types = (pt.dvector, pt.dvector, pt.dvector)
+    result_names = ("terms", "n_effective", "health")
     filter: HealthFilter
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
@@ -23,6 +24,7 @@ class Predictions(FilterOp):
     """The law of every observation before it is seen: see `protocol.PredictionsFunction`."""
 
     output_types = (pt.dmatrix, pt.dtensor3, pt.dmatrix, pt.dmatrix)
+    result_names = ("predicted", "predicted_cov", "log_below", "log_above")
     filter: PredictionFilter
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:

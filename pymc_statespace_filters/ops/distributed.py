@@ -13,21 +13,27 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import call_address
+from pymc_statespace_filters.compiler.native.plan import (
+    N_RECORD,
+    N_REQUEST,
+    N_RESULTS,
+    RAISED,
+    RECORD,
+    REQUEST,
+    RESULTS,
+    PlanFunction,
+)
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
 from pymc_statespace_filters.filters.recommendation import short_form
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, RECORD_INPUTS, evaluator
+from pymc_statespace_filters.ops.base import RECORD_INPUTS, evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
-_CALLBACK = (("number", "int64", 0), ("callback", "int64", 0))
+_CALLBACK = (("number", "int64", 0), ("replacement", "int64", 0))
 
 
 class DistributedLogLikelihood(LogLikelihood):
@@ -41,12 +47,7 @@ class DistributedLogLikelihood(LogLikelihood):
         *RECORD_INPUTS, ("rank", "int64", 0), ("n_ranks", "int64", 0), ("exchange", "int64", 0),
     )  # fmt: skip
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
-    argument_code: ClassVar[Mapping[str, str]] = {}
     is_collective = True
-
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
-        """The filter's log-likelihood for the members of one rank."""
-        return self.filter.compile_distributed(system)
 
 
 def distributed_evaluator(system: StateSpaceModel, filter: Filter, comm: Communicator) -> Callable:
@@ -92,32 +93,10 @@ class CallbackLogLikelihood(LogLikelihood):
 
     input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (*RECORD_INPUTS, *_CALLBACK)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),()->(j),(h)"
-    argument_code: ClassVar[Mapping[str, str]] = {"seed": "seed.item(), no_normals.copy()"}
-
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
-        """The filter's log-likelihood and the call."""
-        of_filter = super().compile(system)
-        by_filter = of_filter.function
-
-        @jit
-        def run(theta, steps, observed, inputs, t0, seed, normals, number, callback):
-            if callback == 0:
-                return by_filter(theta, steps, observed, inputs, t0, (seed, normals))
-            sizes = np.empty(6, np.int64)
-            sizes[0], sizes[1] = theta.size, steps.size
-            sizes[2], sizes[3] = observed.shape
-            sizes[4], sizes[5] = inputs.shape
-            terms, health = np.empty(steps.size), np.empty(HEALTH_SIZE)
-            raised = np.zeros(1, np.int64)
-            call_address(
-                callback,
-                (number, theta, steps, observed, inputs, t0, seed, sizes, terms, health, raised),
-            )
-            if raised[0]:
-                raise RuntimeError("the callback of a likelihood raised an error")
-            return terms, health
-
-        return CompiledFunction(run, key_of("by the filter or a callback", of_filter.key))
+    # A filter without a plan is never replaced.
+    argument_code: ClassVar[Mapping[str, str | None]] = {
+        "seed": "(seed.item(), no_normals.copy())", "number": None, "replacement": None,
+    }  # fmt: skip
 
 
 class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
@@ -128,55 +107,61 @@ class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
 
     input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_CALLBACK)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(z),(),()->(j),(h)"
-    # Not copied: there may be millions.
-    argument_code: ClassVar[Mapping[str, str]] = {"normals": "np.ascontiguousarray(normals)"}
+    argument_code: ClassVar[Mapping[str, str | None]] = {
+        "seed": "(seed.item(), np.ascontiguousarray(normals))", "normals": None, "number": None,
+        "replacement": None,
+    }  # fmt: skip
 
 
 class PythonCallback:
     """A Python function that evaluates likelihoods for machine code.
 
     ``evaluate(number, theta, steps, observed, inputs, t0, seed)`` receives copies and returns terms
-    and health. Machine code calls it at ``address``, which is valid while this object lives. What
-    it raises is stored in ``error``; from then on it is not called, and every evaluation raises.
+    and health. Machine code calls it at ``address`` in place of the function of a plan; it is valid
+    while this object lives. What it raises is stored in ``error``; from then on it is not called,
+    and every evaluation raises.
     """
 
     def __init__(self, evaluate: Evaluate):
         self._evaluate = evaluate
         self.error: BaseException | None = None
-        pointer, number, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-        signature = ctypes.CFUNCTYPE(None, number, *[pointer] * 4, real, number, *[pointer] * 4)
-        self._callback = signature(self._called)
-        address = ctypes.cast(self._callback, pointer).value
+        self._callback = PlanFunction(self._called)
+        address = ctypes.cast(self._callback, ctypes.c_void_p).value
         self.address = np.array(address, dtype=np.int64)
 
-    def _called(self, number: int, *arguments: Any) -> None:
-        theta, steps, observed, inputs, t0, seed, sizes, terms, health, raised = arguments
+    def _called(self, plan: int, record: int, request: int, results: int) -> int:
         # An exception cannot pass through machine code.
         try:
             if self.error is None:
-                n_theta, n_steps, *shapes = _copied(sizes, (6,), np.int64).tolist()
-                values = self._evaluate(
-                    number,
-                    _copied(theta, (n_theta,)),
-                    _copied(steps, (n_steps,), np.int64),
-                    _copied(observed, shapes[:2]),
-                    _copied(inputs, shapes[2:]),
-                    t0,
-                    seed,
+                given = _copied(record, (N_RECORD,), np.int64)
+                asked, to = (
+                    _copied(address, (size,), np.int64)
+                    for address, size in ((request, N_REQUEST), (results, N_RESULTS))
                 )
-                for address, value in zip((terms, health), values, strict=True):
+                observed = given[RECORD.n_observed], given[RECORD.n_observables]
+                inputs = given[RECORD.n_input_rows], given[RECORD.n_inputs]
+                values = self._evaluate(
+                    int(asked[REQUEST.number]),
+                    _copied(given[RECORD.theta], (given[RECORD.n_theta],)),
+                    _copied(given[RECORD.rows], (given[RECORD.n_rows],), np.int64),
+                    _copied(given[RECORD.observed], observed),
+                    _copied(given[RECORD.inputs], inputs),
+                    float(_copied(given[RECORD.starts], (1,))[0]),
+                    int(asked[REQUEST.seed]),
+                )
+                for address, value in zip(to[[RESULTS.terms, RESULTS.health]], values, strict=True):
                     _write(address, value)
         except BaseException as error:
             self.error = error
-        ctypes.c_int64.from_address(raised).value = self.error is not None
+        return RAISED if self.error is not None else 0
 
 
 def _copied(address: int, shape: Sequence[int], dtype: Any = np.float64) -> np.ndarray:
     values = np.empty(shape, dtype)
-    ctypes.memmove(values.ctypes.data, address, values.nbytes)
+    ctypes.memmove(values.ctypes.data, int(address), values.nbytes)
     return values
 
 
 def _write(address: int, values: np.ndarray) -> None:
     numbers = np.ascontiguousarray(values, dtype=np.float64)
-    ctypes.memmove(address, numbers.ctypes.data, numbers.nbytes)
+    ctypes.memmove(int(address), numbers.ctypes.data, numbers.nbytes)

@@ -42,7 +42,7 @@ class LogLikelihood(FilterOp):
 
     output_types = (pt.dvector, pt.dvector)
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
-    argument_code: ClassVar[Mapping[str, str]] = {"seed": "(seed.item(), no_normals.copy())"}
+    argument_code: ClassVar[Mapping[str, str | None]] = {"seed": "(seed.item(), no_normals.copy())"}
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The filter's log-likelihood."""
@@ -107,6 +107,7 @@ class TapedLogLikelihood(FilterOp):
 
     filter: DifferentiableFilter
     output_types = (pt.dvector, pt.dvector, pt.dmatrix)
+    result_names = ("terms", "health", "tape")
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The forward pass."""
@@ -120,7 +121,7 @@ class TapePullback(ThetaDerivative):
     input_types = (*RECORD_INPUTS, ("tape", "float64", 2), ("terms_bar", "float64", 1))
     # The tape was made by the other operation, which checked the record.
     record_checks = ()
-    argument_code: ClassVar[Mapping[str, str]] = {"tape": "tape"}
+    argument_code: ClassVar[Mapping[str, str | None]] = {"tape": "tape"}
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
         """The backward pass."""

@@ -22,6 +22,7 @@ class StoredNoise(FilterOp):
     filter: EnsembleFilter
     input_types = (RECORD_INPUTS[1], RECORD_INPUTS[5])
     output_types = (pt.dvector,)
+    result_names = ("normals",)
     record_checks = ()
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:
@@ -35,6 +36,6 @@ class LogLikelihoodOfNoise(LogLikelihood):
     input_types = (*RECORD_INPUTS[:5], ("normals", "float64", 1))
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(z)->(j),(h)"
     # Not copied: they are many.
-    argument_code: ClassVar[Mapping[str, str]] = {
+    argument_code: ClassVar[Mapping[str, str | None]] = {
         "normals": "(np.int64(0), np.ascontiguousarray(normals))"
     }

@@ -19,6 +19,7 @@ from pytensor.tensor.rewriting.basic import register_specialize
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
 from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.filters.outcomes import NONE
 from pymc_statespace_filters.filters.protocol import PanelFilter
@@ -48,11 +49,12 @@ class PanelLogLikelihood(LogLikelihood):
     record_checks = _CHECKS
     gufunc_signature = "(g,k),(j,c),(j,p),(s,u),(),()->(j),(h)"
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> CompiledFunction | PlannedFunction:
         """All records side by side if the filter has that, else one after the other."""
         if isinstance(self.filter, PanelFilter):
             return _without_stored_noise(self.filter.compile_panel(system))
-        return _one_by_one(self.filter.compile(system))
+        compiled = self.filter.compile(system)
+        return compiled if isinstance(compiled, PlannedFunction) else _one_by_one(compiled)
 
     def gradient(self) -> "PanelLogLikelihoodGradient":
         """The operation of the vector-Jacobian product."""

@@ -10,15 +10,16 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 
 
 class States(FilterOp):
-    """Mean, sd and a draw (R, n) of the state at ``rows``, n_effective (R,), and health (3,).
+    """Mean, sd and a draw (R, n) of the state at steps ``wanted``, n_effective (R,), health (3,).
 
     ``moment`` is "predicted" (given the observations at earlier steps than the row's), "filtered"
     (also at the row's) or "smoothed" (all). ``draw_seed`` is the seed of the draw alone.
     """
 
     __props__ = ("system", "filter", "moment")  # type: ignore[assignment]
-    input_types = (*RECORD_INPUTS, ("rows", "int64", 1), ("draw_seed", "int64", 0))
+    input_types = (*RECORD_INPUTS, ("wanted", "int64", 1), ("draw_seed", "int64", 0))
     output_types = (pt.dmatrix, pt.dmatrix, pt.dmatrix, pt.dvector, pt.dvector)
+    result_names = ("mean", "sd", "drawn", "n_effective_wanted", "health")
     filter: StatesFilter
 
     def __init__(self, system: StateSpaceModel, filter: StatesFilter, moment: str) -> None:
@@ -31,14 +32,15 @@ class States(FilterOp):
 
 
 class FilterRun(FilterOp):
-    """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``rows``.
+    """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``wanted`` steps.
 
     The latter as mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0
     without members.
     """
 
-    input_types = (*RECORD_INPUTS, ("rows", "int64", 1))
+    input_types = (*RECORD_INPUTS, ("wanted", "int64", 1))
     output_types = (pt.dvector, pt.dvector, pt.dmatrix, pt.dtensor3, pt.dtensor3, pt.dmatrix)
+    result_names = ("terms", "health", "mean", "cov", "members", "weights")
     filter: RunFilter
 
     def compile(self, system: CompiledSystem) -> CompiledFunction:

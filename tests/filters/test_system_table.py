@@ -11,7 +11,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     EntryPoint,
     arguments_class,
 )
-from pymc_statespace_filters.filters.system_table import (
+from pymc_statespace_filters.filters.plan import (
     N_SLOTS,
     SYSTEM_ARGUMENTS,
     TABLE,

@@ -104,7 +104,7 @@ class EntryPoint:
     Parameters
     ----------
     function : callable
-        Returns nothing and raises nothing. It may close over compiled functions.
+        Raises nothing. It may close over compiled functions.
     arguments : mapping of str to numba type
         The parameters of the function. Their names and order are checked, because machine code
         would read one argument as another. ``F64_PTR`` and ``I64_PTR`` are addresses, of which
@@ -115,6 +115,8 @@ class EntryPoint:
         Identifies the code, see `digest`; None if it cannot be cached on disk.
     needs : sequence of EntryPoint
         What the function calls by symbol.
+    returns : numba type, optional
+        Of the result, if there is one.
     """
 
     def __init__(
@@ -124,6 +126,7 @@ class EntryPoint:
         name: str,
         key: str | None,
         needs: Sequence["EntryPoint"] = (),
+        returns: Any = types.void,
     ):
         if (parameters := list(signature(function).parameters)) != list(arguments):
             raise TypeError(
@@ -133,7 +136,7 @@ class EntryPoint:
         self._function = function
         self._name = name
         self._arguments = tuple(arguments.values())
-        self._needs = needs
+        self._needs, self._returns = needs, returns
         self.key = key
         self.symbol = f"psf_{name}_{key or uuid4().hex}"
 
@@ -146,7 +149,7 @@ class EntryPoint:
         options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
         compiled: Any = CFunc(
             self._function,
-            (self._arguments, types.void),
+            (self._arguments, self._returns),
             {},
             options,
             pipeline_class=InternalLinkageCompiler,
@@ -169,7 +172,7 @@ class EntryPoint:
         """The function for use in compiled functions; addresses are passed as integers."""
         pointer = types.CPointer
         arguments = (types.intp if isinstance(a, pointer) else a for a in self._arguments)
-        return types.ExternalFunction(self.symbol, types.void(*arguments))
+        return types.ExternalFunction(self.symbol, self._returns(*arguments))
 
 
 def arguments_class(name: str, arguments: Mapping[str, Any], module: str) -> Any:
@@ -193,20 +196,41 @@ def address_of(typing_context, symbol):
 
 
 @intrinsic
-def call_address(typing_context, address, arguments):
-    """Call the entry point at an address with a tuple of numbers, addresses and arrays.
-
-    An array is passed by address and stays alive until the call.
-    """
+def pointer(typing_context, address):
+    """An integer as an address, of which ``numba.carray`` makes an array."""
 
     def generate(context, builder, signature, values):
-        kinds = signature.args[1]
-        given = list(cgutils.unpack_tuple(builder, values[1]))
-        for i, kind in enumerate(kinds):
-            if isinstance(kind, types.Array):
-                given[i] = context.make_array(kind)(context, builder, given[i]).data
-        function = ir.FunctionType(ir.VoidType(), [value.type for value in given])
-        builder.call(builder.inttoptr(values[0], function.as_pointer()), given)
-        return context.get_dummy_value()
+        return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
 
-    return types.void(types.intp, arguments), generate
+    return types.voidptr(types.int64), generate
+
+
+def _caller(returns: Any) -> Any:
+    """A function that calls an entry point with this type of result."""
+
+    @intrinsic
+    def call(typing_context, address, arguments):
+        def generate(context, builder, signature, values):
+            kinds = signature.args[1]
+            given = list(cgutils.unpack_tuple(builder, values[1]))
+            for i, kind in enumerate(kinds):
+                if isinstance(kind, types.Array):
+                    given[i] = context.make_array(kind)(context, builder, given[i]).data
+            result = ir.VoidType() if returns == types.void else context.get_value_type(returns)
+            function = ir.FunctionType(result, [value.type for value in given])
+            returned = builder.call(builder.inttoptr(values[0], function.as_pointer()), given)
+            return context.get_dummy_value() if returns == types.void else returned
+
+        return returns(types.intp, arguments), generate
+
+    return call
+
+
+call_address = _caller(types.void)
+"""Call the entry point at an address with a tuple of numbers, addresses and arrays.
+
+An array is passed by address and stays alive until the call.
+"""
+
+call_for_status = _caller(types.int64)
+"""Call an entry point that returns a status."""

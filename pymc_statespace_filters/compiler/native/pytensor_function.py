@@ -26,6 +26,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     I64_PTR,
     EntryPoint,
     call_address,
+    pointer,
 )
 from pymc_statespace_filters.compiler.native.python_call import call_machine_code
 from pymc_statespace_filters.parallel.signals import held_interrupts
@@ -129,7 +130,7 @@ class NativeFunction:
 @cache
 def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTuple) -> int:
     """Compile the adapter of these types, from a table of addresses to a call; its address."""
-    namespace: dict[str, Any] = {"__name__": __name__, "carray": carray, "pointer": _pointer}
+    namespace: dict[str, Any] = {"__name__": __name__, "carray": carray, "pointer": pointer}
     namespace["invoke"] = _invoker(signature, results)
     arrays, n_table = "", _N_ADDRESSES + len(arguments)
     for i, kind in enumerate(arguments):
@@ -158,16 +159,6 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
     entry = EntryPoint(namespace["adapter"], {"table": I64_PTR, "out": F64_PTR}, "adapter", key)
     entry.compile()
     return entry.address
-
-
-@intrinsic
-def _pointer(typing_context, address):
-    """An integer as an address."""
-
-    def generate(context, builder, signature, values):
-        return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
-
-    return types.voidptr(types.int64), generate
 
 
 def _forget_error(context: Any, builder: Any) -> None:

@@ -20,21 +20,26 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import (
     copy_into,
     inline_always,
-    keep_alive,
-    njit_callable,
     njit_internal,
     njit_reassoc,
 )
+from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, plan_entry
 from pymc_statespace_filters.compiler.numerics.small_cholesky import (
     cholesky,
     solve_lower,
     solve_lower_transposed,
+)
+from pymc_statespace_filters.filters.calls import (
+    ALL_STEPS,
+    OK,
+    opened,
+    single_record,
+    wanted_rows,
 )
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     CALLBACK_ARGUMENTS,
@@ -42,16 +47,16 @@ from pymc_statespace_filters.filters.ensemble.callbacks import (
     FORECAST,
     RESAMPLED,
     UPDATED,
+    run_observed,
 )
 from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
 from pymc_statespace_filters.filters.ensemble.summaries import (
     finite_weights,
-    forget_row,
-    results,
     summarise_row,
+    write_summaries,
 )
 from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.protocol import StatesFunction, System
+from pymc_statespace_filters.filters.plan import PLAN, free_states
 
 LAG = 10
 """Observations after which the past of a resampled particle is settled."""
@@ -260,52 +265,6 @@ def _solve_innovations(P_dd_chol, w, spread, A, V):
 CARRY_PAST = EntryPoint(_carry_past, CALLBACK_ARGUMENTS, "carry_past", digest("carry_past"))
 
 
-def ancestral_smoother(
-    evaluate: CompiledFunction, system: System, n_members: int, *, updates: bool, lag: int
-) -> CompiledFunction[StatesFunction]:
-    """Compile the smoother of a likelihood with callback that carries past states along.
-
-    Parameters
-    ----------
-    evaluate : CompiledFunction
-        See `EnsembleFilterBase.with_callback`.
-    system : System
-    n_members : int
-    updates : bool
-        Whether the filter moves its members by a Kalman gain.
-    lag : int
-        After how many further observations a state is settled.
-    """
-    CARRY_PAST.compile()
-    callback, likelihood = CARRY_PAST.symbol, evaluate.function
-    free, n, p, N = system.free, system.n, system.p, n_members
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
-        R = rows.size
-        settled_at, S = _settlement(rows, steps, observed, lag)
-        header = np.empty(_N_HEADER, np.int64)
-        header[_N], header[_MEMBERS], header[_P], header[_ROWS] = n, N, p, R
-        header[_SLOTS], header[_FREE], header[_SEED] = S, free.size, draw_seed
-        header[_UPDATES], header[_STORED], header[_SETTLED] = np.int64(updates), 0, 0
-        integers, reals = np.empty(_n_integers(header), np.int64), np.empty(_n_reals(header))
-        copy_into(integers[:_N_HEADER], header)
-        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(reals.ctypes.data))
-        past = _past_of(integers, reals)
-        copy_into(past.free, free)
-        copy_into(past.rows, rows)
-        copy_into(past.settled_at, settled_at)
-        past.results[:], past.last_log_w[:] = np.nan, -math.log(N)
-        _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
-        keep_alive(integers)
-        if health[1] != NONE:
-            for row in range(R):
-                forget_row(reals, n, R, row)
-        return results(reals, n, R, health)
-
-    return CompiledFunction(run, key_of(f"ancestral {updates} {lag}", evaluate.key, CARRY_PAST.key))
-
-
 @njit_internal
 def _settlement(rows, steps, observed, lag):
     """At which observation each row is settled, and how many rows wait for that at most."""
@@ -323,3 +282,36 @@ def _settlement(rows, steps, observed, lag):
             until += 1
         most = max(most, until - row)
     return settled_at, most
+
+
+def _smooth(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    words, rows = call.plan, wanted_rows(call)
+    data = single_record(call, 0, 0, call.record[RECORD.n_rows])
+    settled_at, S = _settlement(rows, data.steps, data.observed, words[PLAN.lag])
+    header = np.empty(_N_HEADER, np.int64)
+    header[_N], header[_MEMBERS], header[_P] = words[PLAN.n], words[PLAN.n_members], words[PLAN.p]
+    header[_ROWS], header[_SLOTS], header[_FREE] = rows.size, S, words[PLAN.n_free]
+    header[_SEED], header[_UPDATES] = call.request[REQUEST.draw_seed], words[PLAN.updates]
+    header[_STORED], header[_SETTLED] = 0, 0
+    integers, reals = np.empty(_n_integers(header), np.int64), np.empty(_n_reals(header))
+    copy_into(integers[:_N_HEADER], header)
+    past = _past_of(integers, reals)
+    copy_into(past.free, free_states(words))
+    copy_into(past.rows, rows)
+    copy_into(past.settled_at, settled_at)
+    past.results[:], past.last_log_w[:] = np.nan, -math.log(words[PLAN.n_members])
+    status, _, health = run_observed(call, plan, record, integers, reals)
+    # Where the filter fails, nothing is known: a state is given all observations.
+    write_summaries(call, reals, health, 0 if health[1] != NONE else ALL_STEPS)
+    return status
+
+
+SMOOTH = plan_entry(_smooth, "ancestral_smoother", digest("ancestral_smoother"))
+"""Smoothed states by a callback that carries past states along.
+
+The plan says whether the filter moves its members by a Kalman gain, and after how many further
+observations a state is settled.
+"""

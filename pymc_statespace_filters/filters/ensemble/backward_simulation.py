@@ -16,43 +16,36 @@ these fail, all weights are computed.
 import math
 
 import numpy as np
-from numba import carray, types
+from numba import carray
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    address_of,
-    arguments_class,
-)
-from pymc_statespace_filters.compiler.native.jit import (
-    copy_into,
-    inline_always,
-    keep_alive,
-    njit_callable,
-    njit_internal,
-)
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, plan_entry
 from pymc_statespace_filters.compiler.numerics.philox import STATES, key_words, open_unit, philox
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
 from pymc_statespace_filters.compiler.numerics.small_cholesky import cholesky, solve_lower
-from pymc_statespace_filters.filters.ensemble.callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED
+from pymc_statespace_filters.filters.calls import (
+    ALL_STEPS,
+    OK,
+    opened,
+    single_record,
+    wanted_rows,
+)
+from pymc_statespace_filters.filters.ensemble.callbacks import (
+    CALLBACK_ARGUMENTS,
+    FORECAST,
+    UPDATED,
+    run_observed,
+)
 from pymc_statespace_filters.filters.ensemble.summaries import (
     choose,
     finite_weights,
-    forget_row,
-    results,
+    write_summaries,
 )
 from pymc_statespace_filters.filters.ensemble.weights import normalise
 from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NONE
-from pymc_statespace_filters.filters.protocol import StatesFunction, System
-from pymc_statespace_filters.filters.system_table import (
-    SYSTEM_ARGUMENTS,
-    propagate,
-    read_system,
-    system_table,
-)
+from pymc_statespace_filters.filters.plan import PLAN, propagate, read_system
 
 PARTICLES_PER_PATH = 16
 _LEAST_PATHS = 16
@@ -71,34 +64,19 @@ def _store(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 
 STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles", digest("store_particles"))
 
-BACKWARD_ARGUMENTS = SYSTEM_ARGUMENTS | {
-    "N": types.intp, "m": types.intp, "M": types.intp,  # particles, normals of a step, paths
-    "n_steps": types.intp, "t0": types.float64, "seed": types.int64,  # of the draws
-    "stored": F64_PTR,  # by `_store`
-    "rows": I64_PTR, "R": types.intp, "reals": F64_PTR,  # results at these steps
-    "succeeded": F64_PTR,
-}  # fmt: skip
 
-BackwardArguments = arguments_class("BackwardArguments", BACKWARD_ARGUMENTS, __name__)
-
-
-def _simulate_backward(
-    table, dt, theta, n_theta, inputs, n_rows, N, m, M, n_steps, t0, seed, stored, rows, R, reals,
-    succeeded,
-):  # fmt: skip
-    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    n, width = system.n, -(-N // 64) * 64
-    size = (n + 1) * N
-    tape = carray(stored, ((n_steps + 1) * size,))
-    at, out = carray(rows, (R,)), carray(reals, ((3 * n + 1) * R,))
+@njit_internal
+def _simulate_backward(system, t0, seed, N, n_steps, stored, rows, out):
+    """Write what rows are summarised to; False if a covariance of a step is singular."""
+    n, width, R = system.n, -(-N // 64) * 64, rows.size
+    size, M = (n + 1) * N, max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
     paths, chosen = np.empty((M, n)), np.empty(M, np.int64)
     kernel = (np.empty((n, N)), np.empty((N, n, n)), np.empty(N))
-    noise, scratch = np.zeros((m, width)), np.empty((n, N))
+    noise, scratch = np.zeros((system.m, width)), np.empty((n, N))
     intervals = (np.empty(N), np.empty(N, np.int64))
     row = R - 1
-    carray(succeeded, (1,))[0] = 0.0
     for k in range(n_steps, -1, -1):
-        here = tape[k * size : (k + 1) * size]
+        here = stored[k * size : (k + 1) * size]
         X = here[: n * N].reshape(n, N)
         w = finite_weights(X, here[n * N :])
         _fill_intervals(w, intervals)
@@ -107,16 +85,16 @@ def _simulate_backward(
                 u, _ = _uniforms(seed, 0, path, k)
                 chosen[path] = _find(intervals, u)
         else:
-            if not _kernels(system, k, t0 + k * dt, X, w, noise, scratch, kernel):
-                return
+            if not _kernels(system, k, t0 + k * system.dt, X, w, noise, scratch, kernel):
+                return False
             _choose_particles(seed, k, w, intervals, kernel, paths, chosen)
         for path in range(M):
             for a in range(n):
                 paths[path, a] = X[a, chosen[path]]
-        if row >= 0 and at[row] == k:
+        if row >= 0 and rows[row] == k:
             _summarise_paths(out, R, row, paths, chosen, N)
             row -= 1
-    carray(succeeded, (1,))[0] = 1.0
+    return True
 
 
 @njit_internal
@@ -246,47 +224,26 @@ def _summarise_paths(out, n_rows, row, paths, chosen, N):
     out[3 * n * n_rows + row] = count
 
 
-SIMULATE_BACKWARD = EntryPoint(
-    _simulate_backward, BACKWARD_ARGUMENTS, "simulate_backward", digest("simulate_backward")
-)
+def _smooth(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    n, N, rows = call.plan[PLAN.n], call.plan[PLAN.n_members], wanted_rows(call)
+    data = single_record(call, 0, 0, call.record[RECORD.n_rows])
+    n_steps = data.steps[-1] if data.steps.size else np.int64(0)
+    integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
+    reals = np.full((3 * n + 1) * rows.size, np.nan)
+    status, _, health = run_observed(call, plan, record, integers, stored)
+    if health[1] == NONE:
+        system, seed = (
+            read_system(call.plan, data.theta, data.inputs),
+            call.request[REQUEST.draw_seed],
+        )
+        if not _simulate_backward(system, data.t0, seed, N, n_steps, stored, rows, reals):
+            health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
+    write_summaries(call, reals, health, 0 if health[1] != NONE else ALL_STEPS)
+    return status
 
 
-def backward_simulation(
-    evaluate: CompiledFunction, system: System, n_particles: int
-) -> CompiledFunction[StatesFunction]:
-    """Compile the smoother of a likelihood with callback, by backward simulation."""
-    for entry in (STORE, SIMULATE_BACKWARD):
-        entry.compile()
-    callback, simulate_backward = STORE.symbol, SIMULATE_BACKWARD.external
-    table = system_table(system, ("propagate",))
-    likelihood, make_table = evaluate.function, table.make
-    n, m, dt, N = system.n, system.m, system.dt, n_particles
-    M = max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
-        R, n_steps = rows.size, steps[-1] if steps.size else np.int64(0)
-        integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
-        reals, succeeded = np.full((3 * n + 1) * R, np.nan), np.zeros(1)
-        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(stored.ctypes.data))
-        _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
-        keep_alive(integers)
-        if health[1] == NONE:
-            table = make_table()
-            arguments = BackwardArguments(
-                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
-                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], N=N, m=m, M=M, n_steps=n_steps,
-                t0=t0, seed=draw_seed, stored=stored.ctypes.data, rows=rows.ctypes.data, R=R,
-                reals=reals.ctypes.data, succeeded=succeeded.ctypes.data,
-            )  # fmt: skip
-            simulate_backward(*arguments)
-            keep_alive(table)
-            keep_alive(stored)
-            if succeeded[0] == 0.0:
-                health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
-                for row in range(R):
-                    forget_row(reals, n, R, row)
-        return results(reals, n, R, health)
-
-    keys = evaluate.key, table.key, STORE.key, SIMULATE_BACKWARD.key
-    return CompiledFunction(run, key_of("backward simulation", *keys))
+SMOOTH = plan_entry(_smooth, "backward_simulation", digest("backward_simulation"))
+"""Smoothed states by backward simulation."""

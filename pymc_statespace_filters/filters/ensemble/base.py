@@ -3,35 +3,21 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import numpy as np
-
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.plan import Plan
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, padded
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.callbacks import NO_CALLBACK
-from pymc_statespace_filters.filters.ensemble.loop import FilterArguments
-from pymc_statespace_filters.filters.ensemble.noise import (
-    STORE_NORMALS,
-    NoiseSizes,
-    StoreArguments,
-    n_stored,
+from pymc_statespace_filters.filters.ensemble.noise import STORE_NORMALS, NoiseSizes, n_stored
+from pymc_statespace_filters.filters.ensemble.summaries import (
+    LAST_EVENTS,
+    MEMBER_RUN,
+    MEMBER_STATES,
+    STORE_MEMBERS,
+    SUMMARISE,
 )
-from pymc_statespace_filters.filters.ensemble.partition import SINGLE_RANK
-from pymc_statespace_filters.filters.ensemble.summaries import run_function, states_function
-from pymc_statespace_filters.filters.outcomes import OUT_OF_MEMORY
-from pymc_statespace_filters.filters.protocol import (
-    DistributedLogLikelihoodFunction,
-    HealthFunction,
-    LogLikelihoodFunction,
-    RunFunction,
-    StatesFunction,
-    StoredNoiseFunction,
-    System,
-)
-from pymc_statespace_filters.filters.system_table import system_table
+from pymc_statespace_filters.filters.functions import likelihood, run, states, term_health
+from pymc_statespace_filters.filters.plan import make_plan
+from pymc_statespace_filters.filters.protocol import System
 
 
 class EnsembleFilterBase:
@@ -62,8 +48,8 @@ class EnsembleFilterBase:
         """Return the settings that the entry reads besides the size, choices by their number."""
         raise NotImplementedError
 
-    def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
-        """Compile the smoother of this filter for one system."""
+    def smoother(self, system: System) -> Plan:
+        """Return the plan of the smoother of this filter for one system."""
         raise NotImplementedError
 
     def smoothing_method(self, system: System) -> str:
@@ -114,143 +100,57 @@ class EnsembleFilterBase:
         sizes = self.algorithm(system).noise_sizes(system)
         return n_stored.py_func(sizes, n_steps, n_observations)
 
-    def stored_noise(self, system: System) -> CompiledFunction[StoredNoiseFunction]:
+    def stored_noise(self, system: System) -> PlannedFunction:
         """Compile the function (steps, seed) -> the normals that an evaluation with it uses."""
-        sizes = self.algorithm(system).noise_sizes(system)
-        width, initial, process, observation, resampling = sizes
-        STORE_NORMALS.compile()
-        store = STORE_NORMALS.external
-
-        @njit_callable
-        def stored(steps, seed):
-            n_steps = steps[-1] if steps.size else np.int64(0)
-            out = np.empty(n_stored(sizes, n_steps, steps.size))
-            arguments = StoreArguments(
-                seed=seed, steps=steps.ctypes.data, n_observations=steps.size, width=width,
-                initial=initial, process=process, observation=observation, resampling=resampling,
-                out=out.ctypes.data,
-            )  # fmt: skip
-            store(*arguments)
-            return out
-
-        return CompiledFunction(stored, key_of(f"stored noise {sizes}", STORE_NORMALS.key))
+        plan = self.algorithm(system).plan(system, STORE_NORMALS, ())
+        return PlannedFunction(plan, (("steps", 1), ("seed", 0)), (("normals", 1),))
 
     # Compiled functions
 
-    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+    def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        evaluation = self.algorithm(system).evaluation(system)
-        evaluate = evaluation.function
+        return likelihood(self.algorithm(system).evaluation(system))
 
-        @njit_callable
-        def run(theta, steps, observed, inputs, t0, noise):
-            terms, _, health = evaluate(
-                theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK
-            )
-            return terms, health
-
-        return CompiledFunction(run, key_of("likelihood", evaluation.key))
-
-    def compile_health(self, system: System) -> CompiledFunction[HealthFunction]:
+    def compile_health(self, system: System) -> PlannedFunction:
         """Compile the effective number behind every term of `compile`."""
-        evaluation = self.algorithm(system).evaluation(system)
-        evaluate = evaluation.function
+        return term_health(self.algorithm(system).evaluation(system))
 
-        @njit_callable
-        def run(theta, steps, observed, inputs, t0, seed):
-            noise = (seed, np.empty(0))
-            return evaluate(theta, steps, observed, inputs, t0, noise, NO_CALLBACK, SINGLE_RANK)
-
-        return CompiledFunction(run, key_of("health", evaluation.key))
-
-    def compile_distributed(
-        self, system: System
-    ) -> CompiledFunction[DistributedLogLikelihoodFunction]:
-        """Compile the log-likelihood for members that are divided among ranks.
-
-        Each rank moves its own members (see `partition`); terms and health are equal on all ranks,
-        bit for bit those of `compile`.
-        """
-        evaluation = self.algorithm(system).evaluation(system)
-        evaluate = evaluation.function
-
-        @njit_callable
-        def run(theta, steps, observed, inputs, t0, seed, rank, n_ranks, exchange):
-            noise, layout = (seed, np.empty(0)), (rank, n_ranks, exchange)
-            terms, _, health = evaluate(
-                theta, steps, observed, inputs, t0, noise, NO_CALLBACK, layout
-            )
-            return terms, health
-
-        return CompiledFunction(run, key_of("distributed likelihood", evaluation.key))
-
-    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+    def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states."""
         filter = self.algorithm(system)
         if moment == "smoothed":
-            return filter.smoother(system)
-        return states_function(filter.with_callback(system), system.n, self.size(), moment)
+            return states(filter.smoother(system))
+        last_event = LAST_EVENTS[moment]
+        return states(
+            filter.observed(system, MEMBER_STATES, observer=SUMMARISE, last_event=last_event)
+        )
 
-    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+    def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        with_callback = self.algorithm(system).with_callback(system)
-        return run_function(with_callback, system.n, self.size())
-
-    def with_callback(self, system: System) -> CompiledFunction:
-        """Compile the likelihood with a callback: its address and its two vectors."""
-        evaluation = self.evaluation(system)
-        evaluate = evaluation.function
-
-        @njit_callable
-        def run(theta, steps, observed, inputs, t0, noise, callback):
-            terms, _, health = evaluate(
-                theta, steps, observed, inputs, t0, noise, callback, SINGLE_RANK
-            )
-            return terms, health
-
-        return CompiledFunction(run, key_of("with callback", evaluation.key))
+        last_event, filter = LAST_EVENTS["filtered"], self.algorithm(system)
+        return run(
+            filter.observed(system, MEMBER_RUN, observer=STORE_MEMBERS, last_event=last_event)
+        )
 
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""
         simulated = ("observe",) if self.simulates else ()
         return "initialise", "propagate", "log_density", *simulated
 
-    def evaluation(self, system: System) -> CompiledFunction:
-        """Bind the filter's entry point to one system."""
-        self.entry.compile()
-        order = "" if (ordering := self.ordering()) is None else ordering.symbol
-        if ordering is not None:
-            ordering.compile()
-        table = system_table(system, self.functions())
-        evaluate, make_table, dt = self.entry.external, table.make, system.dt
-        sizes = self.noise_sizes(system)
-        settings = np.array([self.size(), *sizes, *self.settings()], dtype=np.float64)
+    def evaluation(self, system: System) -> Plan:
+        """Return the plan of the filter's entry point for one system."""
+        return self.plan(system, self.entry, self.functions())
 
-        @njit_internal
-        def run(theta, steps, observed, inputs, t0, noise, callback, layout):
-            seed, normals = noise
-            n_steps = steps[-1] if steps.size else np.int64(0)
-            if normals.size and normals.size != n_stored(sizes, n_steps, steps.size):
-                raise ModelError("normals must be those of this filter, system and steps")
-            terms, health = np.full(steps.size, -np.inf), np.empty(3)
-            n_effective = np.full(steps.size, np.nan)
-            health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
-            table = make_table()
-            arguments = FilterArguments(
-                table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
-                inputs=inputs.ctypes.data, n_rows=inputs.shape[0], settings=settings.ctypes.data,
-                steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
-                t0=t0, seed=seed, normals=normals.ctypes.data, n_normals=normals.size,
-                order=address_of(order), callback=callback[0], integers=callback[1],
-                reals=callback[2], rank=layout[0], n_ranks=layout[1], exchange=layout[2],
-                terms=terms.ctypes.data, n_effective=n_effective.ctypes.data,
-                health=health.ctypes.data,
-            )  # fmt: skip
-            evaluate(*arguments)
-            keep_alive(table)
-            keep_alive(normals)
-            return terms, n_effective, health
+    def observed(self, system: System, run: EntryPoint, **others: int | EntryPoint) -> Plan:
+        """Return the plan of a function that runs the filter with a callback."""
+        return self.plan(system, run, self.functions(), evaluate=self.entry, **others)
 
-        return CompiledFunction(
-            run, key_of(f"{self!r} {settings.tolist()} {order}", table.key, self.entry.key)
-        )
+    def plan(
+        self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
+    ) -> Plan:
+        """Return the plan of a function that reads the settings of this filter."""
+        size, order = self.size(), self.ordering()
+        settings = (size, *self.noise_sizes(system), *self.settings())
+        if order is not None:
+            others = {**others, "order": order}
+        return make_plan(system, run, functions, settings, n_members=size, **others)

@@ -2,7 +2,8 @@
 
 A callback is an entry point with two vectors, one of integers and one of reals, which it reads and
 writes. Smoothers, summaries of states and stored particles are callbacks; a likelihood-only run
-passes a null address.
+passes a null address. A function of states is an entry point that runs the filter of its plan with
+its callback, and makes results of what that wrote.
 """
 
 import numpy as np
@@ -13,17 +14,23 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     I64_PTR,
     arguments_class,
     call_address,
+    call_for_status,
 )
-from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_internal
+from pymc_statespace_filters.compiler.native.plan import (
+    HEALTH_SIZE,
+    N_RESULTS,
+    RECORD,
+    REQUEST,
+    RESULTS,
+)
+from pymc_statespace_filters.filters.plan import PLAN
 
 FORECAST, PREDICTED, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(5))
 """Events at step k: members were initialised or moved there from step k - 1; if they were guided by
 later observations, copies of them were moved without it since the last one; an observation has
 updated members and weights; members were resampled (``ancestors`` tells from which); the record has
 ended."""
-
-NO_CALLBACK = (0, 0, 0)
-"""A null address, and two vectors that are not read."""
 
 CALLBACK_ARGUMENTS = {
     "integers": I64_PTR, "reals": F64_PTR,  # vectors of the callback
@@ -46,6 +53,21 @@ def emit(callback, event, j, k, members, d, ancestors):
             log_w=members.log_w, d=d, D=members.D, ancestors=ancestors,
         )  # fmt: skip
         call_address(address, arguments)
+
+
+@njit_internal
+def run_observed(call, plan, record, integers, reals):
+    """Run the filter of a plan with its callback; a status, terms and health."""
+    request, results = call.request.copy(), np.zeros(N_RESULTS, np.int64)
+    request[REQUEST.observer] = call.plan[PLAN.observer]
+    request[REQUEST.observer_integers] = integers.ctypes.data
+    request[REQUEST.observer_reals] = reals.ctypes.data
+    terms, health = np.empty(call.record[RECORD.n_rows]), np.empty(HEALTH_SIZE)
+    results[RESULTS.terms], results[RESULTS.health] = terms.ctypes.data, health.ctypes.data
+    status = call_for_status(call.plan[PLAN.evaluate], (plan, record, request, results))
+    keep_alive(integers)
+    keep_alive(reals)
+    return status, terms, health
 
 
 @njit_internal

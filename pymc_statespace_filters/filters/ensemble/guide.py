@@ -36,18 +36,10 @@ from pymc_statespace_filters.filters.ensemble.information import (
     update_work,
 )
 from pymc_statespace_filters.filters.outcomes import is_missing
-from pymc_statespace_filters.filters.system_table import follow, look_back
+from pymc_statespace_filters.filters.plan import follow, look_back
 
 _MOST_ITERATIONS = 8
 _SETTLED = 0.01  # square of the move of the path, over the variance of the state
-
-
-class Record(NamedTuple):
-    """Observations (J, p) at steps (J,), and the time of step 0."""
-
-    steps: np.ndarray
-    observed: np.ndarray
-    t0: float
 
 
 class Guide(NamedTuple):

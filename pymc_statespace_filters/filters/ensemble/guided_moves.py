@@ -17,7 +17,7 @@ from pymc_statespace_filters.filters.ensemble.loop import Members, new_members
 from pymc_statespace_filters.filters.ensemble.noise import process_normals, process_rows
 from pymc_statespace_filters.filters.ensemble.resampling import resample
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
-from pymc_statespace_filters.filters.system_table import initialise, propagate_guided
+from pymc_statespace_filters.filters.plan import initialise, propagate_guided
 
 _NUMBER_BYTES = 8
 

@@ -14,7 +14,7 @@ from pymc_statespace_filters.filters.ensemble.callbacks import PREDICTED, emit
 from pymc_statespace_filters.filters.ensemble.guide import leave_unguided
 from pymc_statespace_filters.filters.ensemble.loop import Members
 from pymc_statespace_filters.filters.ensemble.noise import initial_rows, process_normals
-from pymc_statespace_filters.filters.system_table import initialise, propagate_guided
+from pymc_statespace_filters.filters.plan import initialise, propagate_guided
 
 _NUMBER_BYTES = 8
 

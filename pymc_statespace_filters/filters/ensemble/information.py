@@ -7,7 +7,7 @@ import numpy as np
 
 from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
 from pymc_statespace_filters.compiler.numerics.small_cholesky import semidefinite_cholesky
-from pymc_statespace_filters.filters.system_table import observation_information
+from pymc_statespace_filters.filters.plan import observation_information
 
 _N_NEWTON, _N_HALVINGS = 12, 12
 _CONVERGED = 1e-4  # nats

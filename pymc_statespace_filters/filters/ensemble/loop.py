@@ -5,17 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import carray, types
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    arguments_class,
-)
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import NORMALS, REQUEST
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
+from pymc_statespace_filters.filters.calls import OK, likelihood_entry, reals_at
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
     FORECAST,
@@ -26,30 +22,21 @@ from pymc_statespace_filters.filters.ensemble.callbacks import (
 from pymc_statespace_filters.filters.ensemble.noise import (
     NoiseSizes,
     initial_normals,
+    n_stored,
     noise_of,
     process_normals,
+    sizes_of,
 )
 from pymc_statespace_filters.filters.ensemble.partition import RankLayout
 from pymc_statespace_filters.filters.ensemble.reductions import local_partition
 from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.system_table import (
-    SYSTEM_ARGUMENTS,
+from pymc_statespace_filters.filters.plan import (
+    PLAN,
     initialise,
     propagate,
     read_system,
+    settings_of,
 )
-
-FILTER_ARGUMENTS = SYSTEM_ARGUMENTS | {
-    "settings": F64_PTR,  # number of members, the five `NoiseSizes`, then the filter's settings
-    "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
-    "seed": types.int64, "normals": F64_PTR, "n_normals": types.intp,  # stored normals, if any
-    "order": types.intp,  # address of the function that sorts particles, 0 if none does
-    "callback": types.intp, "integers": types.intp, "reals": types.intp,  # see `callbacks`
-    "rank": types.intp, "n_ranks": types.intp, "exchange": types.intp,  # see `partition`
-    "terms": F64_PTR, "n_effective": F64_PTR, "health": F64_PTR,
-}  # fmt: skip
-
-FilterArguments = arguments_class("FilterArguments", FILTER_ARGUMENTS, __name__)
 
 N_LEADING = 6
 """Settings of every filter: the number of members and five of `NoiseSizes`."""
@@ -112,12 +99,31 @@ def n_sums(system):
     return 8 + 2 * (system.n + system.p) ** 2
 
 
+@inline_always
+def rank_of(request):
+    """Which of the ranks that evaluate together this one is."""
+    return RankLayout(request[REQUEST.rank], request[REQUEST.n_ranks], request[REQUEST.exchange])
+
+
+@inline_always
+def observer_of(request):
+    """The callback that sees the members, see `callbacks`."""
+    return (
+        request[REQUEST.observer],
+        request[REQUEST.observer_integers],
+        request[REQUEST.observer_reals],
+    )
+
+
 @njit_internal
-def noise_of_rank(seed, normals, given, steps, local):
-    """The normals of this rank: padded to its own width, else of the sizes that the filter gave."""
-    sizes = NoiseSizes(local.width, int(given[2]), int(given[3]), int(given[4]), int(given[5]))
+def noise_of_rank(seed, request, given, steps, local):
+    """The normals of this rank, padded to its own width; and whether stored ones are as many."""
+    sizes = sizes_of(given)
+    own = NoiseSizes(local.width, sizes[1], sizes[2], sizes[3], sizes[4])
     n_steps = steps[-1] if steps.size else np.int64(0)
-    return noise_of(seed, normals, sizes, n_steps, local.first_block)
+    stored = reals_at(request[REQUEST.normals], (request[REQUEST.n_normals],))
+    fits = stored.size == 0 or stored.size == n_stored(sizes, n_steps, steps.size)
+    return noise_of(seed, stored, own, n_steps, local.first_block), fits
 
 
 class _NoResampling(NamedTuple):
@@ -152,7 +158,7 @@ def ensemble_filter(
     name : str
     workspace : njit function ``(system, local, settings) -> tuple``
         Allocates, once per evaluation, what ``update`` needs besides the members, and reads the
-        filter's settings. ``system`` is a `TabledSystem`, ``local`` a `LocalPartition`: which of
+        filter's settings. ``system`` is a `PlannedSystem`, ``local`` a `LocalPartition`: which of
         all members are here.
     update : njit function
         ``(system, j, k, t, d, noise, members, local, work) -> Outcome``. Replaces the forecast
@@ -172,52 +178,50 @@ def ensemble_filter(
         on disk; another one is compiled once per process.
     """
 
-    def run(
-        table, dt, theta, n_theta, inputs, n_rows, settings, steps, n_observations, observed, t0,
-        seed, normals, n_normals, order, callback, integers, reals, rank, n_ranks, exchange,
-        terms, n_effective, health,
-    ):  # fmt: skip
-        given = carray(settings, (N_LEADING + n_settings,))
-        system = read_system(table, dt, theta, n_theta, inputs, n_rows)
+    @njit_internal
+    def evaluate(plan, record, request, seed, to):
+        given, steps, t0 = settings_of(plan), record.steps, record.t0
+        system = read_system(plan, record.theta, record.inputs)
         n_members = int(given[0])
-        local = local_partition(RankLayout(rank, n_ranks, exchange), n_members, n_sums(system))
-        at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
-        out, state = carray(terms, (n_observations,)), carray(health, (3,))
-        numbers = carray(n_effective, (n_observations,))
-        noise = noise_of_rank(seed, carray(normals, (n_normals,)), given, at, local)
+        local = local_partition(rank_of(request), n_members, n_sums(system))
+        noise, fits = noise_of_rank(seed, request, given, steps, local)
+        if not fits:
+            return NORMALS
         work = workspace(system, local, given[N_LEADING:])
-        resampling = resampler(given[N_LEADING:], order, system.n, local)
+        resampling = resampler(given[N_LEADING:], plan[PLAN.order], system.n, local)
         members = new_members(np.empty((system.n, local.size)), system.p, local)
-        width = local.width
-        to = (callback, integers, reals)
-        state[0], state[1], state[2] = n_members, NONE, -1
+        width, dt, health = local.width, system.dt, to.health
+        observer = observer_of(request)
+        health[0], health[1], health[2] = n_members, NONE, -1
         initialise(system, initial_normals(noise), width, members.X)
         k = np.int64(0)
         nothing, ancestors = np.empty(0), resampling.ancestors
-        emit(to, FORECAST, -1, k, members, nothing, ancestors)
-        for j in range(n_observations):
-            while k < at[j]:
+        emit(observer, FORECAST, -1, k, members, nothing, ancestors)
+        for j in range(steps.size):
+            while k < steps[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
                 k += 1
-                emit(to, FORECAST, j, k, members, nothing, ancestors)
-            if is_missing(record, j):
-                out[j] = 0.0
+                emit(observer, FORECAST, j, k, members, nothing, ancestors)
+            d = record.observed[j]
+            if is_missing(record.observed, j):
+                to.terms[j] = 0.0
                 continue
-            found = update(system, j, k, t0 + k * dt, record[j], noise, members, local, work)
-            numbers[j] = found.n_effective
-            state[0] = min(state[0], found.n_effective)
+            found = update(system, j, k, t0 + k * dt, d, noise, members, local, work)
+            to.n_effective[j] = found.n_effective
+            health[0] = min(health[0], found.n_effective)
             if found.failure != NONE:
-                state[1], state[2] = found.failure, j
+                health[1], health[2] = found.failure, j
                 break
-            out[j] = found.increment
-            emit(to, UPDATED, j, k, members, record[j], ancestors)
+            to.terms[j] = found.increment
+            emit(observer, UPDATED, j, k, members, d, ancestors)
             if resample(resampling, noise, j, k, found.n_weighted, members, local):
-                emit(to, RESAMPLED, j, k, members, nothing, ancestors)
-        if state[1] == NONE:
-            emit(to, ENDED, n_observations, k, members, nothing, ancestors)
+                emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
+        if health[1] == NONE:
+            emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
+        return OK
 
     key = _key(name, n_settings, workspace, update, resampler, resample)
-    return EntryPoint(run, FILTER_ARGUMENTS, name, key, needs=(FILL_NORMALS,))
+    return likelihood_entry(name, evaluate, key, needs=(FILL_NORMALS,))
 
 
 def _key(name: str, n_settings: int, *functions: Callable) -> str | None:

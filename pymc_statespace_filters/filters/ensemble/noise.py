@@ -9,11 +9,22 @@ while these change.
 from typing import NamedTuple
 
 import numpy as np
-from numba import carray, types
+from numba import carray
 
 from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint, arguments_class
+from pymc_statespace_filters.compiler.native.entry_point import pointer
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import (
+    DAMAGED,
+    N_RECORD,
+    N_REQUEST,
+    N_RESULTS,
+    RECORD,
+    REQUEST,
+    RESULTS,
+    plan_entry,
+    plan_words,
+)
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
 from pymc_statespace_filters.compiler.numerics.philox import (
     INITIAL,
@@ -21,6 +32,7 @@ from pymc_statespace_filters.compiler.numerics.philox import (
     PROCESS,
     RESAMPLING,
 )
+from pymc_statespace_filters.filters.plan import VERSION, settings_of
 
 _fill = FILL_NORMALS.external
 _NUMBER_BYTES = 8
@@ -132,37 +144,39 @@ def resampling_normals(noise, j, k):
     return noise.buffer[: sizes.resampling]
 
 
-STORE_ARGUMENTS = {
-    "seed": types.int64, "steps": I64_PTR, "n_observations": types.intp, "width": types.intp,
-    "initial": types.intp, "process": types.intp, "observation": types.intp,
-    "resampling": types.intp, "out": types.intp,
-}  # fmt: skip
+@inline_always
+def sizes_of(settings):
+    """The sizes that follow the number of members in the settings of a filter."""
+    return NoiseSizes(
+        int(settings[1]), int(settings[2]), int(settings[3]), int(settings[4]), int(settings[5])
+    )
 
-StoreArguments = arguments_class("StoreArguments", STORE_ARGUMENTS, __name__)
 
-
-def _store(seed, steps, n_observations, width, initial, process, observation, resampling, out):
-    one, first = np.int64(1), np.int64(0)
-    n_steps = carray(steps, (n_observations,))[n_observations - 1] if n_observations else 0
-    at = out
-    _fill(seed, np.int64(INITIAL), first, first, at, initial, width)
-    at += _NUMBER_BYTES * initial * width
+def _store(plan, record, request, results):
+    words = plan_words(plan, VERSION)
+    if words.size == 0:
+        return np.int64(DAMAGED)
+    given, sizes = carray(record, (N_RECORD,)), sizes_of(settings_of(words))
+    to, asked = carray(results, (N_RESULTS,)), carray(request, (N_REQUEST,))
+    steps = carray(pointer(given[RECORD.rows]), (given[RECORD.n_rows],), np.int64)
+    n_steps = steps[-1] if steps.size else np.int64(0)
+    to[RESULTS.n_normals] = n_stored(sizes, n_steps, steps.size)
+    if asked[REQUEST.sizes_only]:
+        return np.int64(0)
+    seed, width, one, first = asked[REQUEST.seed], sizes.width, np.int64(1), np.int64(0)
+    at = to[RESULTS.normals]
+    _fill(seed, np.int64(INITIAL), first, first, at, sizes.initial, width)
+    at += _NUMBER_BYTES * sizes.initial * width
     for k in range(n_steps):
-        _fill(seed, np.int64(PROCESS), np.int64(k), first, at, process, width)
-        at += _NUMBER_BYTES * process * width
-    for j in range(n_observations):
-        k = carray(steps, (n_observations,))[j]
-        _fill(seed, np.int64(OBSERVATION), k, first, at, observation, width)
-        at += _NUMBER_BYTES * observation * width
-        _fill(seed, np.int64(RESAMPLING), k, first, at, one, resampling)
-        at += _NUMBER_BYTES * resampling
+        _fill(seed, np.int64(PROCESS), np.int64(k), first, at, sizes.process, width)
+        at += _NUMBER_BYTES * sizes.process * width
+    for k in steps:
+        _fill(seed, np.int64(OBSERVATION), k, first, at, sizes.observation, width)
+        at += _NUMBER_BYTES * sizes.observation * width
+        _fill(seed, np.int64(RESAMPLING), k, first, at, one, sizes.resampling)
+        at += _NUMBER_BYTES * sizes.resampling
+    return np.int64(0)
 
 
-STORE_NORMALS = EntryPoint(
-    _store,
-    STORE_ARGUMENTS,
-    "store_normals",
-    digest("store_normals"),
-    needs=(FILL_NORMALS,),
-)
-"""Write the normals of a whole evaluation, `n_stored` of them, to an address."""
+STORE_NORMALS = plan_entry(_store, "store_normals", digest("store_normals"), needs=(FILL_NORMALS,))
+"""Write the normals of a whole evaluation, `n_stored` of them."""

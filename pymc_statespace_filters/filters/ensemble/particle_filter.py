@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, ancestral_smoother
-from pymc_statespace_filters.filters.ensemble.backward_simulation import backward_simulation
+from pymc_statespace_filters.compiler.native.plan import Plan
+from pymc_statespace_filters.filters.ensemble import ancestral_smoother, backward_simulation
+from pymc_statespace_filters.filters.ensemble.ancestral_smoother import CARRY_PAST, LAG
+from pymc_statespace_filters.filters.ensemble.backward_simulation import STORE
 from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
 from pymc_statespace_filters.filters.ensemble.hilbert_sort import ORDER_PARTICLES
 from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
@@ -20,7 +21,7 @@ from pymc_statespace_filters.filters.ensemble.resampling import (
     resampler,
     smooth_resampling,
 )
-from pymc_statespace_filters.filters.protocol import StatesFunction, System
+from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
 
 _N_SETTINGS = 2  # threshold of resampling, number of its scheme
@@ -93,12 +94,13 @@ class ParticleFilter(EnsembleFilterBase):
         """Return the function that sorts particles, if the scheme does."""
         return ORDER_PARTICLES if self.resampling == "sorted" else None
 
-    def smoother(self, system: System) -> CompiledFunction[StatesFunction]:
-        """Compile backward simulation, or where a step has no density the ancestral smoother."""
+    def smoother(self, system: System) -> Plan:
+        """Plan backward simulation, or where a step has no density the ancestral smoother."""
         if system.has_transition_density:
-            return backward_simulation(self.with_callback(system), system, self.n_particles)
-        return ancestral_smoother(
-            self.with_callback(system), system, self.n_particles, updates=self.simulates, lag=LAG
+            return self.observed(system, backward_simulation.SMOOTH, observer=STORE)
+        updates = int(self.simulates)
+        return self.observed(
+            system, ancestral_smoother.SMOOTH, observer=CARRY_PAST, updates=updates, lag=LAG
         )
 
     def smoothing_method(self, system: System) -> str:

@@ -5,34 +5,37 @@ import math
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, address_of
-from pymc_statespace_filters.compiler.native.jit import (
-    inline_always,
-    keep_alive,
-    njit_callable,
-    njit_internal,
-)
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
+from pymc_statespace_filters.filters.calls import (
+    OK,
+    first_unknown,
+    opened,
+    reals_at,
+    wanted_rows,
+)
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     CALLBACK_ARGUMENTS,
     PREDICTED,
     UPDATED,
+    run_observed,
     searchsorted,
 )
 from pymc_statespace_filters.filters.ensemble.weights import effective_number, normalise
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction
+from pymc_statespace_filters.filters.plan import PLAN
 
-# The last event at a step that a moment includes.
-_LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
+LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
+"""The last event at a step that a moment includes."""
 
-# Integers of the callbacks, then the steps of the rows. Reals of the states: mean, sd, draw, each
-# (R, n), and effective number (R,). Reals of a run: mean (R, n), covariance (R, n, n), members
-# (R, N, n), weights (R, N).
-_N_HEADER = 6
-_N, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT = range(_N_HEADER)
+# Integers of the callbacks, then the steps of the rows. The last four are addresses of what a run
+# writes. Reals of the states: mean, sd, draw, each (R, n), and effective number (R,).
+_N_HEADER = 10
+(
+    _N, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT, _MEAN, _COV, _STATES, _WEIGHTS,
+) = range(_N_HEADER)  # fmt: skip
 
 
 @inline_always
@@ -47,11 +50,15 @@ def _current_row(integers, event, k):
 
 
 @njit_internal
-def _header(n, n_members, rows, last_event, draw_seed):
-    integers = np.empty(_N_HEADER + rows.size, np.int64)
-    integers[_N], integers[_MEMBERS], integers[_ROWS] = n, n_members, rows.size
-    integers[_LAST_EVENT], integers[_SEED], integers[_NEXT] = last_event, draw_seed, 0
-    integers[_N_HEADER:] = rows
+def _header(call, rows):
+    """The integers of a callback."""
+    integers, to = np.empty(_N_HEADER + rows.size, np.int64), call.results
+    integers[_N], integers[_MEMBERS] = call.plan[PLAN.n], call.plan[PLAN.n_members]
+    integers[_ROWS], integers[_LAST_EVENT] = rows.size, call.plan[PLAN.last_event]
+    integers[_SEED], integers[_NEXT] = call.request[REQUEST.draw_seed], 0
+    integers[_MEAN], integers[_COV] = to[RESULTS.mean], to[RESULTS.cov]
+    integers[_STATES], integers[_WEIGHTS] = to[RESULTS.members], to[RESULTS.weights]
+    copy_into(integers[_N_HEADER:], rows)
     return integers
 
 
@@ -68,13 +75,12 @@ def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 
 def _store_members(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     header = carray(integers, (_N_HEADER,))
-    n, N, n_rows = header[_N], header[_MEMBERS], header[_ROWS]
+    n, N = header[_N], header[_MEMBERS]
     row = _current_row(integers, event, k)
     if row >= 0:
         members = carray(X, (n, N))
         w = finite_weights(members, carray(log_w, (N,)))
-        parts = _parts(carray(reals, (_run_size(n, N, n_rows),)), n, N, n_rows)
-        mean, cov, stored, weights = parts
+        mean, cov, stored, weights = _stored(header)
         for i in range(N):
             weights[row, i] = w[i]
             for a in range(n):
@@ -84,21 +90,14 @@ def _store_members(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 
 
 @njit_internal
-def _run_size(n, N, R):
-    return R * (n + n * n + N * n + N)
-
-
-@njit_internal
-def _parts(reals, n, N, R):
-    """Mean, covariance, members and weights, which lie one after the other."""
-    cov = R * n
-    members = cov + R * n * n
-    weights = members + R * N * n
+def _stored(header):
+    """Mean, covariance, members and weights of a run, as arrays of the results."""
+    n, N, R = header[_N], header[_MEMBERS], header[_ROWS]
     return (
-        reals[:cov].reshape(R, n),
-        reals[cov:members].reshape(R, n, n),
-        reals[members:weights].reshape(R, N, n),
-        reals[weights:].reshape(R, N),
+        reals_at(header[_MEAN], (R, n)),
+        reals_at(header[_COV], (R, n, n)),
+        reals_at(header[_STATES], (R, N, n)),
+        reals_at(header[_WEIGHTS], (R, N)),
     )
 
 
@@ -183,55 +182,6 @@ STORE_MEMBERS = EntryPoint(
 )
 
 
-def states_function(
-    evaluate: CompiledFunction, n: int, n_members: int, moment: str
-) -> CompiledFunction[StatesFunction]:
-    """Compile "predicted" or "filtered" states of a likelihood with callback, in one pass."""
-    SUMMARISE.compile()
-    callback, last_event, likelihood = SUMMARISE.symbol, _LAST_EVENTS[moment], evaluate.function
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
-        R, reals = rows.size, np.full((3 * n + 1) * rows.size, np.nan)
-        integers = _header(n, n_members, rows, last_event, draw_seed)
-        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(reals.ctypes.data))
-        _, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
-        keep_alive(integers)
-        if health[1] != NONE:
-            for row in range(R):
-                if rows[row] >= steps[int(health[2])]:
-                    forget_row(reals, n, R, row)
-        return results(reals, n, R, health)
-
-    return CompiledFunction(run, key_of(f"{moment} states", evaluate.key, SUMMARISE.key))
-
-
-def run_function(
-    evaluate: CompiledFunction, n: int, n_members: int
-) -> CompiledFunction[RunFunction]:
-    """Compile one run of a likelihood with callback that stores all members at some steps."""
-    STORE_MEMBERS.compile()
-    callback, last_event, N = STORE_MEMBERS.symbol, int(UPDATED), n_members
-    likelihood = evaluate.function
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows):
-        R, reals = rows.size, np.full(_run_size(n, N, rows.size), np.nan)
-        integers = _header(n, N, rows, last_event, 0)
-        to = (address_of(callback), np.int64(integers.ctypes.data), np.int64(reals.ctypes.data))
-        terms, health = likelihood(theta, steps, observed, inputs, t0, (seed, np.empty(0)), to)
-        keep_alive(integers)
-        mean, cov, members, weights = _parts(reals, n, N, R)
-        if health[1] != NONE:
-            for row in range(R):
-                if rows[row] >= steps[int(health[2])]:
-                    mean[row], cov[row], members[row], weights[row] = np.nan, np.nan, np.nan, np.nan
-        # Members and weights share memory, of which there may be gigabytes.
-        return terms, health, mean.copy(), cov.copy(), members, weights
-
-    return CompiledFunction(run, key_of("run", evaluate.key, STORE_MEMBERS.key))
-
-
 @njit_internal
 def forget_row(numbers, n, n_rows, row):
     """Leave a row unknown."""
@@ -242,8 +192,52 @@ def forget_row(numbers, n, n_rows, row):
 
 
 @njit_internal
-def results(numbers, n, n_rows, health):
-    """What rows were summarised to, as the function of the states gives it."""
-    moments = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)
-    n_effective = numbers[3 * n * n_rows : (3 * n + 1) * n_rows].copy()
-    return moments[0].copy(), moments[1].copy(), moments[2].copy(), n_effective, health
+def write_summaries(call, numbers, health, until):
+    """Write what rows were summarised to as results; from the step ``until`` on all are unknown."""
+    rows, n, to = wanted_rows(call), call.plan[PLAN.n], call.results
+    for row in range(rows.size):
+        if rows[row] >= until:
+            forget_row(numbers, n, rows.size, row)
+    size = n * rows.size
+    copy_into(reals_at(to[RESULTS.mean], (size,)), numbers[:size])
+    copy_into(reals_at(to[RESULTS.sd], (size,)), numbers[size : 2 * size])
+    copy_into(reals_at(to[RESULTS.drawn], (size,)), numbers[2 * size : 3 * size])
+    copy_into(reals_at(to[RESULTS.n_effective_wanted], (rows.size,)), numbers[3 * size :])
+    copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)
+
+
+def _states(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    rows, n = wanted_rows(call), call.plan[PLAN.n]
+    reals = np.full((3 * n + 1) * rows.size, np.nan)
+    integers = _header(call, rows)
+    status, _, health = run_observed(call, plan, record, integers, reals)
+    write_summaries(call, reals, health, first_unknown(call, health))
+    return status
+
+
+def _run(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    rows, to, integers = wanted_rows(call), call.results, _header(call, wanted_rows(call))
+    mean, cov, members, weights = parts = _stored(integers)
+    for part in parts:
+        part[:] = np.nan
+    status, terms, health = run_observed(call, plan, record, integers, np.empty(0))
+    until = first_unknown(call, health)
+    for row in range(rows.size):
+        if rows[row] >= until:
+            mean[row], cov[row], members[row], weights[row] = np.nan, np.nan, np.nan, np.nan
+    copy_into(reals_at(to[RESULTS.terms], (terms.size,)), terms)
+    copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)
+    return status
+
+
+MEMBER_STATES = plan_entry(_states, "ensemble_states", digest("ensemble_states"))
+"""Predicted or filtered states, in one pass."""
+
+MEMBER_RUN = plan_entry(_run, "ensemble_run", digest("ensemble_run"))
+"""One run that keeps all members at some steps."""

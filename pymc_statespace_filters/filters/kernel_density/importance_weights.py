@@ -22,7 +22,7 @@ from pymc_statespace_filters.filters.kernel_density.density import (
     log_kernel_density,
     scott_bandwidth,
 )
-from pymc_statespace_filters.filters.system_table import log_density
+from pymc_statespace_filters.filters.plan import log_density
 
 
 class Scratch(NamedTuple):

@@ -13,6 +13,7 @@ from pymc_statespace_filters.filters.outcomes import (
     NONE,
     ZERO_WEIGHTS,
 )
+from pymc_statespace_filters.filters.plan import log_density, step_moments
 from pymc_statespace_filters.filters.point_mass.recursion import TOO_SHORT
 from pymc_statespace_filters.filters.point_mass.segments import (
     MAX_SEGMENTS,
@@ -23,7 +24,6 @@ from pymc_statespace_filters.filters.point_mass.segments import (
     tail,
     weight,
 )
-from pymc_statespace_filters.filters.system_table import log_density, step_moments
 
 # Of a segment, in standard deviations of the noise: of the step before, and of the next one.
 _WIDEST = 4.0

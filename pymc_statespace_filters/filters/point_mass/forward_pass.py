@@ -14,8 +14,10 @@ from pymc_statespace_filters.filters.outcomes import (
     GRID_TOO_LARGE,
     NO_PROCESS_NOISE,
     NONE,
+    TOO_FAR,
     is_missing,
 )
+from pymc_statespace_filters.filters.plan import step_moments
 from pymc_statespace_filters.filters.point_mass.recursion import (
     REFINEMENT,
     TOO_COARSE,
@@ -26,7 +28,6 @@ from pymc_statespace_filters.filters.point_mass.recursion import (
     predict,
     update,
 )
-from pymc_statespace_filters.filters.system_table import step_moments
 
 LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
@@ -133,3 +134,11 @@ def attempt(system, steps, observed, t0, settings, tolerance, terms, keep, tape)
         keep(tape, k, grid, True)
         error, n_grids = 0.0, 1
     return code, steps.size
+
+
+@njit_internal
+def write_outcome(code, j, terms, health):
+    """Write the health of a pass that ended with a code at observation j; later terms are -inf."""
+    terms[j:] = -np.inf
+    health[0], health[1] = np.inf, code if code >= NONE else TOO_FAR
+    health[2] = j if code != NONE else -1

@@ -11,18 +11,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import carray, types
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    arguments_class,
-)
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_callable, njit_internal
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_internal
+from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
+from pymc_statespace_filters.filters.calls import OK, opened, reals_at, single_record
 from pymc_statespace_filters.filters.outcomes import NONE
+from pymc_statespace_filters.filters.plan import PLAN, observe, read_system, settings_of
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     END,
     ON_GRID,
@@ -38,21 +33,6 @@ from pymc_statespace_filters.filters.point_mass.segment_pass import (
     pass_on_segments,
 )
 from pymc_statespace_filters.filters.point_mass.segments import POINTS, points_of
-from pymc_statespace_filters.filters.protocol import PredictionsFunction, System
-from pymc_statespace_filters.filters.system_table import (
-    SYSTEM_ARGUMENTS,
-    observe,
-    read_system,
-    system_table,
-)
-
-PREDICTIONS_ARGUMENTS = SYSTEM_ARGUMENTS | {
-    "tolerance": types.float64,
-    "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
-    "mean": F64_PTR, "cov": F64_PTR, "log_below": F64_PTR, "log_above": F64_PTR,
-}  # fmt: skip
-
-PredictionsArguments = arguments_class("PredictionsArguments", PREDICTIONS_ARGUMENTS, __name__)
 
 
 class _Laws(NamedTuple):
@@ -65,32 +45,35 @@ class _Laws(NamedTuple):
     log_above: np.ndarray
 
 
-def _grid_predictions(
-    table, dt, theta, n_theta, inputs, n_rows, tolerance, steps, n_observations, observed, t0,
-    mean, cov, log_below, log_above,
-):  # fmt: skip
-    """The predictions as one function for all systems; what it does not reach stays as it is."""
-    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    J, p = n_observations, system.p
-    at, record = carray(steps, (J,)), carray(observed, (J, p))
+def _grid_predictions(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
+    data = single_record(call, 0, 0, J)
+    at, observed, t0, tolerance = data.steps, data.observed, data.t0, settings_of(call.plan)[0]
+    system = read_system(call.plan, data.theta, data.inputs)
     laws = _Laws(
-        np.zeros(1, np.int64), carray(mean, (J, p)), carray(cov, (J, p, p)),
-        carray(log_below, (J, p)), carray(log_above, (J, p)),
+        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
+        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
+        reals_at(to[RESULTS.log_above], (J, p)),
     )  # fmt: skip
+    _forget(laws, 0)
     if not has_valid_covariances(system):
-        return
+        return status
     place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
-    terms, tape = np.empty(J), (system, at, record, t0, laws)
+    terms, tape = np.empty(J), (system, at, observed, t0, laws)
     while place != END:
         if place == ON_SEGMENTS:
             code, j = pass_on_segments(
-                system, at, record, t0, tolerance, terms, _predict_on_segments, tape
+                system, at, observed, t0, tolerance, terms, _predict_on_segments, tape
             )
         else:
-            code, j = attempt(system, at, record, t0, settings, tolerance, terms, _predict, tape)
+            code, j = attempt(system, at, observed, t0, settings, tolerance, terms, _predict, tape)
         place, settings = next_attempt(place, code, settings)
     if code != NONE:
         _forget(laws, j)
+    return status
 
 
 @njit_internal
@@ -198,33 +181,5 @@ def _write_moments(mass, weight, h, roots, mean, cov):
                 cov[b, c] += weight * mass[i] * product
 
 
-GRID_PREDICTIONS = EntryPoint(
-    _grid_predictions, PREDICTIONS_ARGUMENTS, "grid_predictions", digest("grid_predictions")
-)
-
-
-def predictions_function(system: System, tolerance: float) -> CompiledFunction[PredictionsFunction]:
-    """Compile the law of every observation."""
-    GRID_PREDICTIONS.compile()
-    table = system_table(system, ("step_moments", "log_density", "observe"))
-    evaluate, make_table, dt, p = GRID_PREDICTIONS.external, table.make, system.dt, system.p
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed):
-        J = steps.size
-        mean, cov = np.full((J, p), np.nan), np.full((J, p, p), np.nan)
-        log_below, log_above = np.full((J, p), np.nan), np.full((J, p), np.nan)
-        table = make_table()
-        arguments = PredictionsArguments(
-            table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
-            inputs=inputs.ctypes.data, n_rows=inputs.shape[0], tolerance=tolerance,
-            steps=steps.ctypes.data, n_observations=J, observed=observed.ctypes.data, t0=t0,
-            mean=mean.ctypes.data, cov=cov.ctypes.data, log_below=log_below.ctypes.data,
-            log_above=log_above.ctypes.data,
-        )  # fmt: skip
-        evaluate(*arguments)
-        keep_alive(table)
-        return mean, cov, log_below, log_above
-
-    key = key_of(f"grid predictions {tolerance!r}", table.key, GRID_PREDICTIONS.key)
-    return CompiledFunction(run, key)
+GRID_PREDICTIONS = plan_entry(_grid_predictions, "grid_predictions", digest("grid_predictions"))
+"""The law of every observation."""

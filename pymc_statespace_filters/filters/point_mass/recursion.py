@@ -20,6 +20,7 @@ from pymc_statespace_filters.filters.outcomes import (
     NONE,
     ZERO_WEIGHTS,
 )
+from pymc_statespace_filters.filters.plan import log_density, step_moments
 from pymc_statespace_filters.filters.point_mass.grid import (
     MAX_POINTS,
     aliasing,
@@ -42,7 +43,6 @@ from pymc_statespace_filters.filters.point_mass.tiles import (
     tiles_to_sources,
     tiles_to_targets,
 )
-from pymc_statespace_filters.filters.system_table import log_density, step_moments
 
 # Reasons to repeat the pass on another grid; all other codes are those of `outcomes`.
 TOO_COARSE, TOO_SHORT = -1, -2

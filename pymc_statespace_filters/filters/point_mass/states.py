@@ -17,31 +17,32 @@ without the ratio.
 import math
 
 import numpy as np
-from numba import carray, types
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    arguments_class,
-)
-from pymc_statespace_filters.compiler.native.jit import (
-    inline_always,
-    keep_alive,
-    njit_callable,
-    njit_internal,
+from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import (
+    HEALTH_SIZE,
+    RECORD,
+    REQUEST,
+    RESULTS,
+    plan_entry,
 )
 from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
 from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+from pymc_statespace_filters.filters.calls import (
+    OK,
+    opened,
+    reals_at,
+    single_record,
+    wanted_rows,
+)
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NONE,
     OUT_OF_MEMORY,
-    TOO_FAR,
     is_missing,
 )
+from pymc_statespace_filters.filters.plan import log_density, read_system, settings_of
 from pymc_statespace_filters.filters.point_mass.forward_pass import (
     END,
     ON_GRID,
@@ -49,6 +50,7 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     attempt,
     first_grid,
     next_attempt,
+    write_outcome,
 )
 from pymc_statespace_filters.filters.point_mass.grid import gather, grid_points
 from pymc_statespace_filters.filters.point_mass.moments import draw, mean_and_sd, total_mass
@@ -60,52 +62,62 @@ from pymc_statespace_filters.filters.point_mass.recursion import (
     with_sources,
 )
 from pymc_statespace_filters.filters.point_mass.rows import (
-    FILTERED,
-    MOMENTS,
     PREDICTED,
     SMOOTHED,
     Rows,
 )
 from pymc_statespace_filters.filters.point_mass.segment_states import states_on_segments
 from pymc_statespace_filters.filters.point_mass.tiles import LANES, block_of, multiply
-from pymc_statespace_filters.filters.protocol import RunFunction, StatesFunction, System
-from pymc_statespace_filters.filters.system_table import (
-    SYSTEM_ARGUMENTS,
-    log_density,
-    read_system,
-    system_table,
-)
-
-STATES_ARGUMENTS = SYSTEM_ARGUMENTS | {
-    "tolerance": types.float64, "moment": types.intp,
-    "steps": I64_PTR, "n_observations": types.intp, "observed": F64_PTR, "t0": types.float64,
-    "rows": I64_PTR, "R": types.intp, "draw_seed": types.int64,  # steps of the results
-    "mean": F64_PTR, "sd": F64_PTR, "drawn": F64_PTR, "terms": F64_PTR, "health": F64_PTR,
-}  # fmt: skip
-
-StatesArguments = arguments_class("StatesArguments", STATES_ARGUMENTS, __name__)
 
 
-def _grid_states(
-    table, dt, theta, n_theta, inputs, n_rows, tolerance, moment, steps, n_observations, observed,
-    t0, rows, R, draw_seed, mean, sd, drawn, terms, health,
-):  # fmt: skip
-    """The states as one function for all systems; see `_evaluate` for what it writes."""
-    system = read_system(table, dt, theta, n_theta, inputs, n_rows)
-    at, record = carray(steps, (n_observations,)), carray(observed, (n_observations, system.p))
-    wanted = Rows(
-        carray(rows, (R,)), draw_seed, carray(mean, (R,)), carray(sd, (R,)), carray(drawn, (R,))
+@njit_internal
+def _write_moments(call, rows, drawn):
+    """Write mean and deviation of the state at rows, and terms; (code, failing observation)."""
+    to, J = call.results, call.record[RECORD.n_rows]
+    data, settings = single_record(call, 0, 0, J), settings_of(call.plan)
+    tolerance, moment = settings[0], int(settings[1])
+    system = read_system(call.plan, data.theta, data.inputs)
+    mean = reals_at(to[RESULTS.mean], (rows.size,))
+    sd = reals_at(to[RESULTS.sd], (rows.size,)) if to[RESULTS.sd] != 0 else np.empty(rows.size)
+    terms = reals_at(to[RESULTS.terms], (J,)) if to[RESULTS.terms] != 0 else np.empty(J)
+    health = reals_at(to[RESULTS.health], (HEALTH_SIZE,))
+    # What stays if memory ends.
+    mean[:], sd[:], drawn[:], terms[:] = np.nan, np.nan, np.nan, -np.inf
+    health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
+    wanted = Rows(rows, call.request[REQUEST.draw_seed], mean, sd, drawn)
+    code, j = _evaluate(
+        system, data.steps, data.observed, data.t0, tolerance, moment, wanted, terms
     )
-    out = carray(terms, (n_observations,))
-    code, j = _evaluate(system, at, record, t0, tolerance, moment, wanted, out)
-    for failed in range(j, n_observations):
-        out[failed] = -np.inf
-    for i in range(R):
-        if code != NONE and (moment == SMOOTHED or j == 0 or wanted.at[i] >= at[j]):
-            wanted.mean[i], wanted.sd[i], wanted.drawn[i] = np.nan, np.nan, np.nan
-    state = carray(health, (3,))
-    failure = code if code >= NONE else TOO_FAR
-    state[0], state[1], state[2] = np.inf, failure, j if code != NONE else -1
+    for i in range(rows.size):
+        if code != NONE and (moment == SMOOTHED or j == 0 or rows[i] >= data.steps[j]):
+            mean[i], sd[i], drawn[i] = np.nan, np.nan, np.nan
+    write_outcome(code, j, terms, health)
+    return sd
+
+
+def _grid_states(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    rows = wanted_rows(call)
+    _write_moments(call, rows, reals_at(call.results[RESULTS.drawn], (rows.size,)))
+    mean = reals_at(call.results[RESULTS.mean], (rows.size,))
+    n_effective = reals_at(call.results[RESULTS.n_effective_wanted], (rows.size,))
+    for i in range(rows.size):
+        n_effective[i] = np.nan if np.isnan(mean[i]) else np.inf
+    return status
+
+
+def _grid_run(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    rows = wanted_rows(call)
+    sd = _write_moments(call, rows, np.empty(rows.size))
+    cov = reals_at(call.results[RESULTS.cov], (rows.size,))
+    for i in range(rows.size):
+        cov[i] = sd[i] * sd[i]
+    return status
 
 
 @njit_internal
@@ -251,64 +263,5 @@ def _update_adjoint(system, k, t, d, grid, term, ratio):
         ratio[i] *= math.exp(log_likelihood[i] - term) if is_possible else 0.0
 
 
-GRID_STATES = EntryPoint(_grid_states, STATES_ARGUMENTS, "grid_states", digest("grid_states"))
-
-
-def states_function(
-    system: System, tolerance: float, moment: str
-) -> CompiledFunction[StatesFunction]:
-    """Compile "predicted", "filtered" or "smoothed" states."""
-    bound = _bind(system, tolerance, MOMENTS[moment])
-    evaluate = bound.function
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
-        mean, sd, drawn, _, health = evaluate(theta, steps, observed, inputs, t0, rows, draw_seed)
-        n_effective = np.where(np.isnan(mean[:, 0]), np.nan, np.inf)
-        return mean, sd, drawn, n_effective, health
-
-    return CompiledFunction(run, key_of("states", bound.key))
-
-
-def run_function(system: System, tolerance: float) -> CompiledFunction[RunFunction]:
-    """Compile one run: terms, health and filtered moments."""
-    bound = _bind(system, tolerance, FILTERED)
-    evaluate = bound.function
-
-    @njit_callable
-    def run(theta, steps, observed, inputs, t0, seed, rows):
-        mean, sd, _, terms, health = evaluate(theta, steps, observed, inputs, t0, rows, 0)
-        cov = (sd * sd).reshape(rows.size, 1, 1)
-        return terms, health, mean, cov, np.empty((rows.size, 0, 1)), np.empty((rows.size, 0))
-
-    return CompiledFunction(run, key_of("run", bound.key))
-
-
-def _bind(system: System, tolerance: float, moment: int) -> CompiledFunction:
-    """Bind the entry point to one system: (record, rows, draw_seed) -> moments, terms, health."""
-    GRID_STATES.compile()
-    table = system_table(system, ("step_moments", "log_density"))
-    evaluate, make_table, dt = GRID_STATES.external, table.make, system.dt
-
-    @njit_callable
-    def states(theta, steps, observed, inputs, t0, rows, draw_seed):
-        # One state: what is (R, 1) for the caller is a vector here.
-        mean, sd = np.full((rows.size, 1), np.nan), np.full((rows.size, 1), np.nan)
-        drawn, terms = np.full((rows.size, 1), np.nan), np.full(steps.size, -np.inf)
-        health = np.empty(3)
-        health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
-        table = make_table()
-        arguments = StatesArguments(
-            table=table.ctypes.data, dt=dt, theta=theta.ctypes.data, n_theta=theta.size,
-            inputs=inputs.ctypes.data, n_rows=inputs.shape[0], tolerance=tolerance, moment=moment,
-            steps=steps.ctypes.data, n_observations=steps.size, observed=observed.ctypes.data,
-            t0=t0, rows=rows.ctypes.data, R=rows.size, draw_seed=draw_seed, mean=mean.ctypes.data,
-            sd=sd.ctypes.data, drawn=drawn.ctypes.data, terms=terms.ctypes.data,
-            health=health.ctypes.data,
-        )  # fmt: skip
-        evaluate(*arguments)
-        keep_alive(table)
-        return mean, sd, drawn, terms, health
-
-    key = key_of(f"grid states {tolerance!r} {moment}", table.key, GRID_STATES.key)
-    return CompiledFunction(states, key)
+GRID_STATES = plan_entry(_grid_states, "grid_states", digest("grid_states"))
+GRID_RUN = plan_entry(_grid_run, "grid_run", digest("grid_run"))

@@ -1,0 +1,286 @@
+"""A function that a plan computes: called from Python, or by machine code that numba compiles."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import _empty_nd_impl, populate_array
+
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.plan import (
+    ARGUMENTS,
+    DEFAULTS,
+    HEADER,
+    N_RECORD,
+    N_REQUEST,
+    N_RESULTS,
+    RAISED,
+    REFUSALS,
+    REQUEST,
+    RESULTS,
+    SHAPES,
+    Argument,
+    Plan,
+    PlanFunction,
+)
+from pymc_statespace_filters.errors import ModelError
+
+type Names = Sequence[tuple[str, int]]
+
+# The vectors of a call lie one behind the other.
+_FIRST = {"record": 0, "request": N_RECORD, "results": N_RECORD + N_REQUEST}
+_N_WORDS = N_RECORD + N_REQUEST + N_RESULTS
+_WORD_BYTES = 8
+
+_DEFAULT_WORDS = [0] * _N_WORDS
+for _vector, _words in DEFAULTS.items():
+    for _slot, _word in _words.items():
+        _DEFAULT_WORDS[_FIRST[_vector] + _slot] = _word
+_SIZES_ONLY = _FIRST["request"] + REQUEST.sizes_only
+_REPLACEMENT = _FIRST["request"] + REQUEST.replacement
+
+
+def _exception(status: int) -> type[Exception]:
+    return RuntimeError if status == RAISED else ModelError
+
+
+class PlannedFunction:
+    """A compiled function of arrays and numbers, of which a plan is the machine code.
+
+    Parameters
+    ----------
+    plan : Plan
+    arguments : sequence of (str, int)
+        Names and dimensions, see `plan.ARGUMENTS`. ``noise`` is a seed and a vector of normals.
+    results : sequence of (str, int)
+        Names and dimensions, see `plan.SHAPES`; one result is returned as it is.
+    """
+
+    def __init__(self, plan: Plan, arguments: Names, results: Names) -> None:
+        self.plan = plan
+        self.arguments, self.results = tuple(arguments), tuple(results)
+        self._given = [ARGUMENTS[argument] for argument in _flat(self.arguments)]
+        self._shapes = [_shape(name, ndim) for name, ndim in results]
+
+    @property
+    def key(self) -> str | None:
+        """Identifies the code; None if it cannot be cached on disk."""
+        return key_of(repr((self.arguments, self.results)), self.plan.key)
+
+    def __call__(self, *values: Any) -> Any:
+        """Call from Python; arrays are contiguous and of the right types."""
+        words = _DEFAULT_WORDS.copy()
+        for given, value in zip(self._given, _flat_values(values), strict=True):
+            first = _FIRST[given.vector]
+            if given.is_value:
+                words[first + given.slot] = int(value)
+                continue
+            words[first + given.slot] = value.ctypes.data
+            for slot, length in zip(given.shape, value.shape, strict=True):
+                words[first + slot] = length
+        words[_SIZES_ONLY] = 1
+        memory = np.array(words, np.int64)
+        record = memory.ctypes.data
+        request, places = record + _WORD_BYTES * N_RECORD, record + _WORD_BYTES * _FIRST["results"]
+        call = self.plan.run
+        self._check(call(self.plan.address, record, request, places))
+        sizes = memory[_FIRST["results"] :].tolist()
+        results = []
+        for slot, shape in self._shapes:
+            result = np.empty([sizes[s] if is_slot else s for s, is_slot in shape])
+            memory[_FIRST["results"] + slot] = result.ctypes.data
+            results.append(result)
+        memory[_SIZES_ONLY] = 0
+        if words[_REPLACEMENT]:
+            call = PlanFunction(words[_REPLACEMENT])
+        self._check(call(self.plan.address, record, request, places))
+        n_tape = memory[_FIRST["results"] + RESULTS.n_tape]
+        results = [
+            result[:n_tape] if name == "tape" else result
+            for (name, _), result in zip(self.results, results, strict=True)
+        ]
+        return tuple(results) if len(results) > 1 else results[0]
+
+    def _check(self, status: int) -> None:
+        if status:
+            raise _exception(status)(REFUSALS[status])
+
+    @cached_property
+    def function(self) -> Any:
+        """The same for compiled functions; numba compiles the call, not the plan."""
+        return njit(error_model="numpy", nogil=True)(self.source())
+
+    def source(self) -> Callable:
+        """A function for numba to compile, without Python objects besides an intrinsic."""
+        names = [name for name, _ in self.arguments]
+        parts = ", ".join("noise[0], noise[1]" if n == "noise" else n for n in names)
+        namespace = {"__name__": __name__, "invoke": _invoke(self)}
+        text = f"def call({', '.join(names)}):\n    return invoke({parts})\n"
+        exec(compile(text, "<call of a plan>", "exec"), namespace)
+        return namespace["call"]
+
+
+def _flat(arguments: Names) -> list[tuple[str, int]]:
+    """The arguments with the two parts of a noise in its place."""
+    parts: list[tuple[str, int]] = []
+    for argument in arguments:
+        parts += [("seed", 0), ("normals", 1)] if argument[0] == "noise" else [argument]
+    return parts
+
+
+def _flat_values(values: Sequence[Any]) -> list[Any]:
+    parts: list[Any] = []
+    for value in values:
+        if isinstance(value, tuple):
+            parts += value
+        else:
+            parts.append(np.asarray(value))
+    return parts
+
+
+def _shape(name: str, ndim: int) -> tuple[int, list[tuple[int, bool]]]:
+    """The slot of a result's address, and its shape: slots of sizes, or numbers."""
+    shape = SHAPES[name][len(SHAPES[name]) - ndim :]
+    sizes = [(getattr(RESULTS, s), True) if isinstance(s, str) else (s, False) for s in shape]
+    return getattr(RESULTS, name), sizes
+
+
+def _invoke(planned: PlannedFunction) -> Any:
+    """An intrinsic that makes the call, with arguments in the order of `_flat`."""
+    arguments = _flat(planned.arguments)
+    arrays = [types.Array(types.float64, ndim, "C") for _, ndim in planned.results]
+    returned = types.Tuple(arrays) if len(arrays) > 1 else arrays[0]
+
+    def typed(typing_context: Any, kinds: tuple) -> tuple:
+        def generate(context: Any, builder: Any, signature: Any, values: Sequence[Any]) -> Any:
+            return _Emitter(context, builder, planned).call(signature.args, values)
+
+        return returned(*kinds), generate
+
+    names = ", ".join(f"{name}_{i}" for i, (name, _) in enumerate(arguments))
+    scope: dict[str, Any] = {"typed": typed}
+    exec(f"def invoke(typing_context, {names}): return typed(typing_context, ({names},))", scope)
+    return intrinsic(scope["invoke"])
+
+
+class _Emitter:
+    """Emits the call of a plan into a function that numba compiles."""
+
+    def __init__(self, context: Any, builder: Any, planned: PlannedFunction) -> None:
+        self._context, self._builder, self._planned = context, builder, planned
+        self._integer = context.get_value_type(types.intp)
+        with cgutils.goto_block(builder, builder.function.entry_basic_block):
+            kind = ir.ArrayType(self._integer, _N_WORDS)
+            self._memory = builder.alloca(kind)
+        builder.store(ir.Constant(kind, _DEFAULT_WORDS), self._memory)
+
+    def call(self, kinds: Sequence[Any], values: Sequence[Any]) -> Any:
+        """The results of the call with arguments of these types."""
+        builder, given = self._builder, self._planned._given
+        copies = []
+        for kind, value, argument in zip(kinds, values, given, strict=True):
+            if isinstance(kind, types.Array) and kind.layout != "C":
+                value, kind = self._contiguous(kind, value)
+                copies.append((kind, value))
+            self._pass(argument, kind, value)
+        plan = builder.ptrtoint(_symbol(builder, self._planned.plan.symbol), self._integer)
+        function = self._load_at(plan, HEADER.run)
+        self._set("request", REQUEST.sizes_only, self._integer(1))
+        self._run(function, plan)
+        results = [self._new(name, ndim) for name, ndim in self._planned.results]
+        self._set("request", REQUEST.sizes_only, self._integer(0))
+        replacement = self._get("request", REQUEST.replacement)
+        is_replaced = builder.icmp_signed("!=", replacement, self._integer(0))
+        self._run(builder.select(is_replaced, replacement, function), plan)
+        for kind, value in copies:
+            self._context.nrt.decref(builder, kind, value)
+        made = [
+            self._shortened(*result) if name == "tape" else result[1]._getvalue()
+            for (name, _), result in zip(self._planned.results, results, strict=True)
+        ]
+        if len(made) == 1:
+            return made[0]
+        return self._context.make_tuple(builder, types.Tuple([kind for kind, _ in results]), made)
+
+    def _contiguous(self, kind: Any, value: Any) -> tuple[Any, Any]:
+        copied = types.Array(kind.dtype, kind.ndim, "C")
+        copy = self._context.compile_internal(
+            self._builder, lambda array: array.copy(), copied(kind), [value]
+        )
+        return copy, copied
+
+    def _pass(self, argument: Argument, kind: Any, value: Any) -> None:
+        builder = self._builder
+        if isinstance(kind, types.Array):
+            array = self._context.make_array(kind)(self._context, builder, value)
+            if argument.is_value:
+                number = builder.load(array.data)
+                self._set(argument.vector, argument.slot, number)
+                return
+            address = builder.ptrtoint(array.data, self._integer)
+            lengths = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
+            for slot, length in zip(argument.shape, lengths, strict=True):
+                self._set(argument.vector, slot, length)
+        elif argument.is_value:
+            address = self._context.cast(builder, value, kind, types.intp)
+        else:
+            number = self._context.cast(builder, value, kind, types.float64)
+            place = cgutils.alloca_once_value(builder, number)
+            address = builder.ptrtoint(place, self._integer)
+        self._set(argument.vector, argument.slot, address)
+
+    def _word(self, vector: str, slot: int) -> Any:
+        return cgutils.gep_inbounds(self._builder, self._memory, 0, _FIRST[vector] + slot)
+
+    def _set(self, vector: str, slot: int, value: Any) -> None:
+        self._builder.store(value, self._word(vector, slot))
+
+    def _get(self, vector: str, slot: int) -> Any:
+        return self._builder.load(self._word(vector, slot))
+
+    def _load_at(self, address: Any, slot: int) -> Any:
+        words = self._builder.inttoptr(address, self._integer.as_pointer())
+        return self._builder.load(cgutils.gep_inbounds(self._builder, words, slot))
+
+    def _run(self, function: Any, plan: Any) -> None:
+        """Call, and raise what a status says."""
+        builder = self._builder
+        kind = ir.FunctionType(self._integer, [self._integer] * 4)
+        vectors = [builder.ptrtoint(self._word(vector, 0), self._integer) for vector in _FIRST]
+        status = builder.call(builder.inttoptr(function, kind.as_pointer()), [plan, *vectors])
+        is_refused = builder.icmp_signed("!=", status, self._integer(0))
+        with builder.if_then(is_refused, likely=False):
+            for code, text in REFUSALS.items():
+                with builder.if_then(builder.icmp_signed("==", status, self._integer(code))):
+                    self._context.call_conv.return_user_exc(builder, _exception(code), (text,))
+
+    def _new(self, name: str, ndim: int) -> tuple[Any, Any]:
+        kind = types.Array(types.float64, ndim, "C")
+        slot, shape = _shape(name, ndim)
+        sizes = [
+            self._get("results", size) if is_slot else self._integer(size)
+            for size, is_slot in shape
+        ]
+        array = _empty_nd_impl(self._context, self._builder, kind, sizes)
+        self._set("results", slot, self._builder.ptrtoint(array.data, self._integer))
+        return kind, array
+
+    def _shortened(self, kind: Any, array: Any) -> Any:
+        """A tape of the length that was written."""
+        builder = self._builder
+        _, width = cgutils.unpack_tuple(builder, array.shape, 2)
+        shape = [self._get("results", RESULTS.n_tape), width]
+        populate_array(array, array.data, shape, array.strides, array.itemsize, array.meminfo)
+        return array._getvalue()
+
+
+def _symbol(builder: Any, name: str) -> Any:
+    module = builder.module
+    if name in module.globals:
+        return module.globals[name]
+    return ir.GlobalVariable(module, ir.IntType(8), name)

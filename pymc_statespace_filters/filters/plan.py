@@ -1,0 +1,247 @@
+"""The plan of a filter for one system: sizes, the system's functions by address, and settings.
+
+`make_plan` packs it into words, `read_system` unpacks it. Both use the names of `PLAN`, so that no
+code refers to a slot by its number.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pymc_statespace_filters.compiler.lowering.entry_points import MemberArguments, entry_point
+from pymc_statespace_filters.compiler.lowering.guide_loops import (
+    FollowArguments,
+    LookBackArguments,
+)
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, call_address
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.plan import N_HEADER, Plan, version_of
+from pymc_statespace_filters.filters.protocol import System
+
+
+class PlanSlots(NamedTuple):
+    """Places in a plan behind the header; the free states follow, then the settings."""
+
+    n: int = N_HEADER + 0
+    m: int = N_HEADER + 1
+    p: int = N_HEADER + 2
+    n_inputs: int = N_HEADER + 3
+    n_theta: int = N_HEADER + 4
+    n_constants: int = N_HEADER + 5
+    n_free: int = N_HEADER + 6
+    n_settings: int = N_HEADER + 7
+    dt: int = N_HEADER + 8  # a real number
+    is_time_invariant: int = N_HEADER + 9
+    has_gaussian_observation: int = N_HEADER + 10
+    observation_uses_inputs: int = N_HEADER + 11
+    # functions of the system, 0 for those that the filter does not use
+    prepare: int = N_HEADER + 12
+    initialise: int = N_HEADER + 13
+    propagate: int = N_HEADER + 14
+    observe: int = N_HEADER + 15
+    log_density: int = N_HEADER + 16
+    step_moments: int = N_HEADER + 17
+    propagate_guided: int = N_HEADER + 18
+    observation_information: int = N_HEADER + 19
+    follow: int = N_HEADER + 20
+    look_back: int = N_HEADER + 21
+    start_back: int = N_HEADER + 22
+    # of filters with members
+    n_members: int = N_HEADER + 23
+    order: int = N_HEADER + 24  # the function that sorts members, 0 if none does
+    evaluate: int = N_HEADER + 25  # the filter itself, for functions of states that run it
+    observer: int = N_HEADER + 26
+    # of states
+    last_event: int = N_HEADER + 27
+    updates: int = N_HEADER + 28
+    lag: int = N_HEADER + 29
+
+
+PLAN = PlanSlots()
+N_WORDS = N_HEADER + len(PLAN)
+VERSION = version_of(PLAN)
+
+SYSTEM_FUNCTIONS = (
+    "prepare", "initialise", "propagate", "observe", "log_density", "step_moments",
+    "propagate_guided", "observation_information", "follow", "look_back", "start_back",
+)  # fmt: skip
+
+NULL = np.int64(0)
+"""An address that is not read."""
+
+
+def make_plan(
+    system: System,
+    run: EntryPoint,
+    functions: Sequence[str],
+    settings: Sequence[float] = (),
+    **others: int | EntryPoint,
+) -> Plan:
+    """Pack a system, those of its functions that a filter uses, and the filter's settings.
+
+    Parameters
+    ----------
+    system : System
+    run : EntryPoint
+        The function that the plan is for.
+    functions : sequence of str
+        Names of `SYSTEM_FUNCTIONS`; `prepare` is always there.
+    settings : sequence of float
+        What the function reads by `settings_of`.
+    **others : int or EntryPoint
+        Values of further slots.
+    """
+    used = {name: entry_point(system, name) for name in ("prepare", *functions)}
+    numbers = {name: value for name, value in others.items() if isinstance(value, int)}
+    entries = {name: value for name, value in others.items() if isinstance(value, EntryPoint)}
+    words = np.zeros(N_WORDS + system.free.size + len(settings), np.int64)
+    sizes = {
+        "n": system.n, "m": system.m, "p": system.p, "n_inputs": system.n_inputs,
+        "n_theta": system.n_theta, "n_constants": system.n_constants, "n_free": system.free.size,
+        "n_settings": len(settings), "has_gaussian_observation": system.gaussian_observation,
+        "observation_uses_inputs": system.model.observation_uses_inputs,
+        "is_time_invariant": "step_moments" in used and system.is_time_invariant,
+    }  # fmt: skip
+    for name, number in (sizes | numbers).items():
+        words[getattr(PLAN, name)] = number
+    words.view(np.float64)[PLAN.dt] = system.dt
+    words[N_WORDS : N_WORDS + system.free.size] = system.free
+    words.view(np.float64)[N_WORDS + system.free.size :] = settings
+    identity = repr((words.tolist(), sorted({**used, **entries})))
+    for name, entry in {**used, **entries}.items():
+        entry.compile()
+        words[getattr(PLAN, name)] = entry.address
+    run.compile()
+    key = key_of(identity, run.key, *(entry.key for entry in {**used, **entries}.values()))
+    return Plan(words, VERSION, run, key)
+
+
+class PlannedSystem(NamedTuple):
+    """One evaluation's system: ``c`` its constants, ``inputs`` a row for each step.
+
+    ``free`` are the states that an update may move. Functions are addresses.
+    """
+
+    n: int
+    m: int
+    p: int
+    n_theta: int
+    dt: float
+    is_time_invariant: bool
+    has_gaussian_observation: bool
+    free: np.ndarray
+    c: np.ndarray
+    inputs: np.ndarray
+    initialise: int
+    propagate: int
+    observe: int
+    log_density: int
+    step_moments: int
+    propagate_guided: int
+    observation_information: int
+    follow: int
+    look_back: int
+    start_back: int
+
+
+@njit_internal
+def read_system(plan, theta, inputs):
+    """Unpack a plan, and prepare the constants of one evaluation."""
+    c = np.empty(plan[PLAN.n_constants])
+    call_address(plan[PLAN.prepare], (theta, np.int64(theta.size), c))
+    return PlannedSystem(
+        n=plan[PLAN.n], m=plan[PLAN.m], p=plan[PLAN.p], n_theta=plan[PLAN.n_theta],
+        dt=plan.view(np.float64)[PLAN.dt], is_time_invariant=plan[PLAN.is_time_invariant] != 0,
+        has_gaussian_observation=plan[PLAN.has_gaussian_observation] != 0,
+        free=free_states(plan), c=c, inputs=inputs,
+        initialise=plan[PLAN.initialise], propagate=plan[PLAN.propagate],
+        observe=plan[PLAN.observe], log_density=plan[PLAN.log_density],
+        step_moments=plan[PLAN.step_moments], propagate_guided=plan[PLAN.propagate_guided],
+        observation_information=plan[PLAN.observation_information],
+        follow=plan[PLAN.follow], look_back=plan[PLAN.look_back],
+        start_back=plan[PLAN.start_back],
+    )  # fmt: skip
+
+
+@njit_internal
+def free_states(plan):
+    """The states that an update may move."""
+    return plan[N_WORDS : N_WORDS + plan[PLAN.n_free]]
+
+
+@njit_internal
+def settings_of(plan):
+    """The settings that a plan was made with."""
+    return plan.view(np.float64)[N_WORDS + plan[PLAN.n_free] :]
+
+
+@njit_internal
+def _call(address, system, k, t, z, width, X, out):
+    arguments = MemberArguments(
+        c=system.c, inputs=system.inputs, k=k, t=t, z=z, width=width, X=X, out=out,
+        n_members=np.int64(X.shape[1]),
+    )  # fmt: skip
+    call_address(address, arguments)
+
+
+@njit_internal
+def initialise(system, z, width, X):
+    """Draw every member's state at step 0 from normals at the address z."""
+    _call(system.initialise, system, NULL, 0.0, z, width, X, NULL)
+
+
+@njit_internal
+def propagate(system, k, t, z, width, X):
+    """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
+    _call(system.propagate, system, k, t, z, width, X, NULL)
+
+
+@njit_internal
+def observe(system, k, t, z, width, X, D):
+    """Simulate an observation of every member (Eq. 4.15)."""
+    _call(system.observe, system, k, t, z, width, X, D)
+
+
+@njit_internal
+def log_density(system, k, t, d, X, log_p):
+    """Write log p(d | x) of every member; components of d that are NaN are left out."""
+    _call(system.log_density, system, k, t, d, NULL, X, log_p)
+
+
+@njit_internal
+def propagate_guided(system, k, t, z, width, X, gains):
+    """Move every member by noise that these gains shift; X is followed by a row of log ratios."""
+    _call(system.propagate_guided, system, k, t, z, width, X, gains)
+
+
+@njit_internal
+def follow(system, first, last, t0, path, gains, steps, cov):
+    """Move a path by the mean noise of gains, and linearise its steps, see `guide_loops`."""
+    arguments = FollowArguments(
+        c=system.c, inputs=system.inputs, first=first, last=last, t0=t0, dt=system.dt, path=path,
+        gains=gains, steps=steps, cov=cov,
+    )  # fmt: skip
+    call_address(system.follow, arguments)
+
+
+@njit_internal
+def look_back(address, first, last, path, steps, gains, psi, misfit):
+    """Move psi back, and condition the noise on it, see `guide_loops`."""
+    arguments = LookBackArguments(
+        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi, misfit=misfit
+    )
+    call_address(address, arguments)
+
+
+@njit_internal
+def observation_information(system, k, t, d, x, out):
+    """Write log p(d | x) at a point x (n, 1), its score and its information."""
+    _call(system.observation_information, system, k, t, d, NULL, x, out)
+
+
+@njit_internal
+def step_moments(system, k, t, X, M):
+    """Write mean and variance of the next state, given each point X (1, N), to M (2, N)."""
+    _call(system.step_moments, system, k, t, NULL, NULL, X, M)
