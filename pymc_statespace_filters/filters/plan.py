@@ -101,7 +101,7 @@ def make_plan(
         "n": system.n, "m": system.m, "p": system.p, "n_inputs": system.n_inputs,
         "n_theta": system.n_theta, "n_constants": system.n_constants, "n_free": system.free.size,
         "n_settings": len(settings), "has_gaussian_observation": system.gaussian_observation,
-        "observation_uses_inputs": system.model.observation_uses_inputs,
+        "observation_uses_inputs": system.observation_uses_inputs,
         "is_time_invariant": "step_moments" in used and system.is_time_invariant,
     }  # fmt: skip
     for name, number in (sizes | numbers).items():
@@ -109,13 +109,11 @@ def make_plan(
     words.view(np.float64)[PLAN.dt] = system.dt
     words[N_WORDS : N_WORDS + system.free.size] = system.free
     words.view(np.float64)[N_WORDS + system.free.size :] = settings
-    identity = repr((words.tolist(), sorted({**used, **entries})))
-    for name, entry in {**used, **entries}.items():
-        entry.compile()
-        words[getattr(PLAN, name)] = entry.address
-    run.compile()
-    key = key_of(identity, run.key, *(entry.key for entry in {**used, **entries}.values()))
-    return Plan(words, VERSION, run, key)
+    entries |= used
+    key = key_of(
+        repr((words.tolist(), sorted(entries))), run.key, *(entries[e].key for e in sorted(entries))
+    )
+    return Plan(words, VERSION, run, {getattr(PLAN, e): entries[e] for e in entries}, key)
 
 
 class PlannedSystem(NamedTuple):

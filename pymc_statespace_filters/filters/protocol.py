@@ -20,10 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.errors import ModelError
 
 type Array = NDArray[np.float64]
 type Integers = NDArray[np.int64]
+type Compiled[F] = CompiledFunction[F] | PlannedFunction
+"""A function that numba compiles for one system, or one of a plan, which needs no compilation."""
 
 
 class System(Protocol):
@@ -53,6 +56,7 @@ class System(Protocol):
     carried: tuple[str, ...]
     gaussian_observation: bool
     additive_noise: bool
+    observation_uses_inputs: bool
 
     def __hash__(self) -> int: ...
 
@@ -173,16 +177,6 @@ class LogLikelihoodFunction(Protocol):
         """Evaluate."""
 
 
-class DistributedLogLikelihoodFunction(Protocol):
-    """Terms and health of an evaluation that several ranks make together, equal on all of them."""
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
-        rank: int, n_ranks: int, exchange: int,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Evaluate."""
-
-
 class HealthFunction(Protocol):
     """Terms and health of one evaluation, and between them the effective number of each term.
 
@@ -246,13 +240,6 @@ class GradientFunction(Protocol):
         """Evaluate."""
 
 
-class StoredNoiseFunction(Protocol):
-    """The normals that an evaluation with this seed uses, one vector."""
-
-    def __call__(self, steps: Integers, seed: int) -> Array:
-        """Evaluate."""
-
-
 @runtime_checkable
 class Filter(Protocol):
     """Every filter."""
@@ -271,7 +258,7 @@ class Filter(Protocol):
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood, or the mean of its estimates, is that of the system."""
 
-    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+    def compile(self, system: System) -> Compiled[LogLikelihoodFunction]:
         """Compile the log-likelihood."""
 
 
@@ -279,7 +266,7 @@ class Filter(Protocol):
 class RunFilter(Filter, Protocol):
     """A filter that `run_filter` can show."""
 
-    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+    def compile_run(self, system: System) -> Compiled[RunFunction]:
         """Compile one run with all that it computes."""
 
 
@@ -287,7 +274,7 @@ class RunFilter(Filter, Protocol):
 class StatesFilter(Filter, Protocol):
     """A filter that gives states at draws: `filtered_states`, `smoothed_states`, `forecast`."""
 
-    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+    def compile_states(self, system: System, moment: str) -> Compiled[StatesFunction]:
         """Compile "predicted", "filtered" or "smoothed" states."""
         ...
 
@@ -299,7 +286,7 @@ class StatesFilter(Filter, Protocol):
 class HealthFilter(Filter, Protocol):
     """A filter that tells how many of its members are behind every term."""
 
-    def compile_health(self, system: System) -> CompiledFunction[HealthFunction]:
+    def compile_health(self, system: System) -> Compiled[HealthFunction]:
         """Compile the effective number of every term."""
 
 
@@ -307,7 +294,7 @@ class HealthFilter(Filter, Protocol):
 class PredictionFilter(Filter, Protocol):
     """A filter that knows the law of every observation given those before it."""
 
-    def compile_predictions(self, system: System) -> CompiledFunction[PredictionsFunction]:
+    def compile_predictions(self, system: System) -> Compiled[PredictionsFunction]:
         """Compile the law of every observation, for systems with additive Gaussian noise."""
 
 
@@ -330,7 +317,7 @@ class DifferentiableFilter(Filter, Protocol):
     deterministic system the mean is enough.
     """
 
-    def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
+    def compile_gradient(self, system: System) -> Compiled[GradientFunction]:
         """Compile both passes as one function."""
 
     def compile_taped(self, system: System) -> CompiledFunction:
@@ -378,13 +365,8 @@ class EnsembleFilter(Filter, Protocol):
     def n_normals(self, system: System, n_steps: Any, n_observations: Any) -> Any:
         """Return how many normals one evaluation uses."""
 
-    def stored_noise(self, system: System) -> CompiledFunction[StoredNoiseFunction]:
-        """Compile the making of these normals."""
-
-    def compile_distributed(
-        self, system: System
-    ) -> CompiledFunction[DistributedLogLikelihoodFunction]:
-        """Compile the log-likelihood for members that are divided among ranks."""
+    def stored_noise(self, system: System) -> PlannedFunction:
+        """Compile the making of these normals: (steps, seed) -> one vector."""
 
 
 def check_states_filter(filter: Filter) -> StatesFilter:

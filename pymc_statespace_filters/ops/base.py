@@ -30,7 +30,7 @@ from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.native.python_call import TimedCall, call_machine_code
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Filter, check_filter
+from pymc_statespace_filters.filters.protocol import Compiled, Filter, check_filter
 from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
@@ -88,7 +88,7 @@ class FilterOp(Op):
         # The default would print every equation of the system.
         return f"{type(self).__name__}{{{self.filter}}}"
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction | PlannedFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """Compile the function of the inputs."""
         raise NotImplementedError
 
@@ -144,7 +144,7 @@ def evaluator(op: FilterOp) -> Any:
     with COMPILATION:
         compiled = kernel(op)
     kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]
-    function = compiled if isinstance(compiled, PlannedFunction) else _jitted(op)
+    function = compiled if isinstance(compiled, PlannedFunction) else _jitted(op, compiled)
     call = TimedCall(function)
 
     def evaluate(*values: Any) -> tuple:
@@ -159,9 +159,9 @@ def evaluator(op: FilterOp) -> Any:
     return evaluate
 
 
-def _jitted(op: FilterOp) -> Callable:
+def _jitted(op: FilterOp, kernel: CompiledFunction) -> Callable:
     """A compiled function of an operation whose filter has no plan; on disk if it has a key."""
-    function, key = _call(op)
+    function, key = _call(op, kernel)
     compiled = jit(function)
     machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
 
@@ -243,14 +243,14 @@ def check_observed(p: int) -> Any:
     return check
 
 
-def cache_key(system: StateSpaceModel, compiled: CompiledFunction) -> str | None:
+def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
     """The key of a compiled function together with the checks of its record."""
     checked = (system.p, system.n_input_columns, system.observation_uses_inputs)
     return key_of(f"checked for {checked}", compiled.key)
 
 
 @cache
-def kernel(op: FilterOp) -> CompiledFunction | PlannedFunction:
+def kernel(op: FilterOp) -> Compiled:
     """The compiled function of an operation, made once."""
     compiled = op.compile(compile_system(op.system))
     if isinstance(compiled, PlannedFunction):
@@ -284,20 +284,20 @@ def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     """The compiled function of an operation, and its key."""
     compiled = kernel(op)
     if isinstance(compiled, PlannedFunction):
-        return numba_njit(compiled.source()), compiled.key
-    function, key = _call(op)
+        function, key = compiled.source(), compiled.key
+    else:
+        function, key = _call(op, compiled)
     return numba_njit(function), key
 
 
-def _call(op: FilterOp) -> tuple[Any, str | None]:
-    """The function that checks the record, then calls the kernel; and its key.
+def _call(op: FilterOp, compiled: CompiledFunction) -> tuple[Any, str | None]:
+    """The function that checks the record, then calls a kernel without a plan; and its key.
 
     Kernels receive copies: constants and variables, C and Fortran order differ in type, and each
     combination of types would be compiled separately, which takes seconds where a copy takes
     nanoseconds. The function is written out for each operation; a loop over the inputs would cost
     time in every call and seconds of compilation.
     """
-    compiled = kernel(op)
     names = [name for name, _, _ in op.input_types]
     codes = [
         op.argument_code.get(name, f"{name}.copy()" if ndim else f"{name}.item()")

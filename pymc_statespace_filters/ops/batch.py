@@ -8,9 +8,8 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.blockwise import Blockwise
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import BatchFilter
+from pymc_statespace_filters.filters.protocol import BatchFilter, Compiled
 from pymc_statespace_filters.ops.base import (
     HEALTH_SIZE,
     RECORD_INPUTS,
@@ -27,7 +26,7 @@ class BatchLogLikelihood(FilterOp):
     input_types = (("theta", "float64", 2), *RECORD_INPUTS[1:])
     output_types = (pt.dmatrix, pt.dmatrix)
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's log-likelihood of many points."""
         return self.filter.compile_batch(system)
 

@@ -2,9 +2,8 @@
 
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import HealthFilter, PredictionFilter
+from pymc_statespace_filters.filters.protocol import Compiled, HealthFilter, PredictionFilter
 from pymc_statespace_filters.ops.base import FilterOp
 
 
@@ -15,7 +14,7 @@ class TermHealth(FilterOp):
     result_names = ("terms", "n_effective", "health")
     filter: HealthFilter
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's health."""
         return self.filter.compile_health(system)
 
@@ -27,6 +26,6 @@ class Predictions(FilterOp):
     result_names = ("predicted", "predicted_cov", "log_below", "log_above")
     filter: PredictionFilter
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's predictions."""
         return self.filter.compile_predictions(system)

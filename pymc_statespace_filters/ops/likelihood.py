@@ -15,13 +15,12 @@ from pytensor.graph.fg import FunctionGraph
 from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.rewriting.basic import register_specialize
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import (
     CompiledSystem,
     compile_system,
 )
 from pymc_statespace_filters.errors import GradientUnavailableError
-from pymc_statespace_filters.filters.protocol import DifferentiableFilter
+from pymc_statespace_filters.filters.protocol import Compiled, DifferentiableFilter
 from pymc_statespace_filters.filters.recommendation import filters_for, listed, short_form
 from pymc_statespace_filters.ops.base import (
     HEALTH_SIZE,
@@ -44,7 +43,7 @@ class LogLikelihood(FilterOp):
     gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
     argument_code: ClassVar[Mapping[str, str | None]] = {"seed": "(seed.item(), no_normals.copy())"}
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's log-likelihood."""
         return self.filter.compile(system)
 
@@ -97,7 +96,7 @@ class LogLikelihoodGradient(ThetaDerivative):
     gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """Both passes of the filter."""
         return self.filter.compile_gradient(system)
 
@@ -109,7 +108,7 @@ class TapedLogLikelihood(FilterOp):
     output_types = (pt.dvector, pt.dvector, pt.dmatrix)
     result_names = ("terms", "health", "tape")
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The forward pass."""
         return self.filter.compile_taped(system)
 
@@ -123,7 +122,7 @@ class TapePullback(ThetaDerivative):
     record_checks = ()
     argument_code: ClassVar[Mapping[str, str | None]] = {"tape": "tape"}
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The backward pass."""
         return self.filter.compile_pullback(system)
 

@@ -9,9 +9,8 @@ from typing import ClassVar
 
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import EnsembleFilter
+from pymc_statespace_filters.filters.protocol import Compiled, EnsembleFilter
 from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
@@ -25,7 +24,7 @@ class StoredNoise(FilterOp):
     result_names = ("normals",)
     record_checks = ()
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The normals, in the filter's layout."""
         return self.filter.stored_noise(system)
 

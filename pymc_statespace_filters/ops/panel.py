@@ -22,7 +22,7 @@ from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.filters.protocol import PanelFilter
+from pymc_statespace_filters.filters.protocol import Compiled, PanelFilter
 from pymc_statespace_filters.filters.records import end_of_record, include_health, single_record
 from pymc_statespace_filters.ops.base import RECORD_INPUTS
 from pymc_statespace_filters.ops.likelihood import (
@@ -49,7 +49,7 @@ class PanelLogLikelihood(LogLikelihood):
     record_checks = _CHECKS
     gufunc_signature = "(g,k),(j,c),(j,p),(s,u),(),()->(j),(h)"
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction | PlannedFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """All records side by side if the filter has that, else one after the other."""
         if isinstance(self.filter, PanelFilter):
             return _without_stored_noise(self.filter.compile_panel(system))
@@ -69,11 +69,14 @@ class PanelLogLikelihoodGradient(LogLikelihoodGradient):
     record_checks = _CHECKS
     gufunc_signature = "(g,k),(j,c),(j,p),(s,u),(),(),(j)->(g,k)"
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """Both passes of the filter."""
         if isinstance(self.filter, PanelFilter):
             return self.filter.compile_panel_gradient(system)
-        return _gradients_one_by_one(self.filter.compile_gradient(system))
+        compiled = self.filter.compile_gradient(system)
+        return (
+            compiled if isinstance(compiled, PlannedFunction) else _gradients_one_by_one(compiled)
+        )
 
 
 class TapedPanelLogLikelihood(TapedLogLikelihood):
@@ -83,7 +86,7 @@ class TapedPanelLogLikelihood(TapedLogLikelihood):
     record_checks = _CHECKS
     filter: Any
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The forward pass."""
         return self.filter.compile_panel_taped(system)
 
@@ -95,7 +98,7 @@ class PanelTapePullback(TapePullback):
     output_types = (pt.dmatrix,)
     filter: Any
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The backward pass."""
         return self.filter.compile_panel_pullback(system)
 

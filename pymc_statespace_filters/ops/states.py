@@ -2,9 +2,8 @@
 
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import RunFilter, StatesFilter
+from pymc_statespace_filters.filters.protocol import Compiled, RunFilter, StatesFilter
 from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -26,7 +25,7 @@ class States(FilterOp):
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's states."""
         return self.filter.compile_states(system, self.moment)
 
@@ -43,6 +42,6 @@ class FilterRun(FilterOp):
     result_names = ("terms", "health", "mean", "cov", "members", "weights")
     filter: RunFilter
 
-    def compile(self, system: CompiledSystem) -> CompiledFunction:
+    def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's run."""
         return self.filter.compile_run(system)

@@ -17,6 +17,7 @@ class Machine:
         self.carried, self.states = (), tuple(f"x{i}" for i in range(self.n))
         self.n_start, self.gaussian, self.with_gaussian_steps = self.n, self, self
         self.gaussian_observation = self.additive_noise = True
+        self.observation_uses_inputs = False
         self.has_exact_observation_density = True
 
 

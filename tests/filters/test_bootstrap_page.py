@@ -112,7 +112,7 @@ def test_settings():
 def test_stored_normals_serve_multinomial_resampling_too():
     machine, steps, observed = SCALAR
     filter_ = BootstrapPF(50, resampling="multinomial", resample_below=1)
-    stored = filter_.stored_noise(machine).function(np.asarray(steps, np.int64), 7)
+    stored = filter_.stored_noise(machine)(np.asarray(steps, np.int64), 7)
     by_seed, _ = run(filter_, machine, steps, observed, seed=7)
     by_normals, _ = run(filter_, machine, steps, observed, normals=stored)
     assert np.array_equal(by_seed, by_normals)
@@ -133,7 +133,7 @@ def test_sorted_resampling_of_two_states_is_unbiased():
 def moves(filter_, record, correlation, n_pairs):
     """Variances of log L and of its difference to log L after the normals have moved."""
     machine, steps, _ = record
-    stored = filter_.stored_noise(machine).function
+    stored = filter_.stored_noise(machine)
     at, logs = np.asarray(steps, np.int64), np.empty((n_pairs, 2))
     for pair in range(n_pairs):
         u, v = stored(at, 2 * pair), stored(at, 2 * pair + 1)

@@ -15,7 +15,6 @@ from scipy.stats import chi2, multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.filters.ensemble.ancestral_smoother import LAG, _settlement
 from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
@@ -71,8 +70,7 @@ class States(NamedTuple):
 @cache
 def compiled_states(filter, system, moment):
     """What the filter compiles, without PyTensor's layers around it."""
-    compiled = filter.compile_states(compile_system(system), moment)
-    return cached_on_disk(compiled.function, compiled.key)
+    return filter.compile_states(compile_system(system), moment)
 
 
 def states(

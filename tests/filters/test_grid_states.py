@@ -42,7 +42,7 @@ class States(NamedTuple):
 
 @cache
 def compiled(system, moment):
-    return psf.GridFilter().compile_states(compile_system(system), moment).function
+    return psf.GridFilter().compile_states(compile_system(system), moment)
 
 
 def states(system, parameters, steps, observed, rows, moment, *, draw_seed=0, inputs=None):

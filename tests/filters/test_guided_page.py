@@ -8,6 +8,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from tests.compiled import on_rank
 from tests.filters.truth_systems import (
     DOUBLE_WELL_SYSTEM,
     double_well_parameters,
@@ -37,7 +38,7 @@ def log_likelihood(filter, record, given=WELL, seed=0):
 @pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
 def test_is_the_same_to_the_bit_on_any_number_of_ranks(resampling):
     filter = psf.GuidedPF(300, resample_below=0.9, resampling=resampling)
-    run = filter.compile_distributed(compile_system(DOUBLE_WELL_SYSTEM)).function
+    run = on_rank(filter.compile(compile_system(DOUBLE_WELL_SYSTEM)))
     record = well_record()
     theta = np.array([WELL[name] for name in DOUBLE_WELL_SYSTEM.parameters])
     arguments = (theta, record["steps"], record["observed"][:, None], np.zeros((0, 0)), 0.0, 3)

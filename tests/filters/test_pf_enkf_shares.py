@@ -7,6 +7,7 @@ import pytest
 
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
+from tests.compiled import on_rank
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, WILD_START, well_record
 from tests.filters.machines import DOUBLE_WELL, linear_machine, scalar_record, simulate
 from tests.ranks import on_ranks
@@ -35,7 +36,7 @@ MACHINES = {"line": LINE[0], "plane": OSCILLATOR[0], "space": SPACE[0], "well": 
 
 @cache
 def compiled(filter_, name):
-    return filter_.compile_distributed(MACHINES[name]).function
+    return on_rank(filter_.compile(MACHINES[name]))
 
 
 def assert_same(filter_, name, steps, observed, theta=(1.0,), sizes=SIZES):

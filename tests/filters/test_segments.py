@@ -149,7 +149,7 @@ def test_terms_are_those_of_dense_matrices(name, tolerance):
 def compiled(name, method, *arguments):
     """A compiled function of the filter, as a function of further arguments."""
     model, steps, observed, _ = case(name)
-    function = getattr(psf.GridFilter(), method)(compile_system(model), *arguments).function
+    function = getattr(psf.GridFilter(), method)(compile_system(model), *arguments)
     record = np.empty(0), steps.astype(np.int64), observed[:, None], np.empty((steps[-1] + 1, 0))
     return lambda *rest: function(*record, 0.0, 0, *rest)
 

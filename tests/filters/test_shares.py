@@ -31,6 +31,7 @@ from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
 from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from pymc_statespace_filters.system.record import checked_record
+from tests.compiled import on_rank
 from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
 from tests.ranks import on_ranks
 from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
@@ -51,7 +52,7 @@ def distributed_function(filter_, machine):
     """Compiled once for all tests of this file."""
     key = filter_, id(machine)
     if key not in _shared:
-        _shared[key] = filter_.compile_distributed(machine).function, machine
+        _shared[key] = on_rank(filter_.compile(machine)), machine
     return _shared[key][0]
 
 

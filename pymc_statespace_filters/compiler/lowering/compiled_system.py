@@ -102,6 +102,7 @@ class CompiledSystem:
         self.states, self.carried = tuple(model.states), tuple(model.carried)
         self.gaussian_observation = bool(model.gaussian_observation)
         self.additive_noise = bool(model.additive_noise)
+        self.observation_uses_inputs = bool(model.observation_uses_inputs)
         carried = [self.states.index(name) for name in self.carried]
         self.free = np.setdiff1d(np.arange(self.n), carried)
         draw = model.equations.initial_draw

@@ -16,6 +16,7 @@ key of `REFUSALS`.
 import ctypes
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple
 from uuid import uuid4
 
@@ -255,36 +256,63 @@ def plan_words(plan, version):
 
 
 class Plan:
-    """A plan: its words, which do not change, and the symbol by which graphs refer to it.
+    """A plan, and the symbol by which graphs refer to it; its words are filled in on first use.
 
     Parameters
     ----------
     words : ndarray of int64
-        The header is filled in.
+        Without the header and the addresses.
     version : int
         Of the layout, see `version_of`.
     run : EntryPoint
         The function to call.
+    functions : mapping of int to EntryPoint
+        Functions whose addresses belong to these slots.
     key : str or None
-        Identifies run, functions, sizes and settings, in any process; None if one of them cannot be
+        Identifies functions, sizes and settings, in any process; None if one of them cannot be
         cached on disk.
     """
 
-    def __init__(self, words: np.ndarray, version: int, run: EntryPoint, key: str | None) -> None:
-        words[HEADER.n_words], words[HEADER.run] = words.size, run.address
-        words[HEADER.stamp] = _signed(version ^ (words.size * _FACTOR & _MASK))
+    def __init__(
+        self,
+        words: np.ndarray,
+        version: int,
+        run: EntryPoint,
+        functions: Mapping[int, EntryPoint],
+        key: str | None,
+    ) -> None:
+        self._words, self._version = words, version
+        self._functions = {**functions, HEADER.run: run}
+        self.key = key
+        self._symbol = f"psf_plan_{key or uuid4().hex}"
+
+    @cached_property
+    def address(self) -> int:
+        """Address of the words; functions are compiled, and the symbol is defined."""
+        words = self._words.copy()
+        for slot, entry in self._functions.items():
+            entry.compile()
+            words[slot] = entry.address
+        words[HEADER.n_words] = words.size
+        words[HEADER.stamp] = _signed(self._version ^ (words.size * _FACTOR & _MASK))
         words[HEADER.checksum] = _signed(_checksum(words))
-        words.flags.writeable = False
-        self.words, self.key = words, key
-        self.symbol = f"psf_plan_{key or uuid4().hex}"
-        self.address = words.ctypes.data
-        self.run = PlanFunction(run.address)
-        # Code in other functions refers to the plan for the life of the process.
-        _plans[self.symbol] = self
-        llvm.add_symbol(self.symbol, self.address)
+        # Compiled graphs refer to the words for the life of the process.
+        _kept[self._symbol] = words
+        llvm.add_symbol(self._symbol, words.ctypes.data)
+        return words.ctypes.data
+
+    @property
+    def symbol(self) -> str:
+        """The name of the words in machine code, defined in this process."""
+        return self._symbol if self.address else ""
+
+    @cached_property
+    def run(self) -> Callable[..., int]:
+        """The function to call, with four addresses."""
+        return PlanFunction(self._functions[HEADER.run].address if self.address else 0)
 
 
-_plans: dict[str, Plan] = {}
+_kept: dict[str, np.ndarray] = {}
 
 PlanFunction = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 4)
 """The type of a function of a plan; called from Python it releases the GIL."""

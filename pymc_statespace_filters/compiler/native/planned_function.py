@@ -119,7 +119,7 @@ class PlannedFunction:
         """A function for numba to compile, without Python objects besides an intrinsic."""
         names = [name for name, _ in self.arguments]
         parts = ", ".join("noise[0], noise[1]" if n == "noise" else n for n in names)
-        namespace = {"__name__": __name__, "invoke": _invoke(self)}
+        namespace = {"__name__": __name__, "invoke": _invoke(self, self.plan.symbol)}
         text = f"def call({', '.join(names)}):\n    return invoke({parts})\n"
         exec(compile(text, "<call of a plan>", "exec"), namespace)
         return namespace["call"]
@@ -150,7 +150,7 @@ def _shape(name: str, ndim: int) -> tuple[int, list[tuple[int, bool]]]:
     return getattr(RESULTS, name), sizes
 
 
-def _invoke(planned: PlannedFunction) -> Any:
+def _invoke(planned: PlannedFunction, symbol: str) -> Any:
     """An intrinsic that makes the call, with arguments in the order of `_flat`."""
     arguments = _flat(planned.arguments)
     arrays = [types.Array(types.float64, ndim, "C") for _, ndim in planned.results]
@@ -158,7 +158,7 @@ def _invoke(planned: PlannedFunction) -> Any:
 
     def typed(typing_context: Any, kinds: tuple) -> tuple:
         def generate(context: Any, builder: Any, signature: Any, values: Sequence[Any]) -> Any:
-            return _Emitter(context, builder, planned).call(signature.args, values)
+            return _Emitter(context, builder, planned, symbol).call(signature.args, values)
 
         return returned(*kinds), generate
 
@@ -171,11 +171,12 @@ def _invoke(planned: PlannedFunction) -> Any:
 class _Emitter:
     """Emits the call of a plan into a function that numba compiles."""
 
-    def __init__(self, context: Any, builder: Any, planned: PlannedFunction) -> None:
-        self._context, self._builder, self._planned = context, builder, planned
+    def __init__(self, context: Any, builder: Any, planned: PlannedFunction, symbol: str) -> None:
+        self._context, self._builder = context, builder
+        self._planned, self._symbol = planned, symbol
         self._integer = context.get_value_type(types.intp)
-        with cgutils.goto_block(builder, builder.function.entry_basic_block):
-            kind = ir.ArrayType(self._integer, _N_WORDS)
+        kind = ir.ArrayType(self._integer, _N_WORDS)
+        with builder.goto_entry_block():
             self._memory = builder.alloca(kind)
         builder.store(ir.Constant(kind, _DEFAULT_WORDS), self._memory)
 
@@ -188,7 +189,7 @@ class _Emitter:
                 value, kind = self._contiguous(kind, value)
                 copies.append((kind, value))
             self._pass(argument, kind, value)
-        plan = builder.ptrtoint(_symbol(builder, self._planned.plan.symbol), self._integer)
+        plan = builder.ptrtoint(_global(builder, self._symbol), self._integer)
         function = self._load_at(plan, HEADER.run)
         self._set("request", REQUEST.sizes_only, self._integer(1))
         self._run(function, plan)
@@ -279,7 +280,7 @@ class _Emitter:
         return array._getvalue()
 
 
-def _symbol(builder: Any, name: str) -> Any:
+def _global(builder: Any, name: str) -> Any:
     module = builder.module
     if name in module.globals:
         return module.globals[name]
