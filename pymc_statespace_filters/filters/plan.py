@@ -114,7 +114,9 @@ def make_plan(
         entry.compile()
         words[getattr(PLAN, name)] = entry.address
     run.compile()
-    key = key_of(identity, run.key, *(entry.key for entry in {**used, **entries}.values()))
+    key = key_of(
+        __name__, identity, *(entry.key for entry in (run, *used.values(), *entries.values()))
+    )
     return Plan(words, VERSION, run, key)
 
 

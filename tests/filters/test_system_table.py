@@ -38,7 +38,7 @@ def _read(table, dt, theta, n_theta, inputs, n_rows, out, reals):
     numbers[0], numbers[1] = system.dt, system.c[0]
 
 
-READ = EntryPoint(_read, SYSTEM_ARGUMENTS | {"out": I64_PTR, "reals": F64_PTR}, "read_system", None)
+READ = EntryPoint(_read, SYSTEM_ARGUMENTS | {"out": I64_PTR, "reals": F64_PTR}, "read_system")
 
 
 def test_slots_are_distinct_and_without_gaps():
@@ -82,14 +82,14 @@ def test_swapped_arguments_of_an_entry_point_are_an_error():
         pass
 
     arguments = {"steps": I64_PTR, "rows": I64_PTR, "t0": types.float64}
-    EntryPoint(function, arguments, "function", None)
+    EntryPoint(function, arguments, "function")
     swapped = {"rows": I64_PTR, "steps": I64_PTR, "t0": types.float64}
     message = (
         r"arguments of entry point 'function' must be \['steps', 'rows', 't0'\], the parameters of "
         r"its function, got \['rows', 'steps', 't0'\]"
     )
     with pytest.raises(TypeError, match=message):
-        EntryPoint(function, swapped, "function", None)
+        EntryPoint(function, swapped, "function")
 
 
 def test_arguments_are_given_by_name():
