@@ -19,7 +19,8 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from benchmarks.by_system_records import Case, cases
-from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
+from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record

@@ -11,11 +11,13 @@ from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, NONE
 from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, check_system_and_filter, evaluator
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
+from pymc_statespace_filters.filters.records import single_records
+from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
 from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood, single_records
+from pymc_statespace_filters.ops.panel import PanelLogLikelihood
 from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
 from pymc_statespace_filters.system.checks import check_count
 from pymc_statespace_filters.system.model import StateSpaceModel

@@ -10,8 +10,9 @@ import xarray as xr
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.ops.base import check_system_and_filter, evaluator
-from pymc_statespace_filters.ops.panel import single_records
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
+from pymc_statespace_filters.filters.records import single_records
+from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import checked_panel, row_coords

@@ -20,7 +20,7 @@ from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.compiler.native.python_call import call_in_thread, call_machine_code
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.ops.panel import single_records
+from pymc_statespace_filters.filters.records import single_records
 from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
@@ -58,7 +58,7 @@ def continuation(system: StateSpaceModel) -> CompiledFunction:
         return states, observations
 
     keys = compiled.prepare.key, compiled.propagate.key, sampler.key
-    return _cached(run, key_of(f"continuation {dt!r} {n} {m} {p}", *keys))
+    return _cached(run, key_of(__name__, f"continuation {dt!r} {n} {m} {p}", *keys))
 
 
 @lru_cache(maxsize=256)
@@ -77,13 +77,12 @@ def observer(system: StateSpaceModel) -> CompiledFunction:
             observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
         return observations
 
-    return _cached(run, key_of(f"observer {dt!r} {p}", constants.key, sampler.key))
+    return _cached(run, key_of(__name__, f"observer {dt!r} {p}", constants.key, sampler.key))
 
 
 def _cached(function: Callable, key: str | None) -> CompiledFunction:
     """Compile a function, or load it from disk if it was compiled before."""
-    compiled = jit(function)
-    return CompiledFunction(compiled if key is None else cached_on_disk(compiled, key), key)
+    return CompiledFunction(cached_on_disk(jit(function), key), key)
 
 
 def _sampler(system: StateSpaceModel, noise: bool = True) -> CompiledFunction:
@@ -140,7 +139,9 @@ def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
         return states, observations
 
     keys = (part.key for part in parts)
-    cached = _cached(simulate, key_of(f"simulate {noise} {dt!r} {n} {n_start} {m} {p}", *keys))
+    cached = _cached(
+        simulate, key_of(__name__, f"simulate {noise} {dt!r} {n} {n_start} {m} {p}", *keys)
+    )
     # At once and not by the first call, which PyMC makes when its bar is on the screen already.
     vector, matrix, steps = np.zeros(1), np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
     arguments = np.random.default_rng(0), vector, steps, matrix, 0.0

@@ -203,12 +203,16 @@ def _include_health(health, of_record, first):
 
 
 def likelihood_entry(
-    name: str, evaluate: Callable, key: str | None, needs: Sequence[EntryPoint] = ()
+    name: str,
+    evaluate: Callable,
+    parts: Sequence[str | Callable] = (),
+    needs: Sequence[EntryPoint] = (),
 ) -> EntryPoint:
     """An entry point that evaluates the records of a call one after the other.
 
     ``evaluate(plan, record, request, seed, to)`` is a compiled function of the words of the plan
-    and of the request, a `Record`, and the `Terms` that it writes. It returns a status.
+    and of the request, a `Record`, and the `Terms` that it writes. It returns a status. ``parts``
+    identify what it closes over, see `key_of`.
     """
 
     def run(plan, record, request, results):
@@ -245,4 +249,4 @@ def likelihood_entry(
                 before += n_rows
         return OK
 
-    return plan_entry(run, name, key, needs)
+    return plan_entry(run, name, (evaluate, *parts), needs)

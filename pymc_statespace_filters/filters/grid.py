@@ -17,7 +17,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.native.plan import Plan
@@ -208,4 +207,4 @@ def _evaluate(system, steps, observed, t0, tolerance, terms):
     return code, j
 
 
-POINT_MASS = likelihood_entry("point_mass", _point_mass, digest("point_mass"))
+POINT_MASS = likelihood_entry("point_mass", _point_mass)

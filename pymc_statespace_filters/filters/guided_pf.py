@@ -12,7 +12,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import njit_internal
 from pymc_statespace_filters.compiler.native.plan import NORMALS
@@ -199,9 +198,7 @@ class GuidedPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = likelihood_entry(
-        "guided_pf", _evaluate, digest("guided_pf"), needs=(FILL_NORMALS,)
-    )
+    entry: ClassVar[EntryPoint] = likelihood_entry("guided_pf", _evaluate, needs=(FILL_NORMALS,))
     resample_below: float = 0.5
 
     def check(self, system: System) -> None:

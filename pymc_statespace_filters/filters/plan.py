@@ -110,10 +110,10 @@ def make_plan(
     words[N_WORDS : N_WORDS + system.free.size] = system.free
     words.view(np.float64)[N_WORDS + system.free.size :] = settings
     entries |= used
-    key = key_of(
-        repr((words.tolist(), sorted(entries))), run.key, *(entries[e].key for e in sorted(entries))
-    )
-    return Plan(words, VERSION, run, {getattr(PLAN, e): entries[e] for e in entries}, key)
+    names = sorted(entries)
+    identity = repr((words.tolist(), names))
+    key = key_of(__name__, identity, run.key, *(entries[name].key for name in names))
+    return Plan(words, VERSION, run, {getattr(PLAN, name): entries[name] for name in names}, key)
 
 
 class PlannedSystem(NamedTuple):

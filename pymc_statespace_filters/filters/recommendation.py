@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.bootstrap import BootstrapPF
 from pymc_statespace_filters.filters.ekf import EKF
@@ -16,8 +17,9 @@ from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.guided_pf import GuidedPF
 from pymc_statespace_filters.filters.iplf import IPLF
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
-from pymc_statespace_filters.filters.protocol import Filter, System
+from pymc_statespace_filters.filters.protocol import Filter, System, check_filter
 from pymc_statespace_filters.filters.ukf import UKF
+from pymc_statespace_filters.system.record import check_system
 
 # In the order in which messages name them, with a first number of particles.
 FILTERS: tuple[Filter, ...] = (
@@ -115,6 +117,17 @@ def jump_problem(system: System, filter: Any) -> str | None:
         f"state crosses a threshold, which no linearisation follows, and the log-likelihood may be "
         f"far off{remedy}."
     )
+
+
+def check_system_and_filter(system: Any, filter: Any) -> None:
+    """Raise unless these are a system and a filter that can treat it."""
+    check_system(system)
+    check_filter(filter)
+    compiled = compile_system(system)
+    try:
+        filter.check(compiled)
+    except ModelError as refusal:
+        raise ModelError(f"{refusal}; {alternatives(compiled, filter)}") from None
 
 
 def _followers(system: System, filter: Any) -> list[Filter]:

@@ -1,8 +1,13 @@
 """The records of a panel one after the other in compiled loops; rows as in `system.panel`."""
 
+from typing import Any
+
+import numpy as np
+
 from pymc_statespace_filters.compiler.codegen.function_types import jit
+from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, CheckedPanel
 
 
 @jit
@@ -31,3 +36,18 @@ def include_health(health, of_record, first):
     health[0] = min(health[0], of_record[0])
     if health[1] == NONE and of_record[1] != NONE:
         health[1], health[2] = of_record[1], first + of_record[2]
+
+
+def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
+    """Steps, observed, inputs, t0 and seed of every record, as a single one takes them."""
+    records = table.records
+    return [
+        (
+            table.rows[rows, STEP].copy(),
+            table.observed[rows],
+            table.inputs[table.rows[rows.start, FIRST_INPUT] :],
+            table.t0,
+            np.asarray(seed_of_record(np.int64(seed), code)),
+        )
+        for rows, code in zip(records.slices(), records.codes, strict=True)
+    ]

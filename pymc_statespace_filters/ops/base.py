@@ -24,19 +24,16 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import (
     compile_system,
 )
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.compilation import COMPILATION
 from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
 from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.compiler.native.python_call import TimedCall, call_machine_code
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Compiled, Filter, check_filter
-from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.filters.protocol import Compiled, Filter
 from pymc_statespace_filters.parallel.signals import held_interrupts
 from pymc_statespace_filters.progress import slow_compilation
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
-from pymc_statespace_filters.system.record import check_system
 
 HEALTH_SIZE = 3
 
@@ -48,17 +45,6 @@ RECORD_INPUTS = (
     ("t0", "float64", 0),
     ("seed", "int64", 0),
 )
-
-
-def check_system_and_filter(system: Any, filter: Any) -> None:
-    """Raise unless these are a system and a filter that can treat it."""
-    check_system(system)
-    check_filter(filter)
-    compiled = compile_system(system)
-    try:
-        filter.check(compiled)
-    except ModelError as refusal:
-        raise ModelError(f"{refusal}; {alternatives(compiled, filter)}") from None
 
 
 class FilterOp(Op):
@@ -162,8 +148,7 @@ def evaluator(op: FilterOp) -> Any:
 def _jitted(op: FilterOp, kernel: CompiledFunction) -> Callable:
     """A compiled function of an operation whose filter has no plan; on disk if it has a key."""
     function, key = _call(op, kernel)
-    compiled = jit(function)
-    machine_code = with_internal_linkage(compiled) if key is None else cached_on_disk(compiled, key)
+    machine_code = cached_on_disk(jit(function), key)
 
     def call(*arrays: np.ndarray) -> Any:
         if not machine_code.overloads:
@@ -246,7 +231,7 @@ def check_observed(p: int) -> Any:
 def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
     """The key of a compiled function together with the checks of its record."""
     checked = (system.p, system.n_input_columns, system.observation_uses_inputs)
-    return key_of(f"checked for {checked}", compiled.key)
+    return key_of(__name__, f"checked for {checked}", compiled.key)
 
 
 @cache
@@ -317,4 +302,4 @@ def _call(op: FilterOp, compiled: CompiledFunction) -> tuple[Any, str | None]:
     }
     exec(compile(source, f"<call of {type(op).__name__}>", "exec"), namespace)
     key = cache_key(op.system, compiled)
-    return namespace["call"], None if key is None else key_of(source, key)
+    return namespace["call"], key_of(__name__, source, key)

@@ -32,7 +32,7 @@ from pymc_statespace_filters.ops.likelihood import (
     TapePullback,
     fused,
 )
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, CheckedPanel
+from pymc_statespace_filters.system.panel import RECORD
 
 PANEL_INPUTS = (("theta", "float64", 2), ("steps", "int64", 2), *RECORD_INPUTS[2:])
 _CHECKS = ("check_panel(theta, steps, inputs)", "check_observed(steps, observed)")
@@ -119,21 +119,6 @@ def _vectorize(op: PanelLogLikelihood, node: Apply, *inputs: Variable) -> list[V
     return Blockwise(op)(*inputs, return_list=True)
 
 
-def single_records(table: CheckedPanel, seed: Any) -> list[tuple[Any, ...]]:
-    """Steps, observed, inputs, t0 and seed of every record, as a single one takes them."""
-    records = table.records
-    return [
-        (
-            table.rows[rows, STEP].copy(),
-            table.observed[rows],
-            table.inputs[table.rows[rows.start, FIRST_INPUT] :],
-            table.t0,
-            np.asarray(seed_of_record(np.int64(seed), code)),
-        )
-        for rows, code in zip(records.slices(), records.codes, strict=True)
-    ]
-
-
 def _one_by_one(value: CompiledFunction) -> CompiledFunction:
     run = value.function
 
@@ -153,7 +138,9 @@ def _one_by_one(value: CompiledFunction) -> CompiledFunction:
             first = last
         return terms, health
 
-    return CompiledFunction(jit(panel, value.large), key_of("panel", value.key), value.large)
+    return CompiledFunction(
+        jit(panel, value.large), key_of(__name__, "panel", value.key), value.large
+    )
 
 
 def _gradients_one_by_one(gradient: CompiledFunction) -> CompiledFunction:
@@ -173,7 +160,7 @@ def _gradients_one_by_one(gradient: CompiledFunction) -> CompiledFunction:
             first = last
         return theta_bar
 
-    key = key_of("gradient of a panel", gradient.key)
+    key = key_of(__name__, "gradient of a panel", gradient.key)
     return CompiledFunction(jit(panel, gradient.large), key, gradient.large)
 
 
@@ -184,4 +171,6 @@ def _without_stored_noise(value: CompiledFunction) -> CompiledFunction:
     def panel(theta, rows, observed, inputs, t0, noise):
         return run(theta, rows, observed, inputs, t0, noise[0])
 
-    return CompiledFunction(jit(panel, value.large), key_of("no noise", value.key), value.large)
+    return CompiledFunction(
+        jit(panel, value.large), key_of(__name__, "no noise", value.key), value.large
+    )

@@ -1,13 +1,16 @@
 """Compilation of a model's log-density."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 from pymc.pytensorf import compile as compile_pymc
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.native.compilation import COMPILATION
+from pymc_statespace_filters.compiler.native.compilation import (
+    COMPILATION,
+    undamaged_files,
+    warning_filter,
+)
 
 
 def compile_density(inputs: Sequence[Variable], outputs: Sequence[Variable], **options: Any) -> Any:
@@ -16,6 +19,5 @@ def compile_density(inputs: Sequence[Variable], outputs: Sequence[Variable], **o
     Where there is no C++ compiler, PyTensor fuses at most 32 operands, which is a limit of NumPy's
     functions and not of numba's, and warns of a larger set: a model of nine parameters has one.
     """
-    with COMPILATION, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Loop fusion failed", UserWarning)
+    with COMPILATION, undamaged_files(), warning_filter("ignore", "Loop fusion failed"):
         return compile_pymc(inputs, outputs, **options)

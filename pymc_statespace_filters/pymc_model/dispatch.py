@@ -97,7 +97,7 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
         return observations
 
     draw, what = (draw_panel, "panel") if isinstance(op, PanelRV) else (draw_record, "record")
-    key = key_of(what, cache_key(op.system, compiled))
+    key = key_of(__name__, what, cache_key(op.system, compiled))
     # PyTensor requires an integer as the cache key of a random variable.
     return draw, None if key is None else int(key[:15], 16)
 

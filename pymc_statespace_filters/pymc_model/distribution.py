@@ -15,7 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
 from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
 from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
 from pymc_statespace_filters.system.checks import is_integer

@@ -18,7 +18,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.grid import GridFilter
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
-from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,

@@ -9,7 +9,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
-from pymc_statespace_filters.ops.base import check_system_and_filter
+from pymc_statespace_filters.filters.recommendation import check_system_and_filter
 from pymc_statespace_filters.ops.diagnostics import TermHealth
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import States

@@ -14,6 +14,7 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
+from pymc_statespace_filters.compiler.native.compilation import undamaged_files
 from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
@@ -199,7 +200,8 @@ class VariableAtDraws:
         bound = clone_replace(list(outputs), self._replaced)
         # The index of the draw makes sure that there is at least one varying input.
         all_inputs = [pt.lscalar("number"), *self._symbols, *inputs]
-        return pytensor.function(all_inputs, bound, on_unused_input="ignore", trust_input=True)
+        with undamaged_files():
+            return pytensor.function(all_inputs, bound, on_unused_input="ignore", trust_input=True)
 
     def _call(
         self, function: Any, drawn: Sequence[np.ndarray], constant: Sequence[np.ndarray]

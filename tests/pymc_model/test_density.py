@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from threading import Thread
 
 import numpy as np
 import pymc as pm
@@ -87,6 +88,42 @@ def test_other_warnings_of_a_compilation_are_shown(monkeypatch):
     with pytest.warns(UserWarning, match="something else") as shown:
         compilation.compile_density([], [])
     assert [str(warning.message) for warning in shown] == ["something else"]
+
+
+@pytest.mark.parametrize("in_a_block", [False, True])
+def test_filters_of_warnings_that_another_thread_sets_survive_a_compilation(
+    monkeypatch, in_a_block
+):
+    def sets_a_filter():
+        if in_a_block:
+            block.__enter__()
+        warnings.filterwarnings("ignore", "of another thread")
+
+    def compile_meanwhile(inputs, outputs):
+        other = Thread(target=sets_a_filter)
+        other.start()
+        other.join()
+
+    with warnings.catch_warnings():
+        block, before = warnings.catch_warnings(), list(warnings.filters)
+        monkeypatch.setattr(compilation, "compile_pymc", compile_meanwhile)
+        compilation.compile_density([], [])
+        assert [f[1].pattern for f in warnings.filters[:1]] == ["of another thread"]
+        assert warnings.filters[1:] == before
+        warnings.warn("of another thread", stacklevel=1)
+        if in_a_block:
+            block.__exit__(None, None, None)
+            assert warnings.filters == before
+
+
+def test_a_filter_of_the_same_warning_survives_a_compilation(monkeypatch):
+    monkeypatch.setattr(compilation, "compile_pymc", lambda inputs, outputs: None)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "Loop fusion failed", UserWarning)
+        warnings.filterwarnings("ignore", "Loop fusion failed", UserWarning)
+        before = list(warnings.filters)
+        compilation.compile_density([], [])
+        assert warnings.filters == before
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 5, 40])

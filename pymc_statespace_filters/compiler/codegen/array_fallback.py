@@ -1,6 +1,5 @@
 """Functions on arrays, for graphs that are too large or have an operation without scalar form."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 
 import pytensor
@@ -19,7 +18,8 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     function_of,
 )
 from pymc_statespace_filters.compiler.codegen.source import SCALAR_NAMESPACE
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.native.compilation import undamaged_files, warning_filter
 from pymc_statespace_filters.errors import LoweringError
 
 # The code that reads a whole input, if not its name.
@@ -86,7 +86,9 @@ def _build(
 ) -> CompiledFunction:
     namespace = SCALAR_NAMESPACE | {part: compiled.function for part, compiled in parts.items()}
     function, source = function_of(name, arguments, body, namespace)
-    return CompiledFunction(function, key_of(source, *(part.key for part in parts.values())))
+    return CompiledFunction(
+        function, key_of(__name__, source, *(part.key for part in parts.values()))
+    )
 
 
 def _whole(inputs: Mapping[str, Variable]) -> str:
@@ -122,9 +124,8 @@ def array_code(inputs: list, outputs: Sequence[Variable]) -> CompiledFunction:
     """A graph compiled by PyTensor itself: arrays in, a tuple of arrays out."""
     # Failed parameter checks of PyMC become minus infinity, because a filter must not raise.
     mode = get_mode("NUMBA").including("local_check_parameter_to_ninf_switch")
-    with warnings.catch_warnings():
-        # Object mode calls Python from machine code: slow, not cacheable, and it needs the GIL.
-        warnings.filterwarnings("error", "Numba will use object mode", UserWarning)
+    # Object mode calls Python from machine code: slow, not cacheable, and it needs the GIL.
+    with undamaged_files(), warning_filter("error", "Numba will use object mode"):
         try:
             function = pytensor.function(
                 inputs, list(outputs), mode=mode, on_unused_input="ignore", trust_input=True
@@ -137,4 +138,4 @@ def array_code(inputs: list, outputs: Sequence[Variable]) -> CompiledFunction:
                 f"functions of the system must consist of pytensor.tensor operations that numba "
                 f"supports, got one that it does not: {error}"
             ) from error
-    return CompiledFunction(code, None if key is None else digest(str(key)))
+    return CompiledFunction(code, None if key is None else key_of(__name__, str(key)))

@@ -5,9 +5,6 @@ For a system with 40 states that was nine tenths of the compilation time. For ma
 the loops are about as fast.
 """
 
-import hashlib
-from pathlib import Path
-
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.basic import Apply, Variable
@@ -18,6 +15,8 @@ from pytensor.tensor.linalg.decomposition.cholesky import Cholesky
 from pytensor.tensor.linalg.solvers.psd import CholeskySolve
 from pytensor.tensor.linalg.solvers.triangular import SolveTriangular
 from pytensor.tensor.math import Dot
+
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 
 
 @numba_njit
@@ -96,8 +95,7 @@ class Loops(Op):
 
 @register_funcify_and_cache_key(Loops)
 def _numba_loops(op: Loops, node: Apply | None = None, **kwargs) -> tuple:
-    text = op.name.encode() + Path(__file__).read_bytes()
-    return _LOOPS[op.name], hashlib.sha256(text).hexdigest()
+    return _LOOPS[op.name], key_of(__name__, op.name)
 
 
 def use_loops(graph: FunctionGraph) -> None:

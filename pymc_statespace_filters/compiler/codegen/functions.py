@@ -36,7 +36,7 @@ from pymc_statespace_filters.compiler.codegen.source import (
 )
 from pymc_statespace_filters.compiler.codegen.stages import BLOCK, Stages, is_block
 from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
-from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.errors import LoweringError
 
 _LOG = logging.getLogger("pymc_statespace_filters")
@@ -267,17 +267,19 @@ def build(
     namespace, key = blocks_of(writer, **blocks)
     large |= sum(len(lines) for _, lines in blocks.values()) > LARGE
     function, source = function_of(name, arguments, body, namespace, large)
-    return CompiledFunction(function, digest(source, key), large)
+    return CompiledFunction(function, key_of(__name__, source, key), large)
 
 
-def blocks_of(writer: Writer, **blocks: tuple[str, Sequence[str]]) -> tuple[dict[str, Any], str]:
+def blocks_of(
+    writer: Writer, **blocks: tuple[str, Sequence[str]]
+) -> tuple[dict[str, Any], str | None]:
     """Blocks of a writer's statements, and what they call, as functions; and their key."""
     others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
     namespace = {**writer.namespace, **others}
     code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
     texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
     operations = [repr(op) for op, _ in writer.fallbacks.values()]
-    return {**namespace, **code}, digest(*texts, *operations)
+    return {**namespace, **code}, key_of(__name__, *texts, *operations)
 
 
 def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:

@@ -6,9 +6,6 @@ them as constant: a covariance that depends smoothly on parameters does not leav
 semidefinite matrices on either side, so to first order such a direction gains no spread.
 """
 
-import hashlib
-from pathlib import Path
-
 import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor as pt
@@ -19,6 +16,7 @@ from pytensor.tensor.linalg import solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.expressions import Arena
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 
 # Relative to the variance of the component. A pivot below the first is rounding of zero; one below
 # minus the second belongs to no covariance.
@@ -108,4 +106,4 @@ def unrolled_root(arena: Arena, node: Apply, arguments: list[np.ndarray]) -> lis
 
 @register_funcify_and_cache_key(SemidefiniteCholesky)
 def _numba_root(op: SemidefiniteCholesky, node: Apply | None = None, **kwargs) -> tuple:
-    return semidefinite_cholesky, hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    return semidefinite_cholesky, key_of(__name__)

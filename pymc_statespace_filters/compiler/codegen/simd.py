@@ -20,7 +20,6 @@ from pymc_statespace_filters.compiler.codegen.functions import (
     unrolled,
 )
 from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     EntryPoint,
@@ -96,8 +95,8 @@ def lane_functions(
         blocks, key = _blocks(given, known[name], results, targets)
         sizes = state_size * LANES, n_inputs * LANES
         loop = _loop(blocks["before"], blocks["inside"], *sizes, backwards=function.backwards)
-        key = digest(repr((name, LANES, sizes, function.backwards)), key)
-        entries[name] = EntryPoint(loop, LANE_ARGUMENTS, name, key)
+        parts = (repr((LANES, sizes, function.backwards)), key)
+        entries[name] = EntryPoint(loop, LANE_ARGUMENTS, name, parts)
     return LaneFunctions(entries, n_rows)
 
 
@@ -144,7 +143,7 @@ def _blocks(
     known: Mapping[Value, str],
     values: Sequence[Value],
     targets: Sequence[str],
-) -> tuple[dict[str, Any], str]:
+) -> tuple[dict[str, Any], str | None]:
     """Code that writes ``values`` to ``targets``; what is equal in all lanes is computed before."""
     writer = Writer(dict(code), VECTOR_NAMESPACE, known)
     of_lane = depends_on(values, frozenset(code) - {f"{TIME}.0"})

@@ -152,7 +152,7 @@ def after_extension(
             points[i] = extended(theta[i].copy())
         return function(points, *others)
 
-    key = key_of(f"after extension {of_many}", extension.key, compiled.key)
+    key = key_of(__name__, f"after extension {of_many}", extension.key, compiled.key)
     made = jit(at_many if of_many else at_one, compiled.large)
     return CompiledFunction(made, key, compiled.large)
 
@@ -180,7 +180,9 @@ def between_extensions(
             theta_bars[i] = pulled_back(theta[i], bars[i])
         return theta_bars
 
-    key = key_of(f"between extensions {of_many}", extension.key, pullback.key, compiled.key)
+    key = key_of(
+        __name__, f"between extensions {of_many}", extension.key, pullback.key, compiled.key
+    )
     made = jit(at_many if of_many else at_one, compiled.large)
     return CompiledFunction(made, key, compiled.large)
 

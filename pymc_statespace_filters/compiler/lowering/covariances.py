@@ -16,7 +16,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 )
 from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
 from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -60,7 +60,9 @@ def followed_by_square_roots(
             start += size * size
         return c
 
-    return CompiledFunction(jit(prepare), key_of(repr((length, sizes)), flat.key, SQUARE_ROOT.key))
+    return CompiledFunction(
+        jit(prepare), key_of(__name__, repr((length, sizes)), flat.key, SQUARE_ROOT.key)
+    )
 
 
 def covariance_check(system: StateSpaceModel) -> CompiledFunction:
@@ -74,7 +76,7 @@ def covariance_check(system: StateSpaceModel) -> CompiledFunction:
         if any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
     }
     if not graphs:
-        return CompiledFunction(jit(lambda theta: True), key_of("nothing to check"))
+        return CompiledFunction(jit(lambda theta: True), key_of(__name__, "nothing to check"))
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
     prepare = followed_by_square_roots([], system, theta, graphs)
     roots = prepare.function
@@ -85,7 +87,7 @@ def covariance_check(system: StateSpaceModel) -> CompiledFunction:
                 return False
         return True
 
-    return CompiledFunction(jit(check), key_of("check", prepare.key))
+    return CompiledFunction(jit(check), key_of(__name__, "check", prepare.key))
 
 
 @jit
@@ -128,7 +130,5 @@ def _take_root(a, size):
     semidefinite_cholesky(carray(a, (size, size)))
 
 
-SQUARE_ROOT = EntryPoint(
-    _take_root, {"a": F64_PTR, "size": types.intp}, "square_root", digest("square_root")
-)
+SQUARE_ROOT = EntryPoint(_take_root, {"a": F64_PTR, "size": types.intp}, "square_root")
 """`semidefinite_cholesky` of the matrix at an address, compiled once for all systems."""

@@ -13,7 +13,6 @@ from pymc_statespace_filters.compiler.lowering.guide_loops import (
     follow_loop,
     look_back_loop,
 )
-from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
 
 MEMBER_ARGUMENTS = {
@@ -38,8 +37,8 @@ def entry_point(system: Any, name: str) -> EntryPoint:
     )  # fmt: skip
     function = getattr(system, name)
     arguments = PREPARE_ARGUMENTS if name == "prepare" else MEMBER_ARGUMENTS
-    key = key_of(repr((name, sizes)), function.key)
-    return EntryPoint(_with_addresses(function.function, name, *sizes), arguments, name, key)
+    parts = (repr(sizes), function.key)
+    return EntryPoint(_with_addresses(function.function, name, *sizes), arguments, name, parts)
 
 
 def _with_addresses(
@@ -110,8 +109,8 @@ def _of_guide(system: Any, name: str) -> EntryPoint:
         step, smooth = system.linearized_step, system.smoothed_cov
         sizes = (n, m, system.n_inputs, system.n_constants)
         loop = follow_loop(step.function, smooth.function, *sizes)
-        key = key_of(repr((name, sizes)), step.key, smooth.key)
-        return EntryPoint(loop, FOLLOW_ARGUMENTS, name, key)
+        keys = step.key, smooth.key
+        return EntryPoint(loop, FOLLOW_ARGUMENTS, name, (repr(sizes), *keys))
     back = getattr(system, "start_back" if name == "start_back" else "step_back")
-    key = key_of(repr((name, n, m)), back.key)
-    return EntryPoint(look_back_loop(back.function, n, m), LOOK_BACK_ARGUMENTS, name, key)
+    loop = look_back_loop(back.function, n, m)
+    return EntryPoint(loop, LOOK_BACK_ARGUMENTS, name, (repr((n, m)), back.key))

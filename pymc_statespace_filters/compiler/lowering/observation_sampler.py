@@ -24,7 +24,7 @@ def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
     def observe(rng, c, inputs, k, t, x, out):
         observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))
 
-    return CompiledFunction(jit(observe), simulated.key)
+    return CompiledFunction(jit(observe), key_of(__name__, "draw", simulated.key))
 
 
 def observation_mean(system: StateSpaceModel) -> CompiledFunction:
@@ -35,7 +35,7 @@ def observation_mean(system: StateSpaceModel) -> CompiledFunction:
     def observe(rng, c, inputs, k, t, x, out):
         expect_members(c, inputs, k, t, x, out.reshape(p, 1))
 
-    return CompiledFunction(jit(observe), expected.key)
+    return CompiledFunction(jit(observe), key_of(__name__, "mean", expected.key))
 
 
 def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
@@ -67,4 +67,6 @@ def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -
         "no_inputs": no_inputs,
     }
     exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
-    return CompiledFunction(jit(namespace["observe"]), key_of(source + repr(n_theta), code.key))
+    return CompiledFunction(
+        jit(namespace["observe"]), key_of(__name__, source + repr(n_theta), code.key)
+    )

@@ -5,7 +5,7 @@ from typing import Any
 from pytensor.link.numba.dispatch.basic import register_funcify_and_cache_key
 
 from pymc_statespace_filters.compiler.codegen.source import QUANTILES
-from pymc_statespace_filters.compiler.native.cache_key import digest
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.jit import njit_callable
 from pymc_statespace_filters.system.quantiles import NoDerivative, Quantile
 
@@ -23,7 +23,7 @@ def _machine_code(op: Quantile, node: Any = None, **_: Any) -> tuple:
     def quantile(*arguments):
         return function(*arguments)
 
-    return quantile, digest(op.machine_code)
+    return quantile, key_of(__name__, op.machine_code)
 
 
 def _refuse(op: NoDerivative, node: Any = None, **_: Any) -> tuple:

@@ -23,7 +23,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     jit,
 )
 from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.system.linear_step import LinearStep, LinearStepBack, make_functions
 
@@ -43,10 +43,8 @@ def _backward(given: Any, out: Any, n: Any) -> None:
 
 _ARGUMENTS = {"given": F64_PTR, "out": F64_PTR, "n": types.intp}
 ENTRY_POINTS = {
-    LinearStep: EntryPoint(_forward, _ARGUMENTS, "linear_step", digest("linear_step")),
-    LinearStepBack: EntryPoint(
-        _backward, _ARGUMENTS, "linear_step_back", digest("linear_step_back")
-    ),
+    LinearStep: EntryPoint(_forward, _ARGUMENTS, "linear_step"),
+    LinearStepBack: EntryPoint(_backward, _ARGUMENTS, "linear_step_back"),
 }
 """The entry point of each operation: it reads its arguments and writes its result."""
 
@@ -79,11 +77,13 @@ def staged(inputs: Sequence[TensorVariable], output: TensorVariable) -> Compiled
         fill(work)
         return work[first:].copy()
 
-    return CompiledFunction(jit(evaluate), key_of(f"staged {given} {first} {length}", last.key))
+    return CompiledFunction(
+        jit(evaluate), key_of(__name__, f"staged {given} {first} {length}", last.key)
+    )
 
 
 def _nothing() -> CompiledFunction:
-    return CompiledFunction(jit(lambda work: None), key_of("nothing"))
+    return CompiledFunction(jit(lambda work: None), key_of(__name__, "nothing"))
 
 
 def _written(
@@ -109,7 +109,7 @@ def _written(
         copy(evaluate(work[:size]), work)  # array code takes the whole of its argument
 
     return CompiledFunction(
-        jit(stage), key_of(f"written {start} {length} {size}", before.key, compiled.key)
+        jit(stage), key_of(__name__, f"written {start} {length} {size}", before.key, compiled.key)
     )
 
 
@@ -125,4 +125,6 @@ def _called(before: CompiledFunction, node: Apply, start: int) -> CompiledFuncti
         earlier(work)
         call(work[start:].ctypes.data, work[result:].ctypes.data, n)
 
-    return CompiledFunction(jit(stage), key_of(f"called {start} {n}", before.key, entry_point.key))
+    return CompiledFunction(
+        jit(stage), key_of(__name__, f"called {start} {n}", before.key, entry_point.key)
+    )

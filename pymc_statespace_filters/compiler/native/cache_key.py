@@ -1,42 +1,42 @@
 """Keys of compiled code on disk, and the fast-math flags of generated code."""
 
 import hashlib
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
+
+import llvmlite
+import numba
+import pytensor
+from pytensor.link.numba.cache import NUMBA_CACHE_PATH
+
+from pymc_statespace_filters.compiler.native.sources import Sources
 
 # No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it
 # folds x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.
 FAST_MATH = {"contract", "nsz", "arcp"}
 
-
-def digest(*parts: str) -> str:
-    """The key of compiled code, from ``parts`` that identify it and the sources of this package."""
-    return hashlib.sha256("\0".join((_source_digest(), *parts)).encode()).hexdigest()
-
-
-def key_of(what: str, *keys: str | None) -> str | None:
-    """The key of code that calls compiled parts; None if a part cannot be cached."""
-    known = [key for key in keys if key is not None]
-    return digest(what, *known) if len(known) == len(keys) else None
+# Numba's own index on disk tells processors and versions of Python apart.
+_COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
+_SOURCES = Sources(Path(__file__).parents[2], NUMBA_CACHE_PATH)
 
 
-@cache
-def _source_digest() -> str:
-    return digest_of_sources(Path(__file__).parents[2])
+def key_of(module: str, *parts: str | Callable | None) -> str | None:
+    """The key of machine code that a module makes; None if it cannot be cached on disk.
 
+    It covers the compilers and the sources of all modules of this package that the module reaches
+    by its imports. Modules outside this package are not covered and have no key.
 
-def digest_of_sources(package: Path) -> str:
-    """The digest of all sources that generate machine code, nested folders included.
-
-    A change of any of them invalidates the machine code on disk. A file's path counts too, because
-    machine code is loaded through the module that it was compiled in.
+    Parameters
+    ----------
+    module : str
+        The ``__name__`` of the module.
+    *parts : str, callable or None
+        What else identifies the code: texts, the keys of code that it calls (None where that
+        cannot be cached), and functions, which are covered as the module is.
     """
-    files = [*package.glob("*.py")]
-    for folder in ("system", "compiler", "filters", "ops", "evaluation", "pymc_model"):
-        files += package.joinpath(folder).rglob("*.py")
-    sources = [
-        part
-        for file in sorted(files)
-        for part in (file.relative_to(package).as_posix().encode(), file.read_bytes())
-    ]
-    return hashlib.sha256(b"\0".join(sources)).hexdigest()
+    if module not in _SOURCES:
+        return None
+    keys = [key_of(p.__module__, p.__qualname__) if callable(p) else p for p in parts]
+    if None in keys:
+        return None
+    return hashlib.sha256(repr((_COMPILERS, _SOURCES.digest_of(module), keys)).encode()).hexdigest()

@@ -18,15 +18,15 @@ from uuid import uuid4
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 from pytensor import config
-from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS, NumbaPyTensorCacheLocator
+from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
-from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, digest
+from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, key_of
 from pymc_statespace_filters.compiler.native.code_library import (
     InternalLinkageCompiler,
     with_internal_linkage,
@@ -38,32 +38,18 @@ F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)
 
 
-_load_overload = FunctionCache.load_overload
-
-
-def _load_undamaged(cache: FunctionCache, signature: Any, target_context: Any) -> Any:
-    """The machine code of a signature; None, and no file, if the file is damaged.
-
-    Numba would raise, and at every start again. Only in PyTensor's folder, for its functions and
-    ours.
-    """
-    try:
-        return _load_overload(cache, signature, target_context)
-    except Exception:  # whatever unpickling half a file raises
-        if not isinstance(cache._impl.locator, NumbaPyTensorCacheLocator):
-            raise
-        cache.flush()
-        return None
-
-
-FunctionCache.load_overload = _load_undamaged
-
-
 class _CacheByKey(FunctionCache):
-    """A cache in PyTensor's folder that compares the key alone.
+    """A cache in PyTensor's folder that compares the key alone, and compiles anew what is damaged.
 
     Numba would also compare the closure, and compiled functions in it differ in every process.
     """
+
+    def load_overload(self, sig, target_context):
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever unpickling half a file raises, at every start again
+            self.flush()
+            return None
 
     def _index_key(self, signature, codegen):
         return signature, codegen.magic_tuple(), CACHED_SRC_FUNCTIONS[self._py_func]
@@ -73,16 +59,24 @@ class _CacheByKey(FunctionCache):
 _compiled: dict[str, Any] = {}
 
 
-def cached_on_disk(function: Any, key: str) -> Any:
-    """Cache a jitted function in PyTensor's folder, under a key that identifies its code."""
-    if config.numba__cache:
+def cached_on_disk(function: Any, *parts: str | None) -> Any:
+    """Cache a jitted function of this package in PyTensor's folder.
+
+    ``parts`` identify what it closes over, see `key_of`; without a key it is not cached.
+    """
+    key = key_of(function.__module__, function.__qualname__, *parts)
+    if key is not None and config.numba__cache:
         function._cache = _cache(function.py_func, key)
     return with_internal_linkage(function)
 
 
+def njit_cached(function: Callable) -> Any:
+    """Compile a function of this package that Python calls; for the next process from disk."""
+    return cached_on_disk(njit(function, error_model="numpy", nogil=True))
+
+
 def _cache(function: Callable, key: str) -> _CacheByKey:
-    # The module is part of the key: cached code is loaded through it, and it may be moved.
-    CACHED_SRC_FUNCTIONS[function] = digest(key, function.__module__)
+    CACHED_SRC_FUNCTIONS[function] = key
     return _CacheByKey(function)
 
 
@@ -111,8 +105,9 @@ class EntryPoint:
         ``numba.carray`` makes arrays.
     name : str
         Part of the symbol, readable in a profile.
-    key : str or None
-        Identifies the code, see `digest`; None if it cannot be cached on disk.
+    parts : sequence of str, callable or None
+        Identify what the function closes over, see `key_of`. Its module is covered by itself; a
+        function outside this package is not cached on disk.
     needs : sequence of EntryPoint
         What the function calls by symbol.
     returns : numba type, optional
@@ -124,7 +119,7 @@ class EntryPoint:
         function: Callable,
         arguments: Mapping[str, Any],
         name: str,
-        key: str | None,
+        parts: Sequence[str | Callable | None] = (),
         needs: Sequence["EntryPoint"] = (),
         returns: Any = types.void,
     ):
@@ -137,8 +132,9 @@ class EntryPoint:
         self._name = name
         self._arguments = tuple(arguments.values())
         self._needs, self._returns = needs, returns
-        self.key = key
-        self.symbol = f"psf_{name}_{key or uuid4().hex}"
+        keys = [needed.key for needed in needs]
+        self.key: str | None = key_of(function.__module__, name, *parts, *keys)
+        self.symbol = f"psf_{name}_{self.key or uuid4().hex}"
 
     def compile(self) -> None:
         """Define the symbol in this process; load it from disk if it was compiled before."""

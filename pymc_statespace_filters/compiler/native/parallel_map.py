@@ -2,15 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.entry_point import njit_cached
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
 from pymc_statespace_filters.parallel.cpu_affinity import available_cores
 from pymc_statespace_filters.parallel.signals import held_interrupts
@@ -20,6 +17,7 @@ _REFRESH_SECONDS = 0.1
 _N_DONE, _STOP = 0, 1
 
 
+@njit_cached
 def _call_rows(call, argument, rows, results, control):
     """Call with every row of words (m, size), until stopped; False if a call raised."""
     for i in range(len(rows)):
@@ -33,12 +31,6 @@ def _call_rows(call, argument, rows, results, control):
             results[i, j] = call.out[1 + j]
         control[_N_DONE] = i + 1
     return True
-
-
-_call_rows = cached_on_disk(
-    njit(_call_rows, error_model="numpy", nogil=True),
-    digest("call_rows", Path(__file__).read_text(encoding="utf-8")),
-)
 
 
 class ParallelMap:

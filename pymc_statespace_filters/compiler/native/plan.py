@@ -224,10 +224,13 @@ def version_of(*layouts: tuple) -> int:
 
 
 def plan_entry(
-    function: Callable, name: str, key: str | None, needs: Sequence[EntryPoint] = ()
+    function: Callable,
+    name: str,
+    parts: Sequence[str | Callable | None] = (),
+    needs: Sequence[EntryPoint] = (),
 ) -> EntryPoint:
     """An entry point that is called with a plan, a record, a request and results."""
-    return EntryPoint(function, PLAN_ARGUMENTS, name, key, needs, returns=types.int64)
+    return EntryPoint(function, PLAN_ARGUMENTS, name, parts, needs, returns=types.int64)
 
 
 @njit_internal

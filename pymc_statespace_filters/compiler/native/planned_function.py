@@ -70,7 +70,7 @@ class PlannedFunction:
     @property
     def key(self) -> str | None:
         """Identifies the code; None if it cannot be cached on disk."""
-        return key_of(repr((self.arguments, self.results)), self.plan.key)
+        return key_of(__name__, repr((self.arguments, self.results)), self.plan.key)
 
     def __call__(self, *values: Any) -> Any:
         """Call from Python; arrays are contiguous and of the right types."""

@@ -10,7 +10,6 @@ import ctypes
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -19,7 +18,6 @@ from numba import carray, njit, typeof, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
@@ -154,9 +152,8 @@ def _adapter(arguments: types.BaseTuple, signature: tuple, results: types.BaseTu
             lines += [f"numbers[n] = results[{i}].item()", "n += 1"]
     source = "def adapter(table, out):\n" + "".join(f"    {line}\n" for line in lines)
     exec(compile(source, "<adapter of a PyTensor function>", "exec"), namespace)
-    own = Path(__file__).read_text(encoding="utf-8")
-    key = digest("adapter", own, source, str(signature), str(results))
-    entry = EntryPoint(namespace["adapter"], {"table": I64_PTR, "out": F64_PTR}, "adapter", key)
+    parts = (source, str(signature), str(results))
+    entry = EntryPoint(namespace["adapter"], {"table": I64_PTR, "out": F64_PTR}, "adapter", parts)
     entry.compile()
     return entry.address
 

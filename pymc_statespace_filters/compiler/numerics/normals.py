@@ -17,7 +17,6 @@ import math
 import numpy as np
 from numba import carray, njit, types
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_strict
 from pymc_statespace_filters.compiler.numerics.exponential import (
@@ -142,5 +141,5 @@ _ARGUMENTS = {
     "z": F64_PTR, "n_rows": types.intp, "width": types.intp,
 }  # fmt: skip
 
-FILL_NORMALS = EntryPoint(_fill, _ARGUMENTS, "fill_normals", digest("fill_normals"))
+FILL_NORMALS = EntryPoint(_fill, _ARGUMENTS, "fill_normals")
 """`fill_normals` of an array given by its address, compiled once for all filters."""

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import (
     copy_into,
@@ -262,7 +261,7 @@ def _solve_innovations(P_dd_chol, w, spread, A, V):
             V[b, i] = v[b]
 
 
-CARRY_PAST = EntryPoint(_carry_past, CALLBACK_ARGUMENTS, "carry_past", digest("carry_past"))
+CARRY_PAST = EntryPoint(_carry_past, CALLBACK_ARGUMENTS, "carry_past")
 
 
 @njit_internal
@@ -309,7 +308,7 @@ def _smooth(plan, record, request, results):
     return status
 
 
-SMOOTH = plan_entry(_smooth, "ancestral_smoother", digest("ancestral_smoother"))
+SMOOTH = plan_entry(_smooth, "ancestral_smoother")
 """Smoothed states by a callback that carries past states along.
 
 The plan says whether the filter moves its members by a Kalman gain, and after how many further

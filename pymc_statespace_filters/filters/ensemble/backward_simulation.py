@@ -18,7 +18,6 @@ import math
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, plan_entry
@@ -62,7 +61,7 @@ def _store(integers, reals, event, j, k, X, log_w, d, D, ancestors):
         at[n * N :] = carray(log_w, (N,))
 
 
-STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles", digest("store_particles"))
+STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles")
 
 
 @njit_internal
@@ -245,5 +244,5 @@ def _smooth(plan, record, request, results):
     return status
 
 
-SMOOTH = plan_entry(_smooth, "backward_simulation", digest("backward_simulation"))
+SMOOTH = plan_entry(_smooth, "backward_simulation")
 """Smoothed states by backward simulation."""

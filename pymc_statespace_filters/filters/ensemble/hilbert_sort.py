@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
@@ -197,7 +196,7 @@ def _order(
     copy_into(work.order, order_particles(rows[0], rows[1:], work))
 
 
-ORDER_PARTICLES = EntryPoint(_order, _ARGUMENTS, "order_particles", digest("order_particles"))
+ORDER_PARTICLES = EntryPoint(_order, _ARGUMENTS, "order_particles")
 """`order_particles`, compiled only for filters that sort."""
 
 

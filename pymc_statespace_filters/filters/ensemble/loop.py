@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import NORMALS, REQUEST
@@ -220,14 +219,5 @@ def ensemble_filter(
             emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
         return OK
 
-    key = _key(name, n_settings, workspace, update, resampler, resample)
-    return likelihood_entry(name, evaluate, key, needs=(FILL_NORMALS,))
-
-
-def _key(name: str, n_settings: int, *functions: Callable) -> str | None:
-    """The key on disk; None for code outside the package, which the key would not cover."""
-    package = __name__.partition(".")[0]
-    if any(function.__module__.partition(".")[0] != package for function in functions):
-        return None
-    parts = (f"{function.__module__}.{function.__qualname__}" for function in functions)
-    return digest(name, str(n_settings), *parts)
+    parts = (str(n_settings), workspace, update, resampler, resample)
+    return likelihood_entry(name, evaluate, parts, needs=(FILL_NORMALS,))

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import pointer
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import (
@@ -178,5 +177,5 @@ def _store(plan, record, request, results):
     return np.int64(0)
 
 
-STORE_NORMALS = plan_entry(_store, "store_normals", digest("store_normals"), needs=(FILL_NORMALS,))
+STORE_NORMALS = plan_entry(_store, "store_normals", needs=(FILL_NORMALS,))
 """Write the normals of a whole evaluation, `n_stored` of them."""

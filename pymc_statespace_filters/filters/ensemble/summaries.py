@@ -5,7 +5,6 @@ import math
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
@@ -176,10 +175,8 @@ def choose(w, u):
     return chosen
 
 
-SUMMARISE = EntryPoint(_summarise, CALLBACK_ARGUMENTS, "summarise", digest("summarise"))
-STORE_MEMBERS = EntryPoint(
-    _store_members, CALLBACK_ARGUMENTS, "store_members", digest("store_members")
-)
+SUMMARISE = EntryPoint(_summarise, CALLBACK_ARGUMENTS, "summarise")
+STORE_MEMBERS = EntryPoint(_store_members, CALLBACK_ARGUMENTS, "store_members")
 
 
 @njit_internal
@@ -236,8 +233,8 @@ def _run(plan, record, request, results):
     return status
 
 
-MEMBER_STATES = plan_entry(_states, "ensemble_states", digest("ensemble_states"))
+MEMBER_STATES = plan_entry(_states, "ensemble_states")
 """Predicted or filtered states, in one pass."""
 
-MEMBER_RUN = plan_entry(_run, "ensemble_run", digest("ensemble_run"))
+MEMBER_RUN = plan_entry(_run, "ensemble_run")
 """One run that keeps all members at some steps."""

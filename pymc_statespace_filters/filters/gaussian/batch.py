@@ -38,4 +38,4 @@ def compile_batch(recursion: GaussianFilterFunctions) -> CompiledFunction:
         terms, health, _ = run(theta, records, rows, observed, inputs, t0, n_points * n_rows, 0)
         return terms.reshape((n_points, n_rows)), health
 
-    return CompiledFunction(jit(batch), key_of("batch", forward.key))
+    return CompiledFunction(jit(batch), key_of(__name__, "batch", forward.key))

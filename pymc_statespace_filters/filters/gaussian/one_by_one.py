@@ -110,4 +110,4 @@ def _n_taped(rows, first, last):
 
 
 def _compiled(function, what: str, part: CompiledFunction) -> CompiledFunction:
-    return CompiledFunction(jit(function, part.large), key_of(what, part.key), part.large)
+    return CompiledFunction(jit(function, part.large), key_of(__name__, what, part.key), part.large)

@@ -30,7 +30,7 @@ def compile_panel(recursion: GaussianFilterFunctions) -> CompiledFunction:
         terms, of_records, _ = run(theta, records, rows, observed, inputs, t0, rows.shape[0], 0)
         return terms, _first_failure(of_records)
 
-    return CompiledFunction(jit(panel), key_of("panel", forward.key, FIND_RECORDS.key))
+    return CompiledFunction(jit(panel), key_of(__name__, "panel", forward.key, FIND_RECORDS.key))
 
 
 def compile_panel_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -50,7 +50,9 @@ def compile_panel_taped(recursion: GaussianFilterFunctions) -> CompiledFunction:
         health = _first_failure(of_records)
         return terms, health, tape[: tape.shape[0] if health[1] == NONE else 0]
 
-    return CompiledFunction(jit(panel), key_of("taped panel", forward.key, FIND_RECORDS.key))
+    return CompiledFunction(
+        jit(panel), key_of(__name__, "taped panel", forward.key, FIND_RECORDS.key)
+    )
 
 
 @jit
@@ -77,7 +79,9 @@ def compile_panel_pullback(recursion: GaussianFilterFunctions) -> CompiledFuncti
         records, _ = records_of(rows, theta.shape[0], False)
         return run(theta, records, rows, observed, inputs, t0, tape, terms_bar)
 
-    return CompiledFunction(jit(reverse), key_of("reverse panel", backward.key, FIND_RECORDS.key))
+    return CompiledFunction(
+        jit(reverse), key_of(__name__, "reverse panel", backward.key, FIND_RECORDS.key)
+    )
 
 
 def compile_panel_gradient(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -90,5 +94,5 @@ def compile_panel_gradient(recursion: GaussianFilterFunctions) -> CompiledFuncti
         return reverse(theta, rows, observed, inputs, t0, seed, tape, terms_bar)
 
     large = any(part.large for part in parts)
-    key = key_of("gradient of a panel", *(part.key for part in parts))
+    key = key_of(__name__, "gradient of a panel", *(part.key for part in parts))
     return CompiledFunction(jit(gradient, large), key, large)

@@ -181,5 +181,5 @@ def compiled_of(
     """Compile a function that calls these parts; its key includes theirs."""
     what = f"{what} {recursion.system.dt!r} {recursion.system.n}"
     large = any(part.large for part in parts.values())
-    key = key_of(what, *(part.key for part in parts.values()))
+    key = key_of(__name__, function, what, *(part.key for part in parts.values()))
     return CompiledFunction(jit(function, large), key, large)

@@ -157,7 +157,13 @@ def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
             after[k, i] = s[i]
         return before, after, n_steps + 1, health
 
-    key = key_of(f"forwards {dt!r} {n}", valid.key, *(part.key for part in parts.values()))
+    key = key_of(
+        __name__,
+        __name__,
+        f"forwards {dt!r} {n}",
+        valid.key,
+        *(part.key for part in parts.values()),
+    )
     return CompiledFunction(jit(forwards), key)
 
 
@@ -183,7 +189,7 @@ def _read_forwards(n: int, *, predicted: bool) -> CompiledFunction:
                 drawn[r, i] = s[i] + s[size + i]
         return rows.size
 
-    return CompiledFunction(jit(read), key_of(f"read forwards {n} {predicted}"))
+    return CompiledFunction(jit(read), key_of(__name__, f"read forwards {n} {predicted}"))
 
 
 def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
@@ -224,7 +230,7 @@ def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
                 j -= 1
         return rows.size
 
-    key = key_of(f"read backwards {dt!r} {n}", *(part.key for part in parts.values()))
+    key = key_of(__name__, f"read backwards {dt!r} {n}", *(part.key for part in parts.values()))
     return CompiledFunction(jit(read), key)
 
 
@@ -261,7 +267,13 @@ def _noise(smoother: BrysonFrazier) -> CompiledFunction:
             apply_covariance(values, n * n, m, Z)
         return X, Z
 
-    key = key_of(f"noise of states {n} {m} {n_rows} {is_white}", flat.key, FILL_NORMALS.key)
+    key = key_of(
+        __name__,
+        __name__,
+        f"noise of states {n} {m} {n_rows} {is_white}",
+        flat.key,
+        FILL_NORMALS.key,
+    )
     return CompiledFunction(jit(noise), key)
 
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_internal
 from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
 from pymc_statespace_filters.filters.calls import OK, opened, reals_at, single_record
@@ -181,5 +180,5 @@ def _write_moments(mass, weight, h, roots, mean, cov):
                 cov[b, c] += weight * mass[i] * product
 
 
-GRID_PREDICTIONS = plan_entry(_grid_predictions, "grid_predictions", digest("grid_predictions"))
+GRID_PREDICTIONS = plan_entry(_grid_predictions, "grid_predictions")
 """The law of every observation."""

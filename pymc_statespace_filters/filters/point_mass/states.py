@@ -18,7 +18,6 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import (
     HEALTH_SIZE,
@@ -263,5 +262,5 @@ def _update_adjoint(system, k, t, d, grid, term, ratio):
         ratio[i] *= math.exp(log_likelihood[i] - term) if is_possible else 0.0
 
 
-GRID_STATES = plan_entry(_grid_states, "grid_states", digest("grid_states"))
-GRID_RUN = plan_entry(_grid_run, "grid_run", digest("grid_run"))
+GRID_STATES = plan_entry(_grid_states, "grid_states")
+GRID_RUN = plan_entry(_grid_run, "grid_run")

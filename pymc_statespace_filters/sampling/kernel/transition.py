@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.entry_point import njit_cached
 from pymc_statespace_filters.compiler.native.jit import copy_into, linked
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
-from pymc_statespace_filters.sampling.kernel.cached_code import cached_with
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
 from pymc_statespace_filters.sampling.kernel.independence import (
     SHARE,
@@ -77,18 +77,7 @@ class _Laws(NamedTuple):
 _internal = linked()
 
 
-_cached = cached_with(
-    "transition.py",
-    "state.py",
-    "adaptation.py",
-    "adaptation_state.py",
-    "delayed_rejection.py",
-    "independence.py",
-    "surrogate.py",
-)
-
-
-@_cached
+@njit_cached
 def evaluate(density):
     """Evaluate a `NativeLogDensity` at the position and seeds in its arrays.
 
@@ -228,7 +217,7 @@ def _scaling(chol):
     return np.exp(total / chol.shape[0])
 
 
-@_cached
+@njit_cached
 def advance(settings, target, screen, state, random, first, draws, row, n, control):
     """Make up to n iterations, with random numbers from row ``first``, recorded from ``row``.
 

@@ -39,6 +39,7 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.type import TensorType, tensor
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.pymc_model.compilation import compile_density
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
 # Positions in a block, whose intermediate results stay in the processor's cache.
@@ -170,7 +171,9 @@ class _PerPosition:
         point = raveled.unravel(np.zeros(raveled.dim))
         outputs, joined = join_nonshared_inputs(point, list(wanted), raveled.variables)
         self._dtypes = [output.dtype for output in outputs]
-        self._function = compile_pymc([joined], outputs, on_unused_input="ignore", trust_input=True)
+        self._function = compile_density(
+            [joined], outputs, on_unused_input="ignore", trust_input=True
+        )
         self._dtype = joined.dtype
 
     def __call__(self, positions: np.ndarray) -> list[np.ndarray]:

@@ -13,7 +13,6 @@ import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import ArrayLike
 from pymc.model import Model
-from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
@@ -111,7 +110,7 @@ class LogDensity:
             if group is not None:
                 self._leader = Leader(group, callback.kinds)
         # The stored normals, or their numbers, which depend on the data.
-        self._make_noise: Any = compile_pymc([], noise) if noise else list
+        self._make_noise: Any = compile_density([], noise) if noise else list
         self._n_noises = len(noise)
         outputs, joined = join_nonshared_inputs(
             point, outputs, variables, shared_inputs=seed_inputs

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 from pymc.model import Model
-from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.parallel.signals import held_interrupts
+from pymc_statespace_filters.pymc_model.compilation import compile_density
 from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
 from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
@@ -135,7 +135,7 @@ class BoundRecordDensities:
 
 
 def _compiled(inputs: list, outputs: list) -> Any:
-    function = compile_pymc(inputs, outputs, on_unused_input="ignore")
+    function = compile_density(inputs, outputs, on_unused_input="ignore")
     function.trust_input = True
     return function
 

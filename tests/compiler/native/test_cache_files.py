@@ -4,10 +4,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from pickle import UnpicklingError
+from types import FunctionType
 from uuid import uuid4
 
 import pytest
-from numba import types
+from numba import njit, types
 from pytensor import config
 
 from pymc_statespace_filters.compiler.native import entry_point
@@ -20,8 +22,8 @@ def _nothing(n):
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_a_damaged_file_is_compiled_anew(ending):
-    key = uuid4().hex
-    point = EntryPoint(_nothing, {"n": types.intp}, "nothing", key)
+    inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
+    point = EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,))
     folder = Path(config.base_compiledir, "numba")
     before = set(folder.iterdir())
     point.compile()
@@ -35,29 +37,52 @@ def test_a_damaged_file_is_compiled_anew(ending):
 
 
 SUM = """
-import pymc_statespace_filters as psf, pytensor, pytensor.tensor as pt
-psf.EKF()
+import sys
+import numba, pytensor, pytensor.tensor as pt
+from pymc_statespace_filters.pymc_model.compilation import compile_density
+
 x = pt.dvector()
-print(pytensor.function([x], pt.sum(pt.exp(x)), mode="NUMBA")([0.0, 0.0]))
+graph = pt.sum(pt.exp(x)) + pt.linalg.inv(pt.outer(x, x) + pt.eye(2))[0, 1]
+if sys.argv[1] == "density":
+    print(compile_density([x], [graph])([0.0, 0.0])[0])
+else:
+    print(pytensor.function([x], graph, mode="NUMBA")([0.0, 0.0]))
 """
 
 
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_files_of_pytensor_are_compiled_anew(tmp_path, ending):
-    def run():
-        flags = {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path.as_posix()},blas__ldflags=,cxx="}
-        command = [sys.executable, "-c", SUM]
-        return subprocess.run(
-            command, env=os.environ | flags, capture_output=True, text=True, check=True
-        )
+def _run_sum(folder, *arguments):
+    flags = {"PYTENSOR_FLAGS": f"base_compiledir={folder.as_posix()},blas__ldflags=,cxx="}
+    command = [sys.executable, "-c", SUM, *arguments]
+    return subprocess.run(command, env=os.environ | flags, capture_output=True, text=True)
 
-    assert run().stdout == "2.0\n"
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_damaged_files_of_pytensor_are_compiled_anew_in_a_density(tmp_path, ending):
+    assert _run_sum(tmp_path, "density").stdout == "2.0\n"
     files = list(tmp_path.rglob(f"*.{ending}"))
     assert files
     for file in files:
         file.write_bytes(file.read_bytes()[:10])
-    assert run().stdout == "2.0\n"
+    assert _run_sum(tmp_path, "function").returncode == 1  # PyTensor's own affair
+    assert _run_sum(tmp_path, "density").stdout == "2.0\n"
     assert all(file.stat().st_size > 10 for file in files)  # for the next process
+    assert _run_sum(tmp_path, "function").stdout == "2.0\n"
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_a_damaged_file_of_another_package_is_as_without_this_one(tmp_path, ending):
+    """Numba raises what reading the file raised, and leaves the file."""
+    path = tmp_path / "other.py"
+    path.write_text("def double(x):\n    return 2 * x\n")
+    namespace = {"__name__": "other"}
+    exec(compile(path.read_text(), str(path), "exec"), namespace)
+    double = namespace["double"]
+    assert njit(double, cache=True)(1.0) == 2.0
+    (file,) = tmp_path.rglob(f"*.{ending}")
+    file.write_bytes(file.read_bytes()[:10])
+    with pytest.raises((EOFError, UnpicklingError)):
+        njit(double, cache=True)(1.0)
+    assert file.stat().st_size == 10
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

@@ -46,7 +46,7 @@ def test_entries_are_closed():
         out[0] = twice_jitted(out[0])
 
     twice_jitted = njit(twice)
-    entry = EntryPoint(evaluate, {"out": F64_PTR}, "evaluate", None)
+    entry = EntryPoint(evaluate, {"out": F64_PTR}, "evaluate")
     entry.compile()
     assert linkages_of_helpers(_compiled[entry.symbol]._library) == [Linkage.internal]
     result = np.array([0.5])
@@ -135,6 +135,6 @@ def test_a_function_is_optimised_once_however_many_call_it(monkeypatch):
     def evaluate(out):
         out[0] = first(out[0]) + second(out[0])
 
-    EntryPoint(evaluate, {"out": F64_PTR}, "evaluate_once", None).compile()
+    EntryPoint(evaluate, {"out": F64_PTR}, "evaluate_once").compile()
     assert optimised.count("_LinkedLibrary") == 3
     assert optimised.count("_InternalLinkageLibrary") == 1

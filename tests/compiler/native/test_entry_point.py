@@ -6,6 +6,7 @@ from types import FunctionType
 
 import numpy as np
 from numba import carray, njit, types
+from numba.core.caching import FunctionCache
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
 import pymc_statespace_filters as psf
@@ -19,6 +20,13 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 )
 from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
 
+NATIVE = entries.__name__
+
+
+def of_module(function, module):
+    """The same function as if it were defined in a module."""
+    return FunctionType(function.__code__, globals() | {"__name__": module})
+
 
 def scale(x, n, factor):
     values = carray(x, (n,))
@@ -27,7 +35,7 @@ def scale(x, n, factor):
 
 
 ARGUMENTS = {"x": F64_PTR, "n": types.intp, "factor": types.float64}
-SCALE = EntryPoint(scale, ARGUMENTS, "scale", None)
+SCALE = EntryPoint(scale, ARGUMENTS, "scale")
 by_name, symbol = SCALE.external, SCALE.symbol
 
 
@@ -68,10 +76,22 @@ def test_an_array_is_handed_over_by_its_address():
 
 
 def test_a_second_entry_under_the_same_key_is_the_first():
-    one, two = (EntryPoint(scale, ARGUMENTS, "s", "key") for _ in range(2))
+    one, two = (EntryPoint(of_module(scale, NATIVE), ARGUMENTS, "s") for _ in range(2))
     assert one.symbol == two.symbol
-    unnamed = EntryPoint(scale, ARGUMENTS, "s", None)
-    assert unnamed.symbol != EntryPoint(scale, ARGUMENTS, "s", None).symbol
+    other = EntryPoint(of_module(scale, NATIVE), ARGUMENTS, "s", ("text",))
+    assert other.symbol != one.symbol
+
+
+def test_functions_outside_the_package_have_no_key():
+    for parts in ((), ("text",)):
+        point = EntryPoint(scale, ARGUMENTS, "s", parts)
+        assert point.key is None
+        assert point.symbol != EntryPoint(scale, ARGUMENTS, "s", parts).symbol
+    inside = of_module(scale, NATIVE)
+    assert EntryPoint(inside, ARGUMENTS, "s", (scale,)).key is None
+    assert EntryPoint(inside, ARGUMENTS, "s", (None,)).key is None
+    assert EntryPoint(inside, ARGUMENTS, "s", needs=(SCALE,)).key is None
+    assert not isinstance(cached_on_disk(njit(scale), "text")._cache, FunctionCache)
 
 
 def test_a_filter_is_compiled_once_for_all_systems_and_sizes():
@@ -109,9 +129,9 @@ def test_code_is_kept_for_its_module():
         return x + 1.0
 
     keys = []
-    for module in ("here", "there"):
-        moved = FunctionType(function.__code__, {"__name__": module})
-        keys.append(CACHED_SRC_FUNCTIONS[cached_on_disk(njit(moved), "key").py_func])
+    for module in (NATIVE, f"{psf.__name__}.errors"):
+        moved = njit(of_module(function, module))
+        keys.append(CACHED_SRC_FUNCTIONS[cached_on_disk(moved).py_func])
     assert keys[0] != keys[1]
 
 
@@ -124,11 +144,11 @@ def test_garbage_collection_pauses_during_a_compilation_and_is_left_as_it_was(mo
             super().compile()
 
     monkeypatch.setattr(entries, "CFunc", Compilation)
-    EntryPoint(scale, ARGUMENTS, "scale", None).compile()
+    EntryPoint(scale, ARGUMENTS, "scale").compile()
     assert gc.isenabled()
     gc.disable()
     try:
-        EntryPoint(scale, ARGUMENTS, "scale", None).compile()
+        EntryPoint(scale, ARGUMENTS, "scale").compile()
         assert not gc.isenabled()
     finally:
         gc.enable()

@@ -5,7 +5,7 @@ from numba import carray
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.codegen.simd import LANES
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
@@ -126,7 +126,7 @@ def _observe(
     return any_seen
 
 
-_BACKWARD = EntryPoint(_backward, _ARGUMENTS, "lanes_backward", digest("lanes_backward"))
+_BACKWARD = EntryPoint(_backward, _ARGUMENTS, "lanes_backward")
 
 
 def backward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -154,5 +154,5 @@ def backward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
         call_address(address_of(reverse), arguments)
         return theta_bar
 
-    key = key_of(f"backward pass {dt!r}", forward.key, backward.key, _BACKWARD.key)
+    key = key_of(__name__, f"backward pass {dt!r}", forward.key, backward.key, _BACKWARD.key)
     return CompiledFunction(jit(run), key)

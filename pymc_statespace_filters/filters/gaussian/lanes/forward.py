@@ -10,7 +10,7 @@ from numba import carray, types
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
 from pymc_statespace_filters.compiler.codegen.simd import LANES
 from pymc_statespace_filters.compiler.lowering.covariances import covariance_check
-from pymc_statespace_filters.compiler.native.cache_key import digest, key_of
+from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
@@ -182,7 +182,7 @@ def _store_terms(n, lanes, records, s, seen, term, terms, health):
     return n_failed
 
 
-_FORWARD = EntryPoint(_forward, _ARGUMENTS, "lanes_forward", digest("lanes_forward"))
+_FORWARD = EntryPoint(_forward, _ARGUMENTS, "lanes_forward")
 
 
 def forward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
@@ -215,5 +215,5 @@ def forward_pass(recursion: GaussianFilterFunctions) -> CompiledFunction:
         call_address(address_of(forward), arguments)
         return terms, health, tape
 
-    key = key_of(f"forward pass {dt!r} {size}", table.key, valid.key, _FORWARD.key)
+    key = key_of(__name__, f"forward pass {dt!r} {size}", table.key, valid.key, _FORWARD.key)
     return CompiledFunction(jit(run), key)

@@ -8,7 +8,6 @@ import numpy as np
 from numba import carray, types
 
 from pymc_statespace_filters.compiler.codegen.simd import LANES
-from pymc_statespace_filters.compiler.native.cache_key import digest
 from pymc_statespace_filters.compiler.native.entry_point import (
     I64_PTR,
     EntryPoint,
@@ -80,7 +79,7 @@ def _count_states(rows, records, lanes):
     return total
 
 
-FIND_RECORDS = EntryPoint(_find, _ARGUMENTS, "find_records", digest("find_records"))
+FIND_RECORDS = EntryPoint(_find, _ARGUMENTS, "find_records")
 """Find the records of a panel, compiled once for all systems."""
 
 _FIND = FIND_RECORDS.symbol

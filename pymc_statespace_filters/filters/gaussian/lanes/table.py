@@ -159,7 +159,7 @@ def _table(
         return np.array(table)
 
     keys = [entry.key for entry in lanes.entries.values()]
-    key = key_of(repr((n, lengths, n_rows)), *keys)
+    key = key_of(__name__, repr((n, lengths, n_rows)), *keys)
     return CompiledTable(make, key, n_rows, n_numbers(n_rows, size, n_inputs))
 
 

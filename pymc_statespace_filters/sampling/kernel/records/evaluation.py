@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.entry_point import njit_cached
 from pymc_statespace_filters.compiler.native.jit import linked
 from pymc_statespace_filters.compiler.native.pytensor_function import make_call
-from pymc_statespace_filters.sampling.kernel.cached_code import cached_with
 from pymc_statespace_filters.sampling.kernel.state import HEALTH_SIZE, NOT_A_NUMBER, RAISED
 
-_cached = cached_with("records/evaluation.py", "state.py")
 _internal = linked()
 
 
@@ -31,7 +30,7 @@ def _take_numbers(target, out):
     return n_failed
 
 
-@_cached
+@njit_cached
 def evaluate_likelihoods(density, estimates):
     """Estimate the likelihoods of all records at the position and seeds in the arrays.
 
@@ -51,7 +50,7 @@ def evaluate_likelihoods(density, estimates):
     return RecordEvaluation(NOT_A_NUMBER, n_failed)
 
 
-@_cached
+@njit_cached
 def evaluate_priors(density, priors):
     """All other terms at the position in the arrays; whether the model did not raise."""
     if not make_call(density.prior):

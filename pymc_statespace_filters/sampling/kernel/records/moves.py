@@ -29,10 +29,10 @@ computations. Annals of Statistics 37, 697-725.
 
 import numpy as np
 
+from pymc_statespace_filters.compiler.native.entry_point import njit_cached
 from pymc_statespace_filters.compiler.native.jit import copy_into, linked
 from pymc_statespace_filters.sampling.kernel.adaptation import learn
 from pymc_statespace_filters.sampling.kernel.adaptation_state import packed_size, unpack
-from pymc_statespace_filters.sampling.kernel.cached_code import cached_with
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_ratio_to_one
 from pymc_statespace_filters.sampling.kernel.records.arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
 from pymc_statespace_filters.sampling.kernel.records.evaluation import (
@@ -53,15 +53,6 @@ from pymc_statespace_filters.sampling.kernel.state import (
     STAGE,
 )
 
-_cached = cached_with(
-    "records/moves.py",
-    "records/arrays.py",
-    "records/evaluation.py",
-    "state.py",
-    "adaptation.py",
-    "adaptation_state.py",
-    "delayed_rejection.py",
-)
 _internal = linked()
 
 
@@ -247,7 +238,7 @@ def _scaling(layout, state):
     return np.exp(total / (n_records * size))
 
 
-@_cached
+@njit_cached
 def advance_records(settings, density, layout, state, random, first, draws, row, n, control):
     """Make up to n iterations, with random numbers from row ``first``, recorded from ``row``.
 
