@@ -36,6 +36,7 @@ from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
 
 HEALTH_SIZE = 3
+_READY = 0x0001 | 0x0100 | 0x0400  # flags of NumPy: contiguous in C's order, aligned, writeable
 
 RECORD_INPUTS = (
     ("theta", "float64", 1),
@@ -134,8 +135,7 @@ def evaluator(op: FilterOp) -> Any:
     call = TimedCall(function)
 
     def evaluate(*values: Any) -> tuple:
-        # Other types of arrays (in another order, or read-only) would be compiled again.
-        arrays = [np.require(v, kind, ("C", "W")) for v, kind in zip(values, kinds, strict=True)]
+        arrays = [_ready(v, kind) for v, kind in zip(values, kinds, strict=True)]
         if op.is_collective:
             results = call_machine_code(function, *arrays)
         else:
@@ -143,6 +143,13 @@ def evaluator(op: FilterOp) -> Any:
         return results if isinstance(results, tuple) else (results,)
 
     return evaluate
+
+
+def _ready(value: Any, kind: np.dtype) -> np.ndarray:
+    """An array of this type, in order and writeable: another one would be compiled for again."""
+    if type(value) is np.ndarray and value.dtype is kind and value.flags.num & _READY == _READY:
+        return value
+    return np.require(value, kind, ("C", "A", "W"))
 
 
 def _jitted(op: FilterOp, kernel: CompiledFunction) -> Callable:

@@ -1,6 +1,8 @@
 """A function that a plan computes: called from Python, or by machine code that numba compiles."""
 
+from array import array
 from collections.abc import Callable, Sequence
+from ctypes import addressof, c_char
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +22,7 @@ from pymc_statespace_filters.compiler.native.plan import (
     N_REQUEST,
     N_RESULTS,
     RAISED,
+    RECORD,
     REFUSALS,
     REQUEST,
     RESULTS,
@@ -35,12 +38,21 @@ type Names = Sequence[tuple[str, int]]
 # The vectors of a call lie one behind the other.
 _FIRST = {"record": 0, "request": N_RECORD, "results": N_RECORD + N_REQUEST}
 _N_WORDS = N_RECORD + N_REQUEST + N_RESULTS
-_WORD_BYTES = 8
+_BYTES = 8
+_NOTHING = c_char * 0
+_RESULTS = _FIRST["results"]
 
-_DEFAULT_WORDS = [0] * _N_WORDS
+_DEFAULT_WORDS = array("q", [0] * _N_WORDS)
 for _vector, _words in DEFAULTS.items():
     for _slot, _word in _words.items():
         _DEFAULT_WORDS[_FIRST[_vector] + _slot] = _word
+# Sizes that are those of an argument; other results need a call that asks for their sizes.
+_WORDS_OF_SIZES = {
+    RESULTS.n_terms: RECORD.n_rows,
+    RESULTS.n_theta: RECORD.n_theta,
+    RESULTS.n_records: RECORD.n_records,
+    RESULTS.n_wanted: _FIRST["request"] + REQUEST.n_wanted,
+}
 _SIZES_ONLY = _FIRST["request"] + REQUEST.sizes_only
 _REPLACEMENT = _FIRST["request"] + REQUEST.replacement
 
@@ -65,7 +77,12 @@ class PlannedFunction:
         self.plan = plan
         self.arguments, self.results = tuple(arguments), tuple(results)
         self._given = [ARGUMENTS[argument] for argument in _flat(self.arguments)]
+        self._places = [_words_of(argument) for argument in self._given]
         self._shapes = [_shape(name, ndim) for name, ndim in results]
+        sizes = {s for _, shape in self._shapes for s, is_slot in shape if is_slot}
+        self._asks_for_sizes = not sizes <= _WORDS_OF_SIZES.keys()
+        names = [name for name, _ in results]
+        self._tape = names.index("tape") if "tape" in names else None
 
     @property
     def key(self) -> str | None:
@@ -74,37 +91,36 @@ class PlannedFunction:
 
     def __call__(self, *values: Any) -> Any:
         """Call from Python; arrays are contiguous and of the right types."""
-        words = _DEFAULT_WORDS.copy()
-        for given, value in zip(self._given, _flat_values(values), strict=True):
-            first = _FIRST[given.vector]
-            if given.is_value:
-                words[first + given.slot] = int(value)
+        words = _DEFAULT_WORDS[:]
+        given = [v if type(v) is np.ndarray else np.asarray(v) for v in _flat_values(values)]
+        for (place, shape, is_value), value in zip(self._places, given, strict=True):
+            if is_value:
+                words[place] = int(value)
                 continue
-            words[first + given.slot] = value.ctypes.data
-            for slot, length in zip(given.shape, value.shape, strict=True):
-                words[first + slot] = length
-        words[_SIZES_ONLY] = 1
-        memory = np.array(words, np.int64)
-        record = memory.ctypes.data
-        request, places = record + _WORD_BYTES * N_RECORD, record + _WORD_BYTES * _FIRST["results"]
-        call = self.plan.run
-        self._check(call(self.plan.address, record, request, places))
-        sizes = memory[_FIRST["results"] :].tolist()
-        results = []
-        for slot, shape in self._shapes:
-            result = np.empty([sizes[s] if is_slot else s for s, is_slot in shape])
-            memory[_FIRST["results"] + slot] = result.ctypes.data
-            results.append(result)
-        memory[_SIZES_ONLY] = 0
+            words[place] = _address(value)
+            for word, length in zip(shape, value.shape, strict=True):
+                words[word] = length
+        record, _ = words.buffer_info()
+        request, results = record + _BYTES * N_RECORD, record + _BYTES * _RESULTS
+        run, plan = self.plan.run, self.plan.address
+        if self._asks_for_sizes:
+            words[_SIZES_ONLY] = 1
+            self._check(run(plan, record, request, results))
+            words[_SIZES_ONLY] = 0
+        made = []
+        for place, sizes in self._shapes:
+            result = np.empty([self._size(words, s) if is_slot else s for s, is_slot in sizes])
+            words[_RESULTS + place] = _address(result)
+            made.append(result)
         if words[_REPLACEMENT]:
-            call = PlanFunction(words[_REPLACEMENT])
-        self._check(call(self.plan.address, record, request, places))
-        n_tape = memory[_FIRST["results"] + RESULTS.n_tape]
-        results = [
-            result[:n_tape] if name == "tape" else result
-            for (name, _), result in zip(self.results, results, strict=True)
-        ]
-        return tuple(results) if len(results) > 1 else results[0]
+            run = PlanFunction(words[_REPLACEMENT])
+        self._check(run(plan, record, request, results))
+        if self._tape is not None:
+            made[self._tape] = made[self._tape][: words[_RESULTS + RESULTS.n_tape]]
+        return tuple(made) if len(made) > 1 else made[0]
+
+    def _size(self, words: array, slot: int) -> int:
+        return words[_RESULTS + slot if self._asks_for_sizes else _WORDS_OF_SIZES[slot]]
 
     def _check(self, status: int) -> None:
         if status:
@@ -125,6 +141,14 @@ class PlannedFunction:
         return namespace["call"]
 
 
+def _address(values: np.ndarray) -> int:
+    """The address of an array; `ndarray.ctypes` takes four times as long."""
+    try:
+        return addressof(_NOTHING.from_buffer(values))
+    except TypeError:  # it cannot be written to
+        return values.ctypes.data
+
+
 def _flat(arguments: Names) -> list[tuple[str, int]]:
     """The arguments with the two parts of a noise in its place."""
     parts: list[tuple[str, int]] = []
@@ -133,13 +157,19 @@ def _flat(arguments: Names) -> list[tuple[str, int]]:
     return parts
 
 
+def _words_of(argument: Argument) -> tuple[int, list[int], bool]:
+    """Where an argument goes among all words of a call, and where its shape goes."""
+    first = _FIRST[argument.vector]
+    return first + argument.slot, [first + slot for slot in argument.shape], argument.is_value
+
+
 def _flat_values(values: Sequence[Any]) -> list[Any]:
     parts: list[Any] = []
     for value in values:
         if isinstance(value, tuple):
             parts += value
         else:
-            parts.append(np.asarray(value))
+            parts.append(value)
     return parts
 
 
@@ -178,7 +208,7 @@ class _Emitter:
         kind = ir.ArrayType(self._integer, _N_WORDS)
         with builder.goto_entry_block():
             self._memory = builder.alloca(kind)
-        builder.store(ir.Constant(kind, _DEFAULT_WORDS), self._memory)
+        builder.store(ir.Constant(kind, list(_DEFAULT_WORDS)), self._memory)
 
     def call(self, kinds: Sequence[Any], values: Sequence[Any]) -> Any:
         """The results of the call with arguments of these types."""

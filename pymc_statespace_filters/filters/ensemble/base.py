@@ -141,9 +141,19 @@ class EnsembleFilterBase:
         """Return the plan of the filter's entry point for one system."""
         return self.plan(system, self.entry, self.functions())
 
-    def observed(self, system: System, run: EntryPoint, **others: int | EntryPoint) -> Plan:
-        """Return the plan of a function that runs the filter with a callback."""
-        return self.plan(system, run, self.functions(), evaluate=self.entry, **others)
+    def observed(
+        self,
+        system: System,
+        run: EntryPoint,
+        functions: Sequence[str] = (),
+        **others: int | EntryPoint,
+    ) -> Plan:
+        """Return the plan of a function that runs the filter with a callback.
+
+        ``functions`` are those of the system that it calls besides the filter's.
+        """
+        functions = (*self.functions(), *functions)
+        return self.plan(system, run, functions, evaluate=self.entry, **others)
 
     def plan(
         self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint

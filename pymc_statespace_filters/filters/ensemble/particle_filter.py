@@ -97,7 +97,7 @@ class ParticleFilter(EnsembleFilterBase):
     def smoother(self, system: System) -> Plan:
         """Plan backward simulation, or where a step has no density the ancestral smoother."""
         if system.has_transition_density:
-            return self.observed(system, backward_simulation.SMOOTH, observer=STORE)
+            return self.observed(system, backward_simulation.SMOOTH, ("propagate",), observer=STORE)
         updates = int(self.simulates)
         return self.observed(
             system, ancestral_smoother.SMOOTH, observer=CARRY_PAST, updates=updates, lag=LAG
