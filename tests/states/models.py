@@ -7,7 +7,7 @@ import pytensor.tensor as pt
 
 import pymc_statespace_filters as psf
 from tests.references.linear_states import linear_states
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 
 EKF = psf.EKF()
 ALL_STEPS = np.arange(7)

@@ -8,7 +8,6 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evaluation.simulate import observer
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     DATA_NOISE,
     DT,
@@ -26,6 +25,7 @@ from tests.states.models import (
     pushed_model,
     shown,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 

@@ -10,7 +10,6 @@ from numba.core.dispatcher import Dispatcher
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.states import free_runs
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 from tests.states.models import (
     DATA_NOISE,
     DT,
@@ -25,6 +24,7 @@ from tests.states.models import (
     posterior,
     pushed_model,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
