@@ -159,7 +159,7 @@ def test_counts_are_forecast_as_counts():
     values = np.tile([0.3, 1.3], (2, 1500))
     values[1, 0] = 1e300  # the filter fails, and no count is that of an unknown rate
     with pytest.warns(psf.FilterWarning, match="in 1 of 6000 evaluations"):
-        group = predictions(posterior(c=values), model, n_steps=30).to_dataset().isel(d_time=-1)
+        group = predictions(posterior(level=values), model, n_steps=30).to_dataset().isel(d_time=-1)
     assert group["d"].isnull().sum() == group["d"][1, 0].isnull().sum() == 1
     for i, c in enumerate((0.3, 1.3)):
         part = group.isel(draw=slice(i, None, 2))

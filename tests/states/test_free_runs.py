@@ -210,7 +210,7 @@ def test_coverage_is_that_of_measurements(noise):
 def test_counts():
     """Means of counts, compared with intervals of whole counts."""
     model = counted_model(initial_mean=1.0)
-    idata = posterior(c=np.full((2, 500), 0.5))
+    idata = posterior(level=np.full((2, 500), 0.5))
     expected = np.exp(0.5 + 0.8 ** np.arange(3))
     group = runs(idata, model, steps=[0, 1, 2], observed=[3.0, np.nan, 20.0])
     np.testing.assert_allclose(group["d"][0, 0, :, 0], expected, rtol=1e-10)
