@@ -34,7 +34,7 @@ from pymc_statespace_filters.filters.plan import (
     read_system,
     settings_of,
 )
-from tests.systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS, pair
 
 FUNCTIONS = ("initialise", "propagate", "observe", "log_density")
 RECORD_ARGUMENTS = (("theta", 1), ("steps", 1), ("observed", 2), ("inputs", 2), ("t0", 0))
@@ -94,6 +94,15 @@ def words_of_plan():
     first = np.ctypeslib.as_array((ctypes.c_int64 * N_HEADER).from_address(plan.address))
     size = int(first[HEADER.n_words])
     return np.array((ctypes.c_int64 * size).from_address(plan.address), np.int64)
+
+
+def test_plans_of_equal_code_are_the_same_words():
+    """The words of the first one must not be freed when a second one is made."""
+    filter = psf.BootstrapPF(20)
+    plans = [filter.compile(compile_system(PAIR)).plan for _ in range(2)]
+    plans.append(filter.compile(compile_system(pair())).plan)
+    assert len({plan.address for plan in plans}) == 1
+    assert len({id(plan) for plan in plans}) > 1
 
 
 def test_a_damaged_plan_is_refused():
