@@ -12,13 +12,13 @@ from benchmarks.gaussian_bias import walk
 from benchmarks.guided import sparse, spikes
 from benchmarks.measure import ROOT
 from benchmarks.systems import LINEAR, LINEAR_TRUTH, STEPS
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import (
     DOUBLE_WELL,
     PRECISE_DOUBLE_WELL,
     double_well,
     double_well_with_surprises,
 )
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 MANY, MANY_GUIDED = psf.BootstrapPF(20_000), psf.GuidedPF(5000)
 GRID = psf.GridFilter()

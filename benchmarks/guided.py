@@ -18,7 +18,6 @@ from scipy.special import logsumexp
 
 import pymc_statespace_filters as psf
 from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import (
     DOUBLE_WELL as WELL,
 )
@@ -27,6 +26,7 @@ from tests.references.records import (
     double_well,
     double_well_with_surprises,
 )
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 N_SEEDS = 200
 FILTERS = psf.BootstrapPF(1000), psf.GuidedPF(100), psf.GuidedPF(1000)

@@ -13,8 +13,8 @@ import warnings
 import numpy as np
 
 import pymc_statespace_filters as psf
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import PRECISE_DOUBLE_WELL, SURPRISES, double_well_with_surprises
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 FILTERS = (
     (psf.EKF(), 1),

@@ -9,7 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from tests.elsewhere import MISSING
-from tests.small_systems import FREE
+from tests.systems import FREE
 
 
 def test_nothing_of_linux_is_left(tmp_path):

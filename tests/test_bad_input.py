@@ -404,25 +404,6 @@ def test_a_density_alone_cannot_be_simulated():
         psf.simulate(system, {"a": 1.0}, steps=[1])
 
 
-@pytest.mark.parametrize(
-    ("construct", "words"),
-    [
-        (lambda: psf.EnKF(1), "n_members .*from 2 .*1"),
-        (lambda: psf.EnKF(10.0), "n_members .*integer.*10.0"),
-        (lambda: psf.EnKF(True), "n_members .*True"),
-        (lambda: psf.EnKF(10, likelihood="exact"), "likelihood .*'ensemble', 'gaussian'.*'exact'"),
-        (lambda: psf.BootstrapPF(0), "n_particles .*from 2 .*0"),
-        (lambda: psf.BootstrapPF(10**30), "n_particles .*to 1e.08"),
-        (lambda: psf.BootstrapPF(10, resample_below=2), "resample_below .*0 to 1.*2"),
-        (lambda: psf.BootstrapPF(10, resampling="residual"), "resampling .*'residual'"),
-        (lambda: psf.PFEnKF(10, likelihood="gaussian"), "likelihood .*'predictive'.*'gaussian'"),
-    ],
-)
-def test_wrong_settings_of_a_filter_are_refused(construct, words):
-    with pytest.raises(psf.ModelError, match=words):
-        construct()
-
-
 def test_filters_refuse_systems_that_they_cannot_treat():
     counts = make(
         observation=..., observation_noise=..., observation_dist=lambda x: [pm.Poisson.dist(1.0)]

@@ -17,7 +17,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import cache_key
-from tests.small_systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
+from tests.systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
 
 ROOT = Path(__file__).parents[1]
 POINT = {"a": np.array(0.6)}
@@ -78,7 +78,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native import entry_point as entries
 from pymc_statespace_filters.ops.base import cache_key
-from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
+from tests.systems import FORCE, FORCED_DATA, STEPS, forced
 
 results = []
 for system, observed in json.loads(sys.argv[1]):

@@ -184,9 +184,9 @@ class GuidedPF(ParticleFilter):
     >>> import pymc_statespace_filters as psf
     >>> system = psf.StateSpaceModel(
     ...     transition=lambda x, q, a: [a * x[0] + q[0]],
-    ...     process_noise=[[0.1]],
+    ...     process_noise=[[1.0]],
     ...     observation=lambda x: [x[0]],
-    ...     observation_noise=[[0.2]],
+    ...     observation_noise=[[0.5]],
     ...     initial_mean=[0.0],
     ...     initial_cov=[[1.0]],
     ... )

@@ -109,11 +109,11 @@ def free_run(
     >>> import pymc_statespace_filters as psf
     >>> tank = psf.StateSpaceModel(
     ...     transition=lambda x, q, u, a: [a * x[0] + u[0] + q[0]],
-    ...     process_noise=[[0.01]],
+    ...     process_noise=[[1.0]],
     ...     observation=lambda x: [x[0]],
-    ...     observation_noise=[[0.05]],
+    ...     observation_noise=[[0.5]],
     ...     initial_mean=[0.0],
-    ...     initial_cov=[[0.1]],
+    ...     initial_cov=[[1.0]],
     ...     inputs=["flow"],
     ... )
     >>> with pm.Model() as model:

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import Graph, Vecto
 from pymc_statespace_filters.compiler.codegen.functions import vector_functions
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
 from pymc_statespace_filters.system.equations import as_vector
-from tests.compiler import programs
+from tests.compiler import example_functions
 
 POINTS = np.array([[0.3, -0.7, 1.4], [-1.3, 0.0, 2.0]])
 INTERPRETED = Mode(linker="py", optimizer=None)
@@ -43,10 +43,10 @@ def assert_same(group, x, outputs, rtol):
 
 @pytest.mark.parametrize("group", ["MOVING", "ARITHMETIC", "LOGIC", "ALGEBRA", "SOLVED", "NESTED"])
 def test_unrolled_code_equals_pytensor(group, monkeypatch):
-    x, outputs = traced(getattr(programs, group))
+    x, outputs = traced(getattr(example_functions, group))
     # Whatever has no scalar form raises here, where array code would step in.
     monkeypatch.setattr(lowering, "array_vector_function", None)
-    assert_same(getattr(programs, group), x, outputs, rtol=1e-13)
+    assert_same(getattr(example_functions, group), x, outputs, rtol=1e-13)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
@@ -93,18 +93,18 @@ def test_three_equations_are_eliminated_with_the_largest_pivots():
 
 
 def test_what_does_not_unroll_runs_on_arrays():
-    x, outputs = traced(programs.ARRAYS_ONLY)
+    x, outputs = traced(example_functions.ARRAYS_ONLY)
     for output in outputs:
         with pytest.raises(NotUnrollableError):
             lowering.unrolled(Graph({"theta": x}, [output]))
-    assert_same(programs.ARRAYS_ONLY, x, outputs, rtol=1e-12)
+    assert_same(example_functions.ARRAYS_ONLY, x, outputs, rtol=1e-12)
 
 
 def test_a_value_that_is_not_finite_never_turns_into_a_finite_one():
     names = ("elementary", "whole powers", "sums", "clip")
-    group = {name: programs.ARITHMETIC[name] for name in names}
-    group["cholesky"] = programs.ALGEBRA["cholesky"]
-    group["switch"] = programs.LOGIC["switch"]
+    group = {name: example_functions.ARITHMETIC[name] for name in names}
+    group["cholesky"] = example_functions.ALGEBRA["cholesky"]
+    group["switch"] = example_functions.LOGIC["switch"]
     x, outputs = traced(group)
     references = [pytensor.function([x], y, mode=INTERPRETED) for y in outputs]
     function = lowered(x, outputs)

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
-from tests.sampling.autoregression import autoregression, simulated
+from tests.systems import autoregression, simulated
 
 SYSTEM = autoregression()
 SPREAD = 0.7

@@ -4,15 +4,13 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor
-import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics.calibration import uniformity_of
 from tests.diagnostics.records import SYSTEM
 from tests.references.linear_states import linear_states
-from tests.sampling.autoregression import autoregression, simulated
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS, autoregression, counts, simulated
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -62,7 +60,7 @@ def test_predictions_of_a_linear_system_have_kalmans_law(filter):
 
 def test_guided_particles_do_not_know_what_they_predict():
     """Moved by the guide, all would be within the sensor's error of 0.01 of the observation."""
-    system = autoregression(observation_noise=[[1e-4]])
+    system = autoregression(observation_noise=1e-4)
     steps = np.arange(1, 60, 3)
     observed = simulated(steps, 2, 0.9, 0.3, observation_noise=1e-4)
     found = diagnosed(system, psf.GuidedPF(200), observed, steps, phi=0.9, spread=0.3)
@@ -111,17 +109,10 @@ def test_missing_dynamics_leave_autocorrelation(long_record):
 
 def test_counts():
     """The p-value of a right model is below 0.001 for one seed in 1000."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, c: [0.8 * x[0] + q[0]],
-        process_noise=[[0.2]],
-        observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
-        initial_mean=[0.0],
-        initial_cov=[[0.5]],
-    )
     steps = np.arange(150)
-    seen = psf.simulate(system, {"c": 0.3}, steps=steps, random_seed=3)["observations"].values
+    seen = psf.simulate(counts(), {"level": 0.3}, steps=steps, random_seed=3)["observations"].values
     assert np.unique(seen).size < 12  # many ties
-    found = diagnosed(system, psf.BootstrapPF(1000), seen, steps, (1, 400), c=0.3)
+    found = diagnosed(counts(), psf.BootstrapPF(1000), seen, steps, (1, 400), level=0.3)
     assert (found["d_predicted"] % 1 == 0).all()
     assert found["d_uniformity"].item() > 1e-3
     # The share of predictions below the datum alone, or not above it, is far from uniform.

@@ -16,7 +16,7 @@ from pymc_statespace_filters.diagnostics.innovations import (
     standardised,
 )
 from tests.references.linear_states import linear_states
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from tests.diagnostics.records import PHI, PRIOR, SPREAD, SYSTEM
-from tests.sampling.autoregression import simulated
+from tests.systems import simulated
 
 ROWS = np.array([1, 2, 4, 7])
 LABELS = ["A", "B", "C", "D", "E", "F"]

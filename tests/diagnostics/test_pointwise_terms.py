@@ -10,7 +10,7 @@ from scipy.stats import halfnorm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from tests.diagnostics.records import SYSTEM
-from tests.small_systems import PAIR, PAIR_DATA, STEPS, pair_terms
+from tests.systems import PAIR, PAIR_DATA, STEPS, pair_terms
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 

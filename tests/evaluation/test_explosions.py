@@ -13,7 +13,7 @@ from pymc_statespace_filters.filters.outcomes import FAILURES
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.system.parameters import flat_parameters
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM
+from tests.systems import DOUBLE_WELL_SYSTEM
 
 STEPS = [0, 10, 20, 40]
 RECORD = [1.0, -0.5, np.nan, 0.8]

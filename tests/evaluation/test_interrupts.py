@@ -17,7 +17,7 @@ from pytensor.compile.ops import wrap_py
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.interrupts import interrupt_in
-from tests.small_systems import FREE
+from tests.systems import FREE
 
 pytestmark = pytest.mark.usefixtures("interrupts_arrive")
 
@@ -79,7 +79,7 @@ import signal, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
 import numpy as np
 import pymc_statespace_filters as psf
-from tests.small_systems import FREE
+from tests.systems import FREE
 {prepare}
 print("go", flush=True)
 try:

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from tests.small_systems import FORCED, PAIR
+from tests.systems import FORCED, PAIR
 
 COLUMNS = ["frequency", "damping_ratio", "growth_rate", "time_constant"]
 

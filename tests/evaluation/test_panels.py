@@ -7,7 +7,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.system.panel_records import records_of
-from tests.small_systems import FORCED, PAIR
+from tests.systems import FORCED, PAIR
 
 LABELS = ["B", "B", "B", "A", "C", "C"]
 STEPS = np.array([0, 2, 5, 3, 1, 4])

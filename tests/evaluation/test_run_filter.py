@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal, norm
 import pymc_statespace_filters as psf
 from tests.filters.test_ensemble_states import states
 from tests.references.linear_states import linear_states
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.systems import DOUBLE_WELL_SYSTEM, FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 POINT = {"a": 0.7}
 MEMBERS = {
@@ -138,17 +138,11 @@ def test_a_failure_leaves_what_was_known_before_it(filter, system, observed, inp
 
 def test_where_no_particle_is_finite_the_state_is_unknown():
     # Steps of a steep cubic drift explode, long before the observation that fails.
-    steep = psf.StateSpaceModel(
-        transition=lambda x, q: [x[0] - 10.0 * x[0] ** 3 + q[0]],
-        process_noise=[[1.0]],
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.1]],
-        initial_mean=[1.0],
-        initial_cov=[[0.1]],
-    )
+    steep = {"alpha": 0.0, "beta": -1000.0, "sigma": 10.0}
+    steep |= {"noise_var": 0.1, "initial_mean": 1.0, "initial_var": 0.1}
     with pytest.warns(psf.FilterWarning, match="infinite or NaN"):
         found = psf.run_filter(
-            steep, psf.BootstrapPF(50), {}, [1.0, 1.0], steps=[0, 30], at="steps"
+            DOUBLE_WELL_SYSTEM, psf.BootstrapPF(50), steep, [1.0, 1.0], steps=[0, 30], at="steps"
         )
     assert not np.isfinite(found["particles"][29]).any()
     assert (found["weights"][29] == 0.0).all()

@@ -9,7 +9,7 @@ from scipy.stats import lognorm, norm
 
 import pymc_statespace_filters as psf
 from tests.evidence.targets import POSITIVE, REAL, Independent, Line, Target
-from tests.sampling.autoregression import autoregression, simulated
+from tests.systems import autoregression, simulated
 
 
 class StateSpace(Target):

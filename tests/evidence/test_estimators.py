@@ -74,21 +74,6 @@ def test_a_single_name_will_do(idata, model):
     assert name == "chib_jeliazkov"
 
 
-@pytest.mark.parametrize(
-    ("estimators", "message"),
-    [
-        ([], r"estimators must have at least one of \['chib_j.*got \[\]"),
-        (["bridge", "harmonic_mean"], r"names among \['chib_j.* objects, got 'harmonic_mean'"),
-        (3, "or Estimator objects, got 3"),
-        (["bridge", 3], "or Estimator objects, got 3"),
-        (["bridge", Bridge()], "must have different names, got 'bridge' more than once"),
-    ],
-)
-def test_unknown_estimators(idata, model, estimators, message):
-    with pytest.raises(ModelError, match=message):
-        psf.estimate_evidence(idata, model, estimators=estimators)
-
-
 class LaplaceFromDraws:
     """An estimator outside the package: a Gaussian with the moments of the draws."""
 

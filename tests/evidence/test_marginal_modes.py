@@ -98,18 +98,6 @@ def test_a_constant_is_its_own_mode():
     assert marginal_modes(idata(x=np.full((2, 50), 0.3))).loc["posterior", "x"] == 0.3
 
 
-@pytest.mark.parametrize("given", [{}, None, [idata(x=LEVELS)]])
-def test_bad_idatas(given):
-    with pytest.raises(ModelError, match="idatas must be a DataTree or a mapping"):
-        marginal_modes(given)
-
-
-@pytest.mark.parametrize("given", [3, az.from_dict({"prior": {"x": LEVELS}})])
-def test_an_entry_without_draws(given):
-    with pytest.raises(ModelError, match=r"idatas\['a'\] must be a DataTree with a group 'post"):
-        marginal_modes({"a": given})
-
-
 def test_draws_that_are_not_finite_have_no_mode():
     draws = np.where(LEVELS < 0.1, np.nan, LEVELS)
     found = marginal_modes(idata(x=draws, y=np.full((2, 50), np.inf), z=LEVELS)).loc["posterior"]

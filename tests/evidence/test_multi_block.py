@@ -263,11 +263,6 @@ class TestNumberOfBlocks:
         assert self.chosen(20, 500, 0.8) == 2
         assert self.chosen(31, 500, 0.8) == 4
 
-    @pytest.mark.parametrize("n_blocks", [0, 1.5, True])
-    def test_must_be_a_count(self, n_blocks):
-        with pytest.raises(ModelError, match="n_blocks must be an integer of at least 1, got"):
-            ChibJeliazkov(n_blocks=n_blocks)
-
     def test_must_not_exceed_the_parameters(self):
         rng = np.random.default_rng(32)
         with pytest.raises(ModelError, match="at most the number of parameters, 2, got 3"):

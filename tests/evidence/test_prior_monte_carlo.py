@@ -79,9 +79,3 @@ def test_a_likelihood_that_is_nowhere():
     )
     with pytest.raises(ModelError, match="likelihood is zero at all 10000 draws of the prior"):
         PriorMonteCarlo().estimate(posterior, rng=np.random.default_rng(79))
-
-
-@pytest.mark.parametrize("n_draws", [99, 1e4, None])
-def test_number_of_draws(n_draws):
-    with pytest.raises(ModelError, match="n_draws must be an integer of at least 100, got"):
-        PriorMonteCarlo(n_draws)

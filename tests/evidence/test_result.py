@@ -8,7 +8,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence import Evidence, chib_jeliazkov
 from pymc_statespace_filters.evidence.evidence import store_evidence, stored_evidences
 
@@ -62,11 +62,6 @@ def test_only_what_is_worth_saying_is_said():
     assert "Uniform priors of a, b have a log volume of 5.30" in TOLD.prior_note
     # A volume of one is a volume too.
     assert "log volume of 0.00" in replace(EVIDENCE, uniform="a").prior_note
-
-
-def test_log_volume_is_validated():
-    with pytest.raises(ModelError, match=r"log_volume must be a finite number, got inf"):
-        replace(EVIDENCE, log_volume=np.inf)
 
 
 def line(prior):

@@ -184,11 +184,6 @@ class TestWhatIsRefused:
         with pytest.raises(ModelError, match=r"widths must be positive, got \[0, 1\]"):
             curves_of({"line": Rival(2, 1)}, widths=[0, 1])
 
-    def test_widths_without_models(self):
-        for keywords in ({"widths": [1, 2]}, {"var_names": "w"}):
-            with pytest.raises(ModelError, match="models must be given with widths or var_names"):
-                prior_sensitivity(RIVALS, **keywords)
-
     def test_widths_without_draws(self):
         models = {"small": pm.Model(), "large": pm.Model()}
         for given in (RIVALS, compare_evidence(RIVALS)):
@@ -219,14 +214,6 @@ class TestWhatIsRefused:
             prior_sensitivity(table.drop(columns=["se", "prior"]))
         with pytest.raises(ModelError, match="estimator must not be given with a table"):
             prior_sensitivity(table, estimator="bridge")
-
-    def test_arguments_of_compare_evidence(self):
-        with pytest.raises(ModelError, match="ci_prob must"):
-            prior_sensitivity(RIVALS, ci_prob=95)
-        with pytest.raises(ModelError, match="prior must"):
-            prior_sensitivity(RIVALS, prior={"small": 1})
-        with pytest.raises(ModelError, match="evidences"):
-            prior_sensitivity({"a": 3.0})
 
 
 class Undetermined:

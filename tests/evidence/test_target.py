@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
@@ -175,16 +175,6 @@ class TestShared:
         normal_proposals(posterior, np.random.default_rng(109))
         assert posterior.shared
         assert not replace(posterior, draws=posterior.draws + 1).shared
-
-
-@pytest.mark.parametrize("target_se", [0, -0.1, np.nan, np.inf, "small", True, None])
-def test_a_wrong_target(target_se):
-    with pytest.raises(ModelError, match="target_se must be a positive number, got"):
-        psf.estimate_evidence(exact_draws((2, 100)), REGRESSION.model(), target_se=target_se)
-    if target_se is not None:
-        for make in (*WITH_TARGET.values(), PriorMonteCarlo):
-            with pytest.raises(ModelError, match="target_se must be a positive number, got"):
-                make(target_se=target_se)
 
 
 def test_an_estimator_keeps_its_own_target():

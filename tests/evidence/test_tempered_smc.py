@@ -266,17 +266,3 @@ def test_an_improper_prior_says_so_itself():
 
     with pytest.raises(ModelError, match="improper"):
         smc(replace(draws_of(bounded()), prior=Flat()))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"n_particles": 49}, "n_particles must be an integer of at least 50, got 49"),
-        ({"n_particles": 1e3}, "n_particles must be an integer of at least 50, got 1000.0"),
-        ({"n_runs": 6}, "n_runs must be an even integer of at least 8, got 6"),
-        ({"n_runs": 9}, "n_runs must be an even integer of at least 8, got 9"),
-    ],
-)
-def test_settings(settings, message):
-    with pytest.raises(ModelError, match=message):
-        TemperedSMC(**settings)

@@ -5,19 +5,26 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.enkf import EnKF
-from tests.filters.laws import OSCILLATOR, EnsembleFilterLaws, forecasts, log_gaussian, run
-from tests.filters.machines import kalman, linear_machine, scalar_record
+from tests.filters.ensemble_contract import (
+    LINE,
+    OSCILLATOR,
+    EnsembleFilterContract,
+    forecasts,
+    kalman,
+    log_gaussian,
+    run,
+)
+from tests.systems import linear_system
 
 
-class TestEnsembleLikelihood(EnsembleFilterLaws):
+class TestEnsembleLikelihood(EnsembleFilterContract):
     @pytest.fixture
     def filter_(self):
         return EnKF(200)
 
 
-class TestGaussianLikelihood(EnsembleFilterLaws):
+class TestGaussianLikelihood(EnsembleFilterContract):
     known_start_tolerance = 0.3  # the mean and variance of 200 simulated observations
 
     @pytest.fixture
@@ -25,12 +32,12 @@ class TestGaussianLikelihood(EnsembleFilterLaws):
         return EnKF(200, likelihood="gaussian")
 
 
-def numpy_enkf(machine, steps, observed, n_members, seed, likelihood):
+def numpy_enkf(system, steps, observed, n_members, seed, likelihood, free=slice(None)):
     """Eqs. 4.15-4.26, observed components only, in NumPy."""
-    _, _, H, R, _, _ = machine.matrices
+    H, R = system.C, system.R
     X, terms = None, []
     for (start, advance, noise), d in zip(
-        forecasts(machine, n_members, steps, seed), observed, strict=True
+        forecasts(system, n_members, steps, seed), observed, strict=True
     ):
         X = advance(start if X is None else X)
         seen = ~np.isnan(d)
@@ -39,7 +46,7 @@ def numpy_enkf(machine, steps, observed, n_members, seed, likelihood):
             continue
         D = (H @ X + noise)[seen]
         covariance = np.cov(np.concatenate([X, D]))
-        n = machine.n
+        n = len(X)
         P_xd, P_dd = covariance[:n, n:], covariance[n:, n:]
         if likelihood == "gaussian":
             terms.append(multivariate_normal(D.mean(axis=1), P_dd).logpdf(d[seen]))
@@ -47,17 +54,16 @@ def numpy_enkf(machine, steps, observed, n_members, seed, likelihood):
             log_p = log_gaussian((d[:, None] - H @ X)[seen], np.diag(R)[seen])
             terms.append(logsumexp(log_p) - np.log(n_members))
         nudge = P_xd @ np.linalg.solve(P_dd, d[seen][:, None] - D)
-        X[machine.free] += nudge[machine.free]
+        X[free] += nudge[free]
     return np.array(terms)
 
 
 @pytest.mark.parametrize("likelihood", ["ensemble", "gaussian"])
 def test_is_its_equations_written_in_numpy(likelihood):
-    machine, steps, observed = OSCILLATOR
     filter_ = EnKF(200, likelihood=likelihood)
     for seed in range(3):
-        expected = numpy_enkf(machine, steps, observed, 200, seed, likelihood)
-        terms, health = run(filter_, machine, steps, observed, seed=seed)
+        expected = numpy_enkf(*OSCILLATOR, 200, seed, likelihood)
+        terms, health = run(filter_, *OSCILLATOR, seed=seed)
         assert terms == pytest.approx(expected, rel=1e-10)
         assert health[1:].tolist() == [0, -1]
         # The mean of p(d | x_i) rests on fewer members than are alive, the Gaussian fit on all.
@@ -66,33 +72,20 @@ def test_is_its_equations_written_in_numpy(likelihood):
 
 @pytest.mark.parametrize("likelihood", ["ensemble", "gaussian"])
 def test_approaches_kalman(likelihood):
-    record = scalar_record()
-    exact = kalman(*record).sum()
+    exact = kalman(*LINE).sum()
     filter_ = EnKF(4000, likelihood=likelihood)
-    errors = np.array([run(filter_, *record, seed=s)[0].sum() - exact for s in range(60)])
+    errors = np.array([run(filter_, *LINE, seed=s)[0].sum() - exact for s in range(60)])
     # The bias is O(1/N), some 0.01; the mean of 60 errors has this standard error; 4 of them
     assert abs(errors.mean()) < 0.02 + 4 * errors.std() / np.sqrt(60)
     assert errors.std() < 0.2
 
 
 def test_carried_states_are_not_updated():
-    oscillator, steps, observed = OSCILLATOR
-    machine = linear_machine(*oscillator.matrices, free=[1])
-    expected = numpy_enkf(machine, steps, observed, 200, 0, "ensemble")
-    terms, _ = run(EnKF(200), machine, steps, observed)
+    system, steps, observed = OSCILLATOR
+    carried = linear_system(system, carried=("x0",))
+    expected = numpy_enkf(*OSCILLATOR, 200, 0, "ensemble", free=[1])
+    terms, _ = run(EnKF(200), carried, steps, observed)
     assert terms == pytest.approx(expected, rel=1e-10)
-
-
-@pytest.mark.parametrize("n_members", [1, 0, -3, 10.0, True, "10", None, np.float64(50)])
-def test_count_must_be_an_integer_of_at_least_two(n_members):
-    with pytest.raises(ModelError, match=r"n_members must be an integer from 2 to 1e.08, got"):
-        EnKF(n_members)
-
-
-@pytest.mark.parametrize("likelihood", ["Ensemble", "predictive", None, 3, ["ensemble"]])
-def test_unknown_likelihood_lists_the_known_ones(likelihood):
-    with pytest.raises(ModelError, match="likelihood must be one of 'ensemble', 'gaussian', got"):
-        EnKF(10, likelihood=likelihood)
 
 
 def test_settings_are_frozen_comparable_and_normalised():

@@ -25,11 +25,10 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.compiled import from_python
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
 from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import DOUBLE_WELL_SYSTEM, PAIR, PAIR_DATA, STEPS, double_well_parameters
 
 _choose_particles, _fill_intervals, _settlement = map(
     from_python, (_choose_particles, _fill_intervals, _settlement)

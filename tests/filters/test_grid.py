@@ -20,7 +20,6 @@ from pymc_statespace_filters.filters.outcomes import (
 )
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import (
     BROAD_DOUBLE_WELL,
     DOUBLE_WELL,
@@ -30,6 +29,7 @@ from tests.references.records import (
     double_well,
     double_well_with_surprises,
 )
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 STEPS = np.array([0, 1, 2, 5, 9, 30, 31, 40, 41, 100])
 
@@ -338,12 +338,6 @@ def test_in_a_model_it_is_a_deterministic_likelihood_for_dram():
     assert not noise_seeds(model)
     with pytest.raises(psf.GradientUnavailableError, match="does not come with a gradient"):
         model.compile_dlogp()
-
-
-@pytest.mark.parametrize("tolerance", [0.0, 0.1, -1e-8, np.nan, "1e-8", True])
-def test_tolerance_must_be_a_small_number(tolerance):
-    with pytest.raises(psf.ModelError, match="tolerance must be a number from 1e-12 to 1e-2, got"):
-        psf.GridFilter(tolerance=tolerance)
 
 
 def test_exact_means_smooth_equations_and_a_density_without_approximation():

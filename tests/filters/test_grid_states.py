@@ -13,7 +13,6 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.grid import PointMassFilter
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
@@ -26,8 +25,8 @@ from tests.references.records import (
     double_well,
     double_well_with_surprises,
 )
-from tests.small_systems import FORCE, FORCED, FORCED_DATA
-from tests.small_systems import STEPS as FORCED_STEPS
+from tests.systems import DOUBLE_WELL_SYSTEM, FORCE, FORCED, FORCED_DATA, double_well_parameters
+from tests.systems import STEPS as FORCED_STEPS
 
 MOMENTS = ("predicted", "filtered", "smoothed")
 

@@ -19,8 +19,7 @@ from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
 from pymc_statespace_filters.filters.kernel_density.points import Points
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.compiled import from_python
-from tests.filters.laws import OSCILLATOR, run
-from tests.filters.machines import scalar_record
+from tests.filters.ensemble_contract import LINE, OSCILLATOR, run
 from tests.filters.test_kernel_density import bandwidth, log_density
 from tests.filters.test_pf_enkf_page import numpy_pf_enkf
 
@@ -205,13 +204,13 @@ def test_the_method_is_reported():
 
 
 @pytest.mark.parametrize(
-    ("record", "resample_below"), [(scalar_record(), 0), (OSCILLATOR, 0.9)], ids=["line", "plane"]
+    ("record", "resample_below"), [(LINE, 0), (OSCILLATOR, 0.9)], ids=["line", "plane"]
 )
 def test_log_likelihood_of_the_filter_per_observation(record, resample_below):
     # NumPy's filter sums exactly; its ancestors are the same
     n_particles = 300
     filter_ = PFEnKF(n_particles, likelihood="weights", resample_below=resample_below)
-    assert density_method(record[0].n, n_particles) == "lattice"
+    assert density_method(len(record[0].A), n_particles) == "lattice"
     expected = numpy_pf_enkf(*record, n_particles, 0, "weights", resample_below)
     terms, _ = run(filter_, *record, seed=0)
     assert np.abs(terms - expected).max() < 1e-6

@@ -5,15 +5,9 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
-from tests.compiled import on_rank
-from tests.filters.truth_systems import (
-    DOUBLE_WELL_SYSTEM,
-    double_well_parameters,
-)
-from tests.ranks import on_ranks
+from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.records import (
     BROAD_DOUBLE_WELL,
     DOUBLE_WELL,
@@ -21,6 +15,10 @@ from tests.references.records import (
     broad_double_well,
     double_well,
     double_well_with_surprises,
+)
+from tests.systems import (
+    DOUBLE_WELL_SYSTEM,
+    double_well_parameters,
 )
 
 WELL = double_well_parameters(BROAD_DOUBLE_WELL)
@@ -33,24 +31,6 @@ def well_record(n=8):
 
 def log_likelihood(filter, record, given=WELL, seed=0):
     return psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, given, **record, seed=seed)
-
-
-@pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
-def test_is_the_same_to_the_bit_on_any_number_of_ranks(resampling):
-    filter = psf.GuidedPF(300, resample_below=0.9, resampling=resampling)
-    run = on_rank(filter.compile(compile_system(DOUBLE_WELL_SYSTEM)))
-    record = well_record()
-    theta = np.array([WELL[name] for name in DOUBLE_WELL_SYSTEM.parameters])
-    arguments = (theta, record["steps"], record["observed"][:, None], np.zeros((0, 0)), 0.0, 3)
-    (alone,) = on_ranks(1, lambda ours: run(*arguments, ours.rank, ours.size, ours.exchange))
-    for n_ranks in (2, 3, 4):
-        for terms, health in on_ranks(
-            n_ranks, lambda ours: run(*arguments, ours.rank, ours.size, ours.exchange)
-        ):
-            assert np.array_equal(terms, alone[0])
-            assert np.array_equal(health, alone[1])
-    by_seed = log_likelihood(filter, record, seed=3)
-    assert np.array_equal(by_seed, alone[0])
 
 
 def test_stored_normals_give_what_their_seed_gives_and_small_moves_little():
@@ -134,13 +114,10 @@ def test_carried_states_are_taken_from_the_reference():
         observation_noise=[[0.05]], initial_mean=[0.0, 1.0], initial_cov=np.diag([1.0, 0.0]),
         states=["x", "on"], carried=["on"],
     )  # fmt: skip
-    plain = psf.StateSpaceModel(
-        transition=lambda x, q: [0.9 * x[0] + q[0]], process_noise=[[0.2]],
-        observation=lambda x: [x[0]], observation_noise=[[0.05]], initial_mean=[0.0],
-        initial_cov=[[1.0]],
-    )  # fmt: skip
     record = {"observed": np.array([0.3, 2.5, 0.1]), "steps": np.array([0, 2, 5])}
-    exact = psf.log_likelihood(plain, psf.EKF(), {}, **record).sum()
+    exact = kalman_log_likelihood(
+        [[0.9]], [[0.2]], [[1.0]], [[0.05]], [0.0], [[1.0]], **record
+    ).sum()
     terms = psf.log_likelihood(switched, psf.GuidedPF(10), {}, **record, seed=np.arange(3))
     assert terms.sum(axis=1) == pytest.approx(exact, abs=1e-9)
 
@@ -152,9 +129,3 @@ def test_does_not_warn_where_it_is_right():
     with pytest.warns(psf.FilterWarning):
         log_likelihood(psf.BootstrapPF(500), record._asdict(), given)
     log_likelihood(psf.GuidedPF(500), record._asdict(), given)
-
-
-@pytest.mark.parametrize("n_particles", [1, 2.5, "10"])
-def test_wrong_numbers_of_particles_are_refused(n_particles):
-    with pytest.raises(psf.ModelError, match="n_particles must be an integer"):
-        psf.GuidedPF(n_particles)

@@ -14,7 +14,9 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.compiler.lowering.conditional_moments import conditional_moments
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
+from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.distributions import TABLE
+from tests.systems import counts
 
 
 def observed_by(*distributions):
@@ -51,25 +53,20 @@ def test_normal_distributions_are_gaussian_noise():
     by_distribution = observed_by(
         lambda x: pm.Normal.dist(mu=x, sigma=0.5), lambda x: pm.Normal.dist(mu=2.0 * x, sigma=1.5)
     )
-    by_function = psf.StateSpaceModel(
-        transition=lambda x, q: [0.9 * x[0] + q[0]],
-        process_noise=[[0.2]],
-        observation=lambda x: [x[0], 2.0 * x[0]],
-        observation_noise=np.diag([0.5**2, 1.5**2]),
-        initial_mean=[0.3],
-        initial_cov=[[0.8]],
-    )
     observed = np.array([[0.1, 0.4], [0.9, np.nan], [1.2, 1.6]])
     found = psf.log_likelihood(by_distribution, psf.IPLF(), {}, observed, steps=[0, 2, 3])
     observed[1] = np.nan
-    exact = psf.log_likelihood(by_function, psf.EKF(), {}, observed, steps=[0, 2, 3])
+    noise = np.diag([0.5**2, 1.5**2])
+    exact = kalman_log_likelihood(
+        [[0.9]], [[0.2]], [[1.0], [2.0]], noise, [0.3], [[0.8]], observed=observed, steps=[0, 2, 3]
+    )
     np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-15)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_the_likelihood_of_a_count_is_close_to_its_integral(count):
-    system = observed_by(lambda x: pm.Poisson.dist(mu=pt.exp(1.0 + x)))
-    found = psf.log_likelihood(system, psf.IPLF(), {}, [count], steps=[0])
+    system = counts(a=0.9, initial_mean=0.3, initial_var=0.8)
+    found = psf.log_likelihood(system, psf.IPLF(), {"level": 1.0}, [count], steps=[0])
 
     def density(x):
         return stats.poisson.pmf(count, np.exp(1.0 + x)) * stats.norm.pdf(x, 0.3, 0.8**0.5)
@@ -113,42 +110,41 @@ def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_missing_rows():
     assert value(theta)[1] == pytest.approx(0.0, abs=1e-14)
 
 
-COUNTER = psf.StateSpaceModel(
-    transition=psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.7]], dt=0.1),
-    observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
-    initial_mean=[0.0],
-    initial_cov=[[0.5]],
-)
 STEPS = np.arange(0, 300, 5)
-A, C = np.meshgrid(np.linspace(0.02, 3.0, 40), np.linspace(-0.7, 2.3, 25), indexing="ij")
+RATE, LEVEL = np.meshgrid(np.linspace(0.02, 3.0, 40), np.linspace(-0.7, 2.3, 25), indexing="ij")
+
+
+def decays(rate):
+    """Euler steps of 0.1 of dx = -rate x dt + 0.7 dW, as parameters of `counts`."""
+    return {"a": 1.0 - 0.1 * rate, "noise_var": 0.1 * 0.7**2}
 
 
 @pytest.fixture(scope="module")
-def counts():
-    """Sixty counts of mean 3, and mean and sd of the exact posterior of a and c."""
-    truth = {"a": 0.5, "c": 1.0}
-    record = psf.simulate(COUNTER, truth, steps=STEPS, random_seed=1)["observations"].values
-    terms = psf.log_likelihood(COUNTER, psf.GridFilter(), {"a": A, "c": C}, record, steps=STEPS)
-    density = terms.sum(axis=-1) - 0.5 * A**2 - 0.5 * (C / 2.0) ** 2
+def sixty_counts():
+    """Sixty counts of mean 3, and mean and sd of the exact posterior of their rate and level."""
+    truth = decays(0.5) | {"level": 1.0}
+    record = psf.simulate(counts(), truth, steps=STEPS, random_seed=1)["observations"].values
+    params = decays(RATE) | {"level": LEVEL}
+    terms = psf.log_likelihood(counts(), psf.GridFilter(), params, record, steps=STEPS)
+    density = terms.sum(axis=-1) - 0.5 * RATE**2 - 0.5 * (LEVEL / 2.0) ** 2
     weights = np.exp(density - density.max())
     weights /= weights.sum()
-    mean = np.array([(weights * v).sum() for v in (A, C)])
-    square = np.array([(weights * v**2).sum() for v in (A, C)])
+    mean = np.array([(weights * v).sum() for v in (RATE, LEVEL)])
+    square = np.array([(weights * v**2).sum() for v in (RATE, LEVEL)])
     return record, mean, np.sqrt(square - mean**2)
 
 
-def test_nuts_samples_the_posterior_of_counts(counts):
+def test_nuts_samples_the_posterior_of_counts(sixty_counts):
     """Means within a tenth of a posterior sd; the sampling error of 1600 draws is a third of it."""
-    record, mean, sd = counts
+    record, mean, sd = sixty_counts
     with pm.Model():
-        pm.HalfNormal("a", 1.0)
-        pm.Normal("c", 0.0, 2.0)
-        psf.StateSpace("d", COUNTER, psf.IPLF(), steps=STEPS, observed=record)
+        params = decays(pm.HalfNormal("rate", 1.0)) | {"level": pm.Normal("level", 0.0, 2.0)}
+        psf.StateSpace("d", counts(), psf.IPLF(), params=params, steps=STEPS, observed=record)
         idata = pm.sample(
             800, tune=500, chains=2, cores=1, random_seed=4, progressbar=False,
             compute_convergence_checks=False,
         )  # fmt: skip
-    draws = np.array([idata.posterior[name].values.ravel() for name in ("a", "c")])
+    draws = np.array([idata.posterior[name].values.ravel() for name in ("rate", "level")])
     assert (np.abs(draws.mean(axis=1) - mean) < 0.1 * sd).all(), (draws.mean(axis=1), mean, sd)
     np.testing.assert_allclose(draws.std(axis=1), sd, rtol=0.15)
 
@@ -156,7 +152,7 @@ def test_nuts_samples_the_posterior_of_counts(counts):
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()])
 def test_filters_of_gaussian_noise_name_the_one_for_distributions(filter):
     with pytest.raises(psf.ModelError, match=r"GuidedPF\(100\).*\(exact\) and by IPLF\(\)"):
-        psf.log_likelihood(COUNTER, filter, {"a": 1.0, "c": 1.0}, [3], steps=[0])
+        psf.log_likelihood(counts(), filter, {}, [3], steps=[0])
 
 
 def test_a_density_without_moments_is_refused():

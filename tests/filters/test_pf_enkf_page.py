@@ -7,22 +7,21 @@ from scipy.stats import multivariate_normal
 
 from pymc_statespace_filters.compiler.numerics.normals import uniform
 from pymc_statespace_filters.compiler.numerics.philox import RESAMPLING
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
-from tests.filters.laws import (
+from tests.filters.ensemble_contract import (
+    LINE,
     OSCILLATOR,
-    EnsembleFilterLaws,
+    EnsembleFilterContract,
     forecasts,
+    kalman,
+    linear,
     log_gaussian,
     normals,
     run,
 )
-from tests.filters.machines import kalman, linear_machine, scalar_record
-
-SCALAR = scalar_record()
 
 
-class TestPFEnKF(EnsembleFilterLaws):
+class TestPFEnKF(EnsembleFilterContract):
     @pytest.fixture
     def filter_(self):
         return PFEnKF(200)
@@ -39,12 +38,12 @@ def kernel_density(X, w, V):
     return logsumexp(log_k + np.log(w), axis=1)
 
 
-def numpy_pf_enkf(machine, steps, observed, N, seed, likelihood, resample_below):
+def numpy_pf_enkf(system, steps, observed, N, seed, likelihood, resample_below):
     """Eqs. 4.29-4.44 in NumPy, with systematic resampling."""
-    _, _, H, R, _, _ = machine.matrices
+    H, R = system.C, system.R
     X, terms, w, equal = None, [], np.full(N, 1 / N), np.full(N, 1 / N)
     for step, (start, advance, noise), d in zip(
-        steps, forecasts(machine, N, steps, seed), observed, strict=True
+        steps, forecasts(system, N, steps, seed), observed, strict=True
     ):
         X = advance(start if X is None else X)
         seen = ~np.isnan(d)
@@ -57,7 +56,7 @@ def numpy_pf_enkf(machine, steps, observed, N, seed, likelihood, resample_below)
 
         D = (H @ X + noise)[seen]
         covariance = np.cov(np.concatenate([X, D]), aweights=w)
-        n = machine.n
+        n = len(X)
         K = covariance[:n, n:] @ np.linalg.inv(covariance[n:, n:])
         X_a = X + K @ (d[seen][:, None] - D)
         factor = w if likelihood == "as_printed" else equal
@@ -93,65 +92,49 @@ def test_is_its_equations_written_in_numpy(likelihood, resample_below):
 
 
 def test_approaches_kalman():
-    record = SCALAR
-    exact = kalman(*record).sum()
+    exact = kalman(*LINE).sum()
     filter_ = PFEnKF(1000, likelihood="weights")
-    errors = np.array([run(filter_, *record, seed=s)[0].sum() - exact for s in range(40)])
+    errors = np.array([run(filter_, *LINE, seed=s)[0].sum() - exact for s in range(40)])
     # the kernel's smoothing leaves a bias of some hundredths; 4 standard errors of the mean
     assert abs(errors.mean()) < 0.05 + 4 * errors.std() / np.sqrt(40)
     assert errors.std() < 0.3
 
 
 def test_as_printed_is_too_high_by_tenths_of_a_nat_per_observation():
-    record = SCALAR
-    terms, _ = run(PFEnKF(1000, likelihood="as_printed"), *record)
+    terms, _ = run(PFEnKF(1000, likelihood="as_printed"), *LINE)
     n_observed = np.count_nonzero(terms)
-    assert 0.3 * n_observed < terms.sum() - kalman(*record).sum() < 1.5 * n_observed
+    assert 0.3 * n_observed < terms.sum() - kalman(*LINE).sum() < 1.5 * n_observed
 
 
 def test_without_any_spread_it_is_the_bootstrap_filter():
     # No noise and no spread at the start: all particles are one, and the proposal moves nothing
-    machine = linear_machine([[1.0]], [[0.0]], [[1.0]], [[0.5]], [2.0], [[0.0]])
+    system = linear([[1.0]], [[0.0]], [[1.0]], [[0.5]], [2.0], [[0.0]])
     steps, observed = np.arange(3), np.array([[1.5], [2.5], [2.0]])
-    exact = kalman(machine, steps, observed)
-    terms, health = run(PFEnKF(100, likelihood="weights"), machine, steps, observed)
+    exact = kalman(system, steps, observed)
+    terms, health = run(PFEnKF(100, likelihood="weights"), system, steps, observed)
     assert terms == pytest.approx(exact, rel=1e-10)
     assert health == pytest.approx([100, 0, -1])
 
 
 def test_a_state_known_exactly_does_not_spoil_the_densities():
-    machine, steps, observed = SCALAR
-    F, G, _, R, m0, L0 = machine.matrices
-    with_clock = linear_machine(
-        np.diag([F[0, 0], 1.0]), [[G[0, 0]], [0.0]], [[1.0, 0.0]], R,
-        [m0[0], 7.1], np.diag([L0[0, 0], 0.0]),
-    )  # fmt: skip
+    plain_system, steps, observed = LINE
+    with_clock = linear(
+        np.diag([0.9, 1.0]), [[0.5], [0.0]], [[1.0, 0.0]], [[0.3]], [1.0, 7.1], np.diag([0.7, 0.0])
+    )
     filter_ = PFEnKF(1000, likelihood="weights")
-    plain, _ = run(filter_, machine, steps, observed)
+    plain, _ = run(filter_, plain_system, steps, observed)
     clocked, _ = run(filter_, with_clock, steps, observed)
     assert clocked == pytest.approx(plain, rel=1e-9)
 
 
 def test_total_degeneracy_goes_on_with_bootstrap_weights():
     # A sensor of sd 1e-4 and 20 particles, never resampled: one particle has all the weight at once
-    machine = linear_machine([[1.0]], [[1.0]], [[1.0]], [[1e-8]], [0.0], [[1.0]])
+    system = linear([[1.0]], [[1.0]], [[1.0]], [[1e-8]], [0.0], [[1.0]])
     steps, observed = np.arange(6), np.linspace(0, 3, 6)[:, None]
-    terms, health = run(PFEnKF(20, resample_below=0), machine, steps, observed)
+    terms, health = run(PFEnKF(20, resample_below=0), system, steps, observed)
     assert np.all(np.isfinite(terms))
     assert 1 <= health[0] < 20
     assert health[1] == 0
-
-
-def test_unknown_names_list_the_known_ones():
-    names = "'predictive', 'weights', 'as_printed'"
-    with pytest.raises(ModelError, match=f"likelihood must be one of {names}, got 'ensemble'"):
-        PFEnKF(10, likelihood="ensemble")
-    with pytest.raises(ModelError, match="resampling must be one of"):
-        PFEnKF(10, resampling="residual")
-    with pytest.raises(ModelError, match="n_particles must be"):
-        PFEnKF(1)
-    with pytest.raises(ModelError, match="resample_below must be"):
-        PFEnKF(10, resample_below=2)
 
 
 def test_settings():

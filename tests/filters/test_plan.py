@@ -2,6 +2,7 @@
 
 import ctypes
 import mmap
+from copy import copy
 
 import numpy as np
 import pytest
@@ -33,8 +34,7 @@ from pymc_statespace_filters.filters.plan import (
     read_system,
     settings_of,
 )
-from tests.filters.machines import oscillator_machine
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS, pair
 
 FUNCTIONS = ("initialise", "propagate", "observe", "log_density")
 RECORD_ARGUMENTS = (("theta", 1), ("steps", 1), ("observed", 2), ("inputs", 2), ("t0", 0))
@@ -67,16 +67,16 @@ def test_slots_are_distinct_and_without_gaps():
 
 def test_what_is_packed_is_read_under_its_own_name():
     """Sizes that all differ, and the address of every function."""
-    machine = oscillator_machine()
-    machine.n, machine.p, machine.n_inputs, machine.n_theta = 2, 3, 5, 4
-    machine.free = np.array([1])
-    plan = make_plan(machine, plan_entry(_read, "read", None), FUNCTIONS, (0.125, 8.0))
+    system = copy(compile_system(PAIR))
+    system.n, system.p, system.n_inputs, system.n_theta = 2, 3, 5, 4
+    system.free, n_constants = np.array([1]), system.n_constants
+    plan = make_plan(system, plan_entry(_read, "read"), FUNCTIONS, (0.125, 8.0))
     read = PlannedFunction(plan, RECORD_ARGUMENTS, (("normals", 1),))
     steps, observed = np.array([1, 4]), np.zeros((2, 3))
     seen = read(np.full(4, 7.0), steps, observed, np.zeros((6, 5)), 0.75)
-    addresses = [entry_point(machine, name).address for name in FUNCTIONS]
+    addresses = [entry_point(system, name).address for name in FUNCTIONS]
     assert seen.tolist() == [
-        2, 3, 4, 1, 6, 5, *addresses, 0, 1, machine.dt, 7.0, 1, 2, 0.125, 8.0, 0.75, 4,
+        2, 3, 4, n_constants, 6, 5, *addresses, 0, 1, system.dt, 7.0, 1, 2, 0.125, 8.0, 0.75, 4,
     ]  # fmt: skip
 
 
@@ -94,6 +94,15 @@ def words_of_plan():
     first = np.ctypeslib.as_array((ctypes.c_int64 * N_HEADER).from_address(plan.address))
     size = int(first[HEADER.n_words])
     return np.array((ctypes.c_int64 * size).from_address(plan.address), np.int64)
+
+
+def test_plans_of_equal_code_are_the_same_words():
+    """The words of the first one must not be freed when a second one is made."""
+    filter = psf.BootstrapPF(20)
+    plans = [filter.compile(compile_system(PAIR)).plan for _ in range(2)]
+    plans.append(filter.compile(compile_system(pair())).plan)
+    assert len({plan.address for plan in plans}) == 1
+    assert len({id(plan) for plan in plans}) > 1
 
 
 def test_a_damaged_plan_is_refused():
@@ -177,11 +186,11 @@ def test_swapped_arguments_of_an_entry_point_are_an_error():
         pass
 
     arguments = {"steps": I64_PTR, "rows": F64_PTR, "t0": types.float64}
-    EntryPoint(function, arguments, "function", None)
+    EntryPoint(function, arguments, "function")
     swapped = {"rows": F64_PTR, "steps": I64_PTR, "t0": types.float64}
     message = (
         r"arguments of entry point 'function' must be \['steps', 'rows', 't0'\], the parameters of "
         r"its function, got \['rows', 'steps', 't0'\]"
     )
     with pytest.raises(TypeError, match=message):
-        EntryPoint(function, swapped, "function", None)
+        EntryPoint(function, swapped, "function")

@@ -14,7 +14,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters.outcomes import FAILURES
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM
+from tests.systems import DOUBLE_WELL_SYSTEM
 
 pytestmark = pytest.mark.slow
 

@@ -14,12 +14,6 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.convergence import Law, measure, violations
-from tests.filters.truth_systems import (
-    DOUBLE_WELL_SYSTEM,
-    double_well_parameters,
-    linear_system,
-    log_likelihoods,
-)
 from tests.references import faulty_filters
 from tests.references.faulty_filters import Fault
 from tests.references.records import (
@@ -27,6 +21,12 @@ from tests.references.records import (
     OSCILLATOR,
     broad_double_well,
     oscillator_with_gaps,
+)
+from tests.systems import (
+    DOUBLE_WELL_SYSTEM,
+    double_well_parameters,
+    linear_system,
+    log_likelihoods,
 )
 
 # Monte Carlo errors fall as N^(-1/2). The kernel densities of a PF-EnKF have a bias of the square

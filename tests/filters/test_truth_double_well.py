@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters, log_likelihoods
 from tests.references.records import (
     DOUBLE_WELL,
     PRECISE_DOUBLE_WELL,
@@ -15,6 +14,7 @@ from tests.references.records import (
     double_well,
     double_well_with_surprises,
 )
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters, log_likelihoods
 
 
 def of_double_well(filter, reference, record, n_seeds):

@@ -9,11 +9,6 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.filters.truth_systems import (
-    DOUBLE_WELL_SYSTEM,
-    double_well_parameters,
-    linear_system,
-)
 from tests.references import scan_oracle
 from tests.references.records import (
     OSCILLATOR,
@@ -21,6 +16,12 @@ from tests.references.records import (
     LinearSystem,
     double_well,
     oscillator_with_gaps,
+)
+from tests.systems import (
+    DOUBLE_WELL_SYSTEM,
+    DUFFING,
+    double_well_parameters,
+    linear_system,
 )
 
 SCALAR = LinearSystem(
@@ -112,19 +113,8 @@ def test_ekf_is_the_kalman_filter_with_inputs_and_euler_substeps():
 
 
 def duffing_case():
-    """A Duffing oscillator, its oracle and point: parameters and gaps wherever there can be."""
+    """An oracle of DUFFING and a point: parameters and gaps wherever there can be."""
     steps, observed = oscillator_with_gaps()
-    system = psf.StateSpaceModel(
-        transition=psf.EulerMaruyama(
-            lambda x, k, c: [x[1], -k * x[0] - x[0] ** 3 - c * x[1]],
-            lambda s: [[0.0], [s]],
-            dt=0.1,
-        ),
-        observation=lambda x, b: [x[0] + b * x[0] ** 2, x[1]],
-        observation_noise=lambda r: [[r, 0.06], [0.06, 0.4]],
-        initial_mean=lambda m: [m, 0.0],
-        initial_cov=lambda v: [[v, 0.1], [0.1, 2.0 * v]],
-    )
     point = {"k": 1.3, "c": 0.4, "s": 0.7, "b": 0.2, "r": 0.3, "m": 0.5, "v": 0.5}
     k, c, s, b, r, m, v = symbols = [pt.dscalar(name) for name in point]
 
@@ -137,11 +127,11 @@ def duffing_case():
         process_cov=pt.diag(pt.stack([0.0, 0.1 * s**2])),
         observation_cov=pt.stack([pt.stack([r, 0.06]), pt.as_tensor([0.06, 0.4])]),
         initial_mean=pt.stack([m, 0.0]),
-        initial_cov=pt.stack([pt.stack([v, 0.1]), pt.stack([0.1, 2.0 * v])]),
+        initial_cov=pt.stack([pt.stack([v, 0.2 * v]), pt.stack([0.2 * v, 2.0 * v])]),
         steps=steps,
         observed=observed,
     )
-    return system, steps, observed, point, oracle, symbols
+    return steps, observed, point, oracle, symbols
 
 
 def test_gradient_of_one_state_is_that_of_an_independent_scan():
@@ -175,11 +165,11 @@ def test_gradient_of_one_state_is_that_of_an_independent_scan():
 
 
 def test_gradient_in_a_pymc_model_is_that_of_an_independent_scan():
-    system, steps, observed, point, oracle, symbols = duffing_case()
+    steps, observed, point, oracle, symbols = duffing_case()
     with pm.Model() as model:
         for name in point:
             pm.Flat(name)  # no density of its own: the model's gradient is the likelihood's
-        psf.StateSpace("d", system, psf.EKF(), steps=steps, observed=observed)
+        psf.StateSpace("d", DUFFING, psf.EKF(), steps=steps, observed=observed)
     # Together, as in a sampler: alone each would be compiled with a forward pass of its own.
     both = model.compile_fn([model.logp(), model.dlogp()])
 

@@ -7,12 +7,6 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.filters.truth_systems import (
-    DOUBLE_WELL_SYSTEM,
-    double_well_parameters,
-    linear_system,
-    log_likelihoods,
-)
 from tests.references.records import (
     BROAD_DOUBLE_WELL,
     OSCILLATOR,
@@ -22,6 +16,13 @@ from tests.references.records import (
     double_well_with_surprises,
     oscillator_with_gaps,
     simulate,
+)
+from tests.systems import (
+    DOUBLE_WELL_SYSTEM,
+    counts,
+    double_well_parameters,
+    linear_system,
+    log_likelihoods,
 )
 
 N_SEEDS = 20_000
@@ -107,18 +108,10 @@ def double_well_case():
     return DOUBLE_WELL_SYSTEM, given, {"observed": observed, "steps": steps}, None
 
 
-COUNTS = psf.StateSpaceModel(
-    transition=lambda x, q: [0.9 * x[0] + 0.2 * pt.sin(x[0]) + q[0]],
-    process_noise=[[0.3]],
-    observation_dist=lambda x: [pm.Poisson.dist(pt.exp(x[0]))],
-    initial_mean=[0.0],
-    initial_cov=[[1.0]],
-)
-
-
 def counts_case():
     observed = np.array([0.0, 3.0, 9.0, np.nan, 2.0, 0.0, 0.0, 14.0])
-    return COUNTS, {}, {"observed": observed, "steps": np.arange(8)}, None
+    system = counts(a=0.9, bend=0.2, noise_var=0.3, initial_var=1.0)
+    return system, {}, {"observed": observed, "steps": np.arange(8)}, None
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import PRECISE_DOUBLE_WELL, SURPRISES, double_well_with_surprises
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 
 def test_bootstrap_filter_falls_far_below_the_truth_and_warns_once():

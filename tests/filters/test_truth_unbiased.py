@@ -5,8 +5,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.filters.truth_systems import linear_system, log_likelihoods
 from tests.references.records import OSCILLATOR, oscillator_with_gaps
+from tests.systems import linear_system, log_likelihoods
 
 N_SEEDS = 20_000
 N_OBSERVATIONS = 9  # with gaps in both components, and one row wholly missing

@@ -5,7 +5,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from tests.mpi.launch import on_ranks
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 FILTERS = (
     psf.EnKF(300),

@@ -17,7 +17,7 @@ from pymc_statespace_filters.compiler.codegen.simd import LANES
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.batch import BatchLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))
 rng = np.random.default_rng(1)

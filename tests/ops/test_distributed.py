@@ -12,7 +12,7 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.graph_rewrites import with_likelihood_callback
 from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from tests.pymc_model.test_inspection import ENSEMBLE, FEW, filters_in, twins, two_systems
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
+from tests.systems import FORCE, FORCED, FORCED_DATA, STEPS
 
 OP = LogLikelihood(FORCED, ENSEMBLE)
 RECORD = (STEPS, FORCED_DATA.reshape(-1, 1), FORCE.reshape(-1, 1), 0.5, 7)

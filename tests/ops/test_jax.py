@@ -12,7 +12,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, FREE, PAIR, PAIR_DATA, STEPS, pair_terms
+from tests.systems import FORCE, FORCED, FORCED_DATA, FREE, PAIR, PAIR_DATA, STEPS, pair_terms
 
 jax = pytest.importorskip("jax")
 # Not before the line above. PyMC sets the number of JAX's devices here, before JAX counts them.
@@ -319,7 +319,7 @@ def test_jax_is_imported_only_for_graphs_that_are_compiled_with_it():
 import sys
 import numpy as np, pymc as pm, pytensor
 import pymc_statespace_filters as psf
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 with pytensor.config.change_flags(mode="FAST_COMPILE"), pm.Model() as model:
     pm.Normal("a")
     psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)

@@ -11,7 +11,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.many_points import gradients, values
 from pymc_statespace_filters.ops.panel import PanelLogLikelihood
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, pair_terms
+from tests.systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, pair_terms
 
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))
 rng = np.random.default_rng(1)

@@ -17,7 +17,7 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.base import cache_key, evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
-from tests.small_systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
+from tests.systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
 
 PF = psf.BootstrapPF(20)
 NOISY = [psf.EnKF(20), PF, psf.PFEnKF(20)]

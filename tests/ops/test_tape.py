@@ -16,7 +16,7 @@ from pymc_statespace_filters.ops.likelihood import (
     TapedLogLikelihood,
     TapePullback,
 )
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 THETA = np.array([0.6, 0.2])
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))

@@ -13,7 +13,7 @@ import os, sys
 import numpy as np
 import pymc as pm
 import pymc_statespace_filters as psf
-from tests.small_systems import FREE
+from tests.systems import FREE
 
 record = {"steps": range(1, 21), "observed": np.sin(np.arange(20.0))}
 with pm.Model():

@@ -12,7 +12,7 @@ from benchmarks.posteriors import HARDENING, narrow
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.factors import ModelFactors
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.sampling.autoregression import autoregression, simulated
+from tests.systems import autoregression, simulated
 
 STEPS = np.arange(1, 81)
 
@@ -97,7 +97,7 @@ class TestAutoregression:
         with pm.Model() as model:
             pm.Uniform("phi", 0.0, 1.0)
             pm.HalfNormal("spread", 1.0)
-            system = autoregression(observation_noise=[[0.2]])
+            system = autoregression(observation_noise=0.2)
             psf.StateSpace("d", system, filter, steps=STEPS, observed=self.observed)
         return model
 

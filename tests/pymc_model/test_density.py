@@ -17,7 +17,7 @@ from pymc_statespace_filters.pymc_model import compilation
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.interrupts import interrupt_in
-from tests.sampling.autoregression import autoregression
+from tests.systems import autoregression
 
 DATA = np.array([0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1])
 
@@ -26,7 +26,7 @@ def model_of(*filters):
     with pm.Model() as model:
         phi = pm.Normal("phi", 0.5, 0.3, shape=2)
         for i, filter in enumerate(filters):
-            system = autoregression(process_noise=[[0.5]])
+            system = autoregression(spread=0.5**0.5)
             psf.StateSpace(
                 f"d{i}",
                 system,
@@ -65,7 +65,7 @@ def test_many_parameters_without_a_compiler_of_c():
         rates = [pm.LogNormal(f"rate_{i}") for i in range(16)]
         psf.StateSpace(
             "d",
-            autoregression(process_noise=[[0.5]]),
+            autoregression(spread=0.5**0.5),
             psf.EKF(),
             params={"phi": 1 / (1 + sum(rates))},
             steps=range(1, 9),

@@ -9,18 +9,20 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from tests.sampling.autoregression import autoregression
-from tests.small_systems import (
+from tests.systems import (
     FORCE,
     FORCED,
     FORCED_DATA,
     PAIR,
     PAIR_DATA,
     STEPS,
+    autoregression,
     forced,
     forced_terms,
     pair_terms,
 )
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 ENKF = psf.EnKF(20)
 

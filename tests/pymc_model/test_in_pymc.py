@@ -13,7 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.pymc_model.distribution import StateSpace
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
-from tests.small_systems import (
+from tests.systems import (
     FORCE,
     FORCED,
     PAIR,

@@ -16,7 +16,9 @@ from pymc_statespace_filters.pymc_model.inspection import (
     noisy_filters,
     resized,
 )
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 EKF, FEW, ENSEMBLE = psf.EKF(), psf.BootstrapPF(30, resample_below=0.7), psf.EnKF(20)
 

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, FREE, STEPS, forced_terms
+from tests.systems import FORCE, FORCED, FORCED_DATA, FREE, STEPS, forced_terms
 from tests.test_readme import run_code_of
 
 jax = pytest.importorskip("jax")

@@ -16,7 +16,9 @@ from pymc_statespace_filters.evidence.posterior.observed_data import (
 )
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
 from pymc_statespace_filters.system.panel_records import records_of
-from tests.small_systems import FORCE, FORCED, forced_terms
+from tests.systems import FORCE, FORCED, forced_terms
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 LABELS = np.array(["b", "b", "b", "a", "c", "c"])
 STEPS = np.array([0, 2, 5, 3, 1, 4])

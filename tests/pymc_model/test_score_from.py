@@ -12,7 +12,9 @@ from pymc_statespace_filters.evidence.posterior.observed_data import (
     observation_count,
     scalar_count,
 )
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS, forced_terms
+from tests.systems import FORCE, FORCED, FORCED_DATA, STEPS, forced_terms
+
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 # Row 2 is missing.
 A = 0.6

@@ -19,7 +19,7 @@ class Record(NamedTuple):
     observed: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearSystem:
     """x' = A x + B q, q ~ N(0, I); d = C x + e, e ~ N(0, R); x_0 ~ N(mean, cov)."""
 

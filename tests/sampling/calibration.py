@@ -32,10 +32,10 @@ from pymc_statespace_filters.sampling.target.log_density import screening_densit
 from pymc_statespace_filters.sampling.target.record_target import target_of
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
-from tests.sampling.autoregression import autoregression
 from tests.sampling.rank_uniformity import chi_square_p, ecdf_p
+from tests.systems import autoregression
 
-LINEAR = autoregression(observation_noise=[[0.5]])
+LINEAR = autoregression(observation_noise=0.5)
 
 TUNE = 1000
 N_KEPT = 63

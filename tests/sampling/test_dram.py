@@ -278,43 +278,6 @@ def test_live_columns():
         assert field in first
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"stages": 0}, r"stages must be .* got 0$"),
-        ({"stages": (2, 1, 1)}, r"stages must be .* got \(2, 1, 1\)"),
-        ({"stages": 1.5}, r"stages must be .* got 1\.5"),
-        ({"stages": True}, r"stages must be .* got True"),
-        ({"stage_scale": 0.0}, r"stage_scale must be a positive number, got 0\.0"),
-        ({"stage_scale": np.nan}, r"stage_scale must be .* got nan"),
-        (
-            {"adaptation": "haario"},
-            r"adaptation must be one of 'chain', 'continuous', got 'haario'",
-        ),
-        ({"adapt_every": 2}, r"adapt_every must be an integer of at least 4, got 2"),
-        ({"adapt_every": 50.0}, r"adapt_every must be .* got 50\.0"),
-        ({"refresh_noise": "yes"}, r"refresh_noise must be True or False, got 'yes'"),
-        ({"proposal_cov": np.eye(3)}, r"proposal_cov must be .* 2 x 2 matrix, got shape \(3, 3\)"),
-        (
-            {"proposal_cov": [[1.0, 0.5], [0.0, 1.0]]},
-            r"proposal_cov must be a symmetric .* got \[\[",
-        ),
-        (
-            {"proposal_cov": [[1.0, 2.0], [2.0, 1.0]]},
-            r"proposal_cov must be .* positive definite .* got \[\[",
-        ),
-        (
-            {"proposal_cov": [[1.0, np.nan], [np.nan, 1.0]]},
-            r"proposal_cov must be .* positive definite .* got \[\[",
-        ),
-        ({"proposal_cov": "wide"}, r"proposal_cov must be .* got 'wide'"),
-    ],
-)
-def test_bad_settings(settings, message):
-    with simple_model(), pytest.raises(ModelError, match=message):
-        DRAM(**settings)
-
-
 def test_discrete_variables_are_refused():
     with pm.Model():
         pm.Normal("a")

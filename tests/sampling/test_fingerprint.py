@@ -20,7 +20,7 @@ from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
     model_fingerprint,
 )
 from pymc_statespace_filters.system.graph_digest import describe
-from tests.small_systems import PAIR_DATA, STEPS, pair
+from tests.systems import PAIR_DATA, STEPS, pair
 
 X, Y = np.array([0.5, 1.0, -0.3]), np.array([1.0, 2.5, -0.5])
 

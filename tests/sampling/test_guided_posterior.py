@@ -10,8 +10,8 @@ from scipy.special import logsumexp
 from scipy.stats import lognorm, norm
 
 import pymc_statespace_filters as psf
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import DOUBLE_WELL, double_well
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 ALPHA, STEEPNESS, SIGMA = norm(4.0, 2.0), lognorm(0.5, scale=4.0), lognorm(0.5, scale=0.6)
 FREE = ("alpha", "steepness", "sigma")

@@ -16,6 +16,7 @@ from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, cl
 from pymc_statespace_filters.sampling.target.target import Growth
 from tests.sampling.test_dram import nan_beyond, sample, simple_model
 from tests.sampling.test_sample_dram import sample_dram, state_space_model
+from tests.systems import autoregression
 
 LOGGER = "pymc.stats.convergence"
 
@@ -29,17 +30,12 @@ def runaway():
 
 def collapsing():
     """Three observations far from where the particles are, and a parameter of no consequence."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q: 0.5 * x[0] + q[0],
-        process_noise=1.0,
-        observation=lambda x: x[0],
-        observation_noise=1e-4,
-        initial_mean=lambda m: 1e-9 * m,
-        initial_cov=1.0,
-    )
     with pm.Model() as model:
-        pm.Normal("m")
-        psf.StateSpace("d", system, psf.BootstrapPF(20), steps=[1, 2, 3], observed=[3.0, -3, 3])
+        params = {"phi": 0.5, "initial_mean": 1e-9 * pm.Normal("m")}
+        psf.StateSpace(
+            "d", autoregression(spread=1.0, observation_noise=1e-4), psf.BootstrapPF(20),
+            params=params, steps=[1, 2, 3], observed=[3.0, -3, 3],
+        )  # fmt: skip
     return model
 
 

@@ -13,9 +13,9 @@ from pymc_statespace_filters.sampling.kernel.state import STAGE
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
-from tests.sampling.autoregression import autoregression
 from tests.sampling.test_state_space import DATA as RECORD
 from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
+from tests.systems import autoregression, counts
 
 FEW = psf.BootstrapPF(30)
 
@@ -78,61 +78,10 @@ class TestRefusals:
     """What cannot be right, or cannot be computed, is refused alike by both entry points."""
 
     @pytest.mark.parametrize("entry", [psf.DRAM, psf.sample_dram])
-    @pytest.mark.parametrize(
-        ("settings", "message"),
-        [
-            ({"correlation": 0.9}, r"stages must be 1 with correlation=0\.9, got \(2, 1\).*cancel"),
-            ({"correlation": 0.9, "stages": 2}, r"stages must be 1 .* got \(2, 2\)"),
-            (
-                {"correlation": 0.9, "stages": 1, "screen": psf.EnKF(20)},
-                r"screen must be a filter without noise with correlation=0\.9, got EnKF",
-            ),
-            (
-                {"correlation": 0.9, "stages": 1, "refresh_noise": False},
-                r"refresh_noise must be True with correlation=0\.9, got False",
-            ),
-            ({"correlation": False}, r"correlation must be .* got False"),
-            (
-                {"correlation": 1.0, "stages": 1},
-                r"correlation must be a number between 0 and 1, or None, got 1\.0",
-            ),
-            ({"correlation": -0.1, "stages": 1}, r"correlation must be .* got -0\.1"),
-            ({"correlation": np.nan, "stages": 1}, r"correlation must be .* got nan"),
-            ({"correlation": True, "stages": 1}, r"correlation must be .* got True"),
-            (
-                {"screen": "EKF"},
-                r"screen must be a filter such as psf\.EKF\(\), or None, got 'EKF'",
-            ),
-            ({"screen": psf.EKF}, r"screen must be a filter .* got <class .*EKF'>"),
-            (
-                {"screen": "EKF", "correlation": 0.9, "stages": 1},
-                r"screen must be a filter .* got 'EKF'",
-            ),
-            (
-                {"screen": psf.EKF(), "screen_power": 0},
-                r"screen_power must be a number in \(0, 1\], got 0",
-            ),
-            ({"screen": psf.EKF(), "screen_power": 2}, r"screen_power must be .* got 2"),
-            ({"screen": psf.EKF(), "screen_power": np.nan}, r"screen_power must be .* got nan"),
-        ],
-    )
-    def test_settings(self, entry, settings, message):
-        with linear_model(FEW), pytest.raises(ModelError, match=message) as caught:
-            entry(**settings)
-        assert isinstance(caught.value, ValueError)
-
-    @pytest.mark.parametrize("entry", [psf.DRAM, psf.sample_dram])
     def test_a_screen_that_cannot_treat_the_system(self, entry):
-        counts = psf.StateSpaceModel(
-            transition=lambda x, q, phi: [phi * x[0] + q[0]],
-            process_noise=[[0.1]],
-            observation_dist=lambda x: [pm.Poisson.dist(mu=pt.exp(x[0]))],
-            initial_mean=[0.0],
-            initial_cov=[[1.0]],
-        )
         with pm.Model():
-            pm.Normal("phi")
-            psf.StateSpace("d", counts, FEW, steps=[1, 2], observed=[1, 0])
+            pm.Normal("level")
+            psf.StateSpace("d", counts(), FEW, steps=[1, 2], observed=[1, 0])
             with pytest.raises(ModelError, match=r"screen=EKF\(\): EKF needs .*Gaussian noise"):
                 entry(screen=psf.EKF())
 
@@ -153,7 +102,7 @@ def kinked(x, q, phi):
 
 
 def kinked_model():
-    system = autoregression(transition=kinked, process_noise=[[0.5]])
+    system = autoregression(transition=kinked, spread=0.5**0.5)
     with pm.Model() as model:
         pm.Normal("phi", 0.5, 0.5)
         psf.StateSpace("d", system, FEW, steps=STEPS, observed=RECORD)
@@ -216,7 +165,7 @@ def brittle(x, q, phi, narrow):
 
 def test_a_screen_that_fails_where_another_step_moved():
     """DRAM waits there; what it notes down is the density of the target."""
-    system = autoregression(transition=brittle, process_noise=[[0.5]])
+    system = autoregression(transition=brittle, spread=0.5**0.5)
     with pm.Model() as model:
         phi, narrow = pm.Normal("phi", 0.5, 0.5), pm.Normal("narrow", 0.5, 0.3)
         psf.StateSpace("d", system, psf.EKF(), steps=[1], observed=[[0.4]])

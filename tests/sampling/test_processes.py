@@ -17,7 +17,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from tests.small_systems import FREE
+from tests.systems import FREE
 
 pytestmark = pytest.mark.slow
 

@@ -15,8 +15,8 @@ from pymc_statespace_filters.sampling.output import deterministics
 from pymc_statespace_filters.sampling.output.datatree import to_datatree
 from pymc_statespace_filters.sampling.output.deterministics import BLOCK, Deterministics
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
-from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import sample
+from tests.systems import autoregression
 
 TUNE, DRAWS = 30, 40
 
@@ -307,7 +307,7 @@ def test_one_by_one_with_and_without_machine_code(monkeypatch):
 @pytest.fixture(scope="module")
 def state_space():
     """Two records, one quantity computed from a likelihood, and a tree of some draws."""
-    system = autoregression(process_noise=[[0.5]])
+    system = autoregression(spread=0.5**0.5)
     steps = np.arange(1, 9)
     data = np.array([[0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1]]).T
     with pm.Model() as model:

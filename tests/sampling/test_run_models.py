@@ -13,7 +13,7 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.sampling.run import model_task
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import SamplingRequest
@@ -190,33 +190,3 @@ def test_an_error_names_chain_and_model(models):
     assert re.fullmatch(
         r"in chain \d of model 'broken', after \d+ iterations", caught.value.__notes__[-1]
     )
-
-
-@pytest.mark.parametrize(
-    ("models", "message"),
-    [
-        ([normal_model()], "models must be a non-empty mapping"),
-        ({}, r"models must be a non-empty mapping .* got \{\}"),
-        ({1: normal_model()}, "names of models must be .* got 1"),
-        ({"": normal_model()}, "names of models must be .* got ''"),
-        ({"a": "b"}, r"models\['a'\] must be a pymc.Model, got 'b'"),
-    ],
-)
-def test_bad_models(models, message):
-    with pytest.raises(ModelError, match=message):
-        psf.run_models(models)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"gather": "some"}, "gather must be .* got 'some'"),
-        ({"ranks_per_chain": 0}, "ranks_per_chain must be .* got 0"),
-        ({"ranks_per_chain": 2}, "ranks_per_chain=2 needs comm"),
-        ({"cores": 0}, "cores must be .* got 0"),
-        ({"draws": -1}, "draws must be .* got -1"),
-    ],
-)
-def test_bad_settings(settings, message):
-    with pytest.raises(ModelError, match=message):
-        psf.run_models({"a": normal_model()}, **settings)

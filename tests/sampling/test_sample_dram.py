@@ -23,9 +23,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.output.report import left_out_warnings
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
-from tests.sampling.autoregression import autoregression
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
+from tests.systems import autoregression
 
 LOGGER = "pymc.stats.convergence"
 
@@ -42,7 +42,7 @@ def sample_dram(model, **changes):
     return psf.sample_dram(model=model, **settings | changes)
 
 
-SYSTEM = autoregression(process_noise=[[0.5]])
+SYSTEM = autoregression(spread=0.5**0.5)
 STEPS = np.arange(1, 9)
 DATA = np.array([[0.3, 0.5, -0.1, 0.4, 0.9, 0.2, -0.3, 0.1]]).T
 
@@ -195,48 +195,6 @@ def test_stored_estimates_are_those_of_their_seeds(noisy):
 
 
 # What cannot be sampled.
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"draws": -1}, ModelError, r"draws must be an integer of at least 0, got -1"),
-        ({"tune": 1.5}, ModelError, r"tune must be .* got 1\.5"),
-        ({"draws": 0}, ModelError, r"got draws=0, tune=200, discard_tuned_samples=True"),
-        ({"draws": 0, "tune": 0, "discard_tuned_samples": False}, ModelError, r"draws=0, tune=0"),
-        ({"chains": 0}, ModelError, r"chains must be an integer of at least 1, got 0"),
-        ({"cores": 0}, ModelError, r"cores must be None or an integer of at least 1, got 0"),
-        ({"random_seed": -1}, ModelError, r"random_seed must be .* got -1"),
-        (
-            {"random_seed": [1, 2]},
-            ModelError,
-            r"random_seed must be None, a non-neg.* got \[1, 2\]",
-        ),
-        (
-            {"initvals": [{"mu": 1.0}]},
-            ModelError,
-            r"initvals must have one entry for each chain, got 1 for chains=2",
-        ),
-        ({"initvals": "prior"}, ModelError, r"initvals must be None, a mapping .* got 'prior'"),
-        (
-            {"initvals": {"nu": 1.0}},
-            ModelError,
-            r"initvals must name free variables of the model, mu, sigma, got 'nu'",
-        ),
-        ({"initvals": {"mu": [1.0, 2.0]}}, ModelError, r"'mu' must have shape \(\), got \(2,\)"),
-        ({"initvals": {"mu": "x"}}, ModelError, r"'mu' must be numbers, .* got 'x'"),
-        ({"initvals": {"sigma": -1.0}}, ModelError, r"not finite at the start, \[0\.0, nan\]"),
-        ({"progressbar": "wide"}, ValueError, r"Invalid value for `progressbar`"),
-        ({"step": None}, TypeError, r"argument 'step': the settings of DRAM are proposal_cov, sta"),
-        ({"stages": 0}, ModelError, r"stages must be .* got 0"),
-        ({"model": 3}, ModelError, r"model must be a pymc.Model, got 3"),
-        ({"checkpoint": 3}, ModelError, r"checkpoint must be the path of a folder, got 3"),
-        ({"checkpoint": ""}, ModelError, r"checkpoint must be the path of a folder, got ''"),
-    ],
-)
-def test_bad_arguments(arguments, error, message):
-    with pytest.raises(error, match=message):
-        sample_dram(**{"model": simple_model()} | arguments)
 
 
 def test_models_that_cannot_be_sampled():

@@ -12,7 +12,7 @@ from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
 from pymc_statespace_filters.sampling.target.target import Target
-from tests.sampling.autoregression import autoregression, simulated
+from tests.systems import autoregression, simulated
 
 
 def starts_of(model, chains=4, seed=1):
@@ -106,14 +106,6 @@ def test_noisy_likelihoods_and_seeds():
     (first,), (again,), (other,) = (starts_of(model, 1, seed) for seed in (1, 1, 2))
     assert first == again
     assert first != other
-
-
-@pytest.mark.parametrize(("chains", "message"), [(0, "chains"), (2.5, "chains"), (257, "at most")])
-def test_wrong_numbers_of_chains_are_refused(chains, message):
-    with pm.Model() as model:
-        pm.Normal("x", 0, 1)
-    with pytest.raises(ModelError, match=message):
-        psf.find_starts(model, chains=chains)
 
 
 def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():

@@ -17,9 +17,9 @@ from pymc_statespace_filters.ops.noise import StoredNoise
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
-from tests.sampling.autoregression import autoregression, simulated
 from tests.sampling.test_dram import sample
 from tests.sampling.test_noise import Redrawing
+from tests.systems import autoregression, simulated
 
 STEPS = np.arange(1, 21)
 
@@ -124,9 +124,7 @@ def cubed(x, q, phi):
 
 @pytest.mark.parametrize("filter", [FEW, psf.EKF()], ids=["particles", "EKF"])
 def test_failures_come_with_the_filters_reason(filter):
-    explosive = autoregression(
-        transition=cubed, process_noise=[[1e-4]], initial_mean=[0.05], initial_cov=[[1e-4]]
-    )
+    explosive = autoregression(transition=cubed, spread=1e-2, initial_mean=0.05, initial_var=1e-4)
     with pm.Model():
         pm.Normal("phi", 0.0, 3.0)
         psf.StateSpace("d", explosive, filter, steps=[20], observed=[0.0])

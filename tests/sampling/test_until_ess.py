@@ -13,7 +13,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, convergence
 from pymc_statespace_filters.sampling.run import chain_task, convergence_display, model_task
@@ -218,29 +218,6 @@ def test_no_limit_was_met_without_a_warning(model, caplog):
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         sample_dram(model, **RULE)
     assert "until_ess" not in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"until_ess": 0}, "until_ess must be a positive number, got 0"),
-        ({"until_ess": -5.0}, "until_ess must be a positive number, got -5.0"),
-        ({"until_ess": np.nan}, "until_ess must be a positive number, got nan"),
-        ({"until_ess": "400"}, "until_ess must be a positive number, got '400'"),
-        ({"max_draws": 500}, "max_draws needs until_ess, got max_draws=500 alone"),
-        ({"until_ess": 400, "max_draws": 49}, "max_draws must be .* at least draws=50, got 49"),
-        ({"until_ess": 400, "max_draws": 99.5}, "max_draws must be an integer .*, got 99.5"),
-        (
-            {"until_ess": 400, "draws": 0, "discard_tuned_samples": False},
-            "draws with until_ess must be an integer of at least 1, got 0",
-        ),
-    ],
-)
-def test_bad_rules_are_refused(model, settings, message):
-    with pytest.raises(ModelError, match=message):
-        sample_dram(model, **{"draws": 50} | settings)
-    with pytest.raises(ModelError, match=message):
-        psf.run_models({"one": model}, **{"draws": 50} | settings)
 
 
 # Interruptions.

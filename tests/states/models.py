@@ -3,11 +3,10 @@
 import arviz as az
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 
 import pymc_statespace_filters as psf
 from tests.references.linear_states import linear_states
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, counts, forced
 
 EKF = psf.EKF()
 ALL_STEPS = np.arange(7)
@@ -48,16 +47,10 @@ def pushed_model(inputs=FORCE):
 
 
 def counted_model(initial_mean):
-    """Counts of one state, with the free variable `c`, two of them observed."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, c: [0.8 * x[0] + q[0]],
-        process_noise=[[0.2]],
-        observation_dist=lambda x, c: [pm.Poisson.dist(mu=pt.exp(c + x[0]))],
-        initial_mean=[initial_mean],
-        initial_cov=[[0.5]],
-    )
+    """Counts of one state, with the free variable `level`, two of them observed."""
+    system = counts(initial_mean=initial_mean)
     with pm.Model() as model:
-        pm.Normal("c")
+        pm.Normal("level")
         psf.StateSpace("d", system, psf.BootstrapPF(100), steps=[0, 1], observed=[1.0, 2.0])
     return model
 

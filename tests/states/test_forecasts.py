@@ -8,7 +8,6 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evaluation.simulate import observer
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     DATA_NOISE,
     DT,
@@ -26,6 +25,7 @@ from tests.states.models import (
     pushed_model,
     shown,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -159,7 +159,7 @@ def test_counts_are_forecast_as_counts():
     values = np.tile([0.3, 1.3], (2, 1500))
     values[1, 0] = 1e300  # the filter fails, and no count is that of an unknown rate
     with pytest.warns(psf.FilterWarning, match="in 1 of 6000 evaluations"):
-        group = predictions(posterior(c=values), model, n_steps=30).to_dataset().isel(d_time=-1)
+        group = predictions(posterior(level=values), model, n_steps=30).to_dataset().isel(d_time=-1)
     assert group["d"].isnull().sum() == group["d"][1, 0].isnull().sum() == 1
     for i, c in enumerate((0.3, 1.3)):
         part = group.isel(draw=slice(i, None, 2))

@@ -10,7 +10,6 @@ from numba.core.dispatcher import Dispatcher
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.states import free_runs
 from tests.filters.test_ekf_states import assert_drawn_from
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 from tests.states.models import (
     DATA_NOISE,
     DT,
@@ -25,6 +24,7 @@ from tests.states.models import (
     posterior,
     pushed_model,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -210,7 +210,7 @@ def test_coverage_is_that_of_measurements(noise):
 def test_counts():
     """Means of counts, compared with intervals of whole counts."""
     model = counted_model(initial_mean=1.0)
-    idata = posterior(c=np.full((2, 500), 0.5))
+    idata = posterior(level=np.full((2, 500), 0.5))
     expected = np.exp(0.5 + 0.8 ** np.arange(3))
     group = runs(idata, model, steps=[0, 1, 2], observed=[3.0, np.nan, 20.0])
     np.testing.assert_allclose(group["d"][0, 0, :, 0], expected, rtol=1e-10)

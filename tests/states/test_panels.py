@@ -9,8 +9,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.panel_records import records_of
-from tests.small_systems import FORCED
 from tests.states.models import EKF, posterior
+from tests.systems import FORCED
 
 LABELS = np.array(["b", "b", "b", "a", "c", "c"])
 STEPS = np.array([0, 2, 5, 3, 1, 4])

@@ -6,7 +6,6 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     EKF,
     FORCE,
@@ -21,6 +20,7 @@ from tests.states.models import (
     posterior,
     pushed_law,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 

@@ -17,8 +17,8 @@ from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws
 from tests.interrupts import interrupt_in
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
 from tests.states.models import EKF, pair_model, posterior
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 MANY = np.random.default_rng(5).uniform(-0.5, 0.9, (3, 5))
 

@@ -13,7 +13,6 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from tests.small_systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 from tests.states.models import (
     ALL_STEPS,
     DT,
@@ -32,6 +31,7 @@ from tests.states.models import (
     pushed_law,
     pushed_model,
 )
+from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 PF = psf.BootstrapPF(64)
 ESTIMATES = {"filtered": psf.filtered_states, "smoothed": psf.smoothed_states}

@@ -10,6 +10,8 @@ import pytest
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 STIFFNESS, START, LENGTH, GAP = 1.3, 0.4, 0.7, 0.25
 GRID = np.linspace(-3.0, 3.0, 1201)  # holds the kinks, and points between them
 WIDTHS = [0.05, 0.3, 2.0]  # the last one so wide that neighbouring bends overlap

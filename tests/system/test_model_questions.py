@@ -8,7 +8,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.pymc_model.inspection import exactness, health_outputs, noise_seeds
-from tests.small_systems import PAIR, PAIR_DATA, STEPS
+from tests.systems import PAIR, PAIR_DATA, STEPS
 
 ENKF = psf.EnKF(20)
 

@@ -13,7 +13,7 @@ from pymc_statespace_filters.system.panel import (
 )
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
 from pymc_statespace_filters.system.panel_records import records_of
-from tests.small_systems import FORCE, FORCED, PAIR, forced
+from tests.systems import FORCE, FORCED, PAIR, forced
 
 LABELS = ["b", "b", "a", "c", "c"]
 STEPS = np.array([0, 3, 1, 0, 2])

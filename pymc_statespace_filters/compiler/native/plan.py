@@ -299,8 +299,9 @@ class Plan:
         words[HEADER.n_words] = words.size
         words[HEADER.stamp] = _signed(self._version ^ (words.size * _FACTOR & _MASK))
         words[HEADER.checksum] = _signed(_checksum(words))
-        # Compiled graphs refer to the words for the life of the process.
-        _kept[self._symbol] = words
+        # Compiled graphs refer to the words for the life of the process, as do other plans of this
+        # key: those of equal code, which may be of another operation or of another system.
+        words = _kept.setdefault(self._symbol, words)
         llvm.add_symbol(self._symbol, words.ctypes.data)
         return words.ctypes.data
 

@@ -18,7 +18,7 @@ from pymc_statespace_filters.compiler.native.entry_point import (
     cached_on_disk,
     call_address,
 )
-from tests.small_systems import FORCE, FORCED_DATA, STEPS, forced
+from tests.systems import FORCE, FORCED_DATA, STEPS, forced
 
 NATIVE = entries.__name__
 

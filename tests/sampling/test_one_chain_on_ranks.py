@@ -19,7 +19,7 @@ from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.ranks import on_ranks
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
+from tests.systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
 ENSEMBLE, PARTICLES = psf.EnKF(192), psf.BootstrapPF(300, resample_below=0.7)
 ITERATIONS = 60

@@ -9,7 +9,7 @@ from pymc_statespace_filters.sampling.target import leader_follower as lockstep
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.mpi.launch import mpiexec, on_ranks
-from tests.sampling.test_lockstep import led, run_chain, two_records
+from tests.sampling.test_one_chain_on_ranks import led, run_chain, two_records
 
 MODEL = two_records(psf.EnKF(256), psf.BootstrapPF(300))
 
@@ -63,7 +63,7 @@ def fail(rank):
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_rank_that_fails_in_an_evaluation_ends_the_job(alone, rank):
     """Also without ``-m mpi4py``, which ends a job only when a rank's script has ended."""
-    script = f"from tests.mpi.test_lockstep import fail; fail({rank})"
+    script = f"from tests.mpi.test_one_chain_on_ranks import fail; fail({rank})"
     done = mpiexec(2, ["-c", script], abort=False)
     assert done.status != 0
     assert "MemoryError: not enough for all members" in done.stderr

@@ -11,7 +11,7 @@ from numba import njit
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.normals import fill_normals
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS
-from pymc_statespace_filters.filters import BootstrapPF, EnKF
+from pymc_statespace_filters.filters import BootstrapPF, EnKF, GuidedPF, PFEnKF
 from pymc_statespace_filters.filters.ensemble.partition import (
     BLOCKS,
     MEMBERS,
@@ -29,54 +29,82 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
 )
 from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
-from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
+from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.distributed import (
+    DistributedLogLikelihood,
+    check_ranks,
+    distributed_evaluator,
+)
+from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
-from tests.compiled import on_rank
-from tests.filters.laws import LOST_START, OSCILLATOR, WELL, normals, well_record
+from tests.filters.ensemble_contract import (
+    LINE,
+    LOST_START,
+    OSCILLATOR,
+    PLAIN_START,
+    WELL,
+    WILD_START,
+    arguments,
+    linear,
+    normals,
+    well,
+    well_record,
+    written,
+)
 from tests.ranks import on_ranks
-from tests.small_systems import FORCE, FORCED, FORCED_DATA, STEPS
+from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well, simulate
+from tests.systems import (
+    FORCE,
+    FORCED,
+    FORCED_DATA,
+    STEPS,
+    double_well_parameters,
+    linear_system,
+)
 
 NUMBERS = (1, 2, 3, 4)
 N = 300  # members: four whole blocks, and a part of one
-EVERY_SCHEME = [
-    BootstrapPF(N, resample_below=0),
-    BootstrapPF(N, resample_below=1 / 3),
-    *(BootstrapPF(N, resampling=s, resample_below=1) for s in SCHEMES),
-]
-EVERY_FILTER = [EnKF(N), EnKF(N, likelihood="gaussian"), *EVERY_SCHEME]
-IN_THE_WELL = [EnKF(N), EnKF(N, likelihood="gaussian"), BootstrapPF(N)]
-_shared = {}
+IN_THE_WELL = [EnKF(N), EnKF(N, likelihood="gaussian"), BootstrapPF(N), PFEnKF(N)]
 
 
-def distributed_function(filter_, machine):
-    """Compiled once for all tests of this file."""
-    key = filter_, id(machine)
-    if key not in _shared:
-        _shared[key] = on_rank(filter_.compile(machine)), machine
-    return _shared[key][0]
-
-
-def evaluations(filter_, machine, steps, observed, theta=(1.0,), seed=3, numbers=NUMBERS):
-    """Terms and health on every rank, for several numbers of ranks."""
-    run = distributed_function(filter_, machine)
-    record = (
-        np.array(theta, dtype=float),
-        np.asarray(steps, dtype=np.int64),
-        np.asarray(observed, dtype=float),
-        np.zeros((0, 0)),
-        0.0,
-        seed,
+def space_record():
+    """Four states, of which the third is carried and the last, a clock, is known exactly."""
+    system = linear(
+        A=np.diag([0.9, 0.8, 0.7, 1.0]),
+        B=np.vstack([0.3 * np.eye(3), np.zeros(3)]),
+        C=np.eye(2, 4),
+        R=0.1 * np.eye(2),
+        mean=[0.0, 0.0, 0.0, 7.1],
+        root=np.diag([1.0, 1.0, 1.0, 0.0]),
     )
-    for n in numbers:
-        yield from on_ranks(n, lambda ours: run(*record, ours.rank, ours.size, ours.exchange))
+    steps = np.arange(5)
+    observed = simulate(system, steps, np.random.default_rng(1))
+    return linear_system(system, carried=("x2",)), steps, observed
 
 
-def assert_all_the_same(results):
-    results = list(results)
-    for terms, health in results[1:]:
-        assert np.array_equal(terms, results[0][0])
-        assert np.array_equal(health, results[0][1])
-    return results[0]
+def broad_well_record():
+    steps, observed = (values[:8] for values in broad_double_well())
+    theta = flat_parameters(WELL, double_well_parameters(BROAD_DOUBLE_WELL))
+    return WELL, steps, observed[:, None], theta
+
+
+def on_ranks_alike(call, numbers=NUMBERS):
+    """What ``call(rank)`` returns, the same terms and health on all of several ranks."""
+    (terms, health), *others = [found for n in numbers for found in on_ranks(n, call)]
+    for terms_there, health_there in others:
+        assert np.array_equal(terms_there, terms)
+        assert np.array_equal(health_there, health)
+    return terms, health
+
+
+def everywhere(filter_, system, steps, observed, theta=None, seed=3, numbers=NUMBERS):
+    """Terms and health, the same on every rank for several numbers of ranks."""
+    evaluate = evaluator(DistributedLogLikelihood(written(system), filter_))
+    given = (*arguments(system, steps, observed, theta), seed)
+    return on_ranks_alike(
+        lambda ours: evaluate(*given, ours.rank, ours.size, ours.exchange), numbers
+    )
 
 
 # ---- the division
@@ -159,15 +187,39 @@ def test_sums_are_those_of_exact_arithmetic_and_the_same_on_any_number_of_ranks(
 # ---- whole filters
 
 
-@pytest.mark.parametrize("filter_", EVERY_FILTER, ids=str)
-def test_two_states_with_missing_rows_and_components(filter_):
-    terms, health = assert_all_the_same(evaluations(filter_, *OSCILLATOR))
+LIKELIHOODS = ("predictive", "weights", "as_printed")
+CASES = [
+    (EnKF(N), OSCILLATOR, NUMBERS),
+    (EnKF(N, likelihood="gaussian"), OSCILLATOR, NUMBERS),
+    *((BootstrapPF(N, resample_below=b), OSCILLATOR, NUMBERS) for b in (0, 1 / 3)),
+    *((BootstrapPF(N, resampling=s, resample_below=1), OSCILLATOR, NUMBERS) for s in SCHEMES),
+    *((PFEnKF(500, likelihood=f, resample_below=0.9), OSCILLATOR, NUMBERS) for f in LIKELIHOODS),
+    *((PFEnKF(N, resampling=s, resample_below=0.9), LINE, NUMBERS) for s in SCHEMES),
+    (PFEnKF(320), LINE, (1, 5)),  # as many ranks as blocks
+    (PFEnKF(200), space_record(), (1, 2, 3)),  # exact sums
+    *(
+        (GuidedPF(N, resampling=s, resample_below=0.9), broad_well_record(), NUMBERS)
+        for s in SCHEMES
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("filter_", "record", "numbers"), CASES, ids=[str(filter_) for filter_, *_ in CASES]
+)
+def test_every_rank_has_the_numbers_of_one(record, numbers, filter_):
+    """With missing rows and components, by all schemes and likelihoods."""
+    terms, health = everywhere(filter_, *record, numbers=numbers)
+    n = filter_.n_members if isinstance(filter_, EnKF) else filter_.n_particles
+    seen = ~np.isnan(record[2]).all(axis=1)
     assert np.all(np.isfinite(terms))
-    assert 1 < health[0] <= N
+    assert np.array_equal(terms != 0.0, seen)
+    assert 1 < health[0] <= n
+    assert health[1] == NONE
 
 
 def test_one_seed_is_not_another():
-    a, b = (next(evaluations(EnKF(N), *OSCILLATOR, seed=s, numbers=(2,)))[0] for s in (3, 4))
+    a, b = (everywhere(EnKF(N), *OSCILLATOR, seed=s, numbers=(2,))[0] for s in (3, 4))
     assert not np.array_equal(a, b)
 
 
@@ -180,8 +232,8 @@ def test_ranks_of_whose_members_none_is_alive(filter_):
 
     seed = next(s for s in range(1000) if survivors(s).size > 3 and survivors(s)[0] >= 128)
     steps, observed = well_record()
-    record = WELL, steps + 10, observed, (4.0, -4.0, 0.0, 300.0)
-    terms, health = assert_all_the_same(evaluations(filter_, *record, seed=seed))
+    record = WELL, steps + 10, observed, well(4, -4, 0.0, 300.0)
+    terms, health = everywhere(filter_, *record, seed=seed)
     assert np.all(np.isfinite(terms))
     assert health[0] < 20
 
@@ -189,33 +241,59 @@ def test_ranks_of_whose_members_none_is_alive(filter_):
 @pytest.mark.parametrize("filter_", IN_THE_WELL, ids=str)
 @pytest.mark.parametrize(
     ("theta", "outlier", "code"),
-    [(LOST_START, 1000.0, 1), ((4.0, -4.0, 1.0, 0.7), 1e200, 3)],
+    [(LOST_START, 1000.0, NO_FINITE_MEMBER), (PLAIN_START, 1e200, ZERO_WEIGHTS)],
 )
 def test_failures_of_all_members(filter_, theta, outlier, code):
     """Whether none is finite, or all weights are zero: every rank gives up at the same place."""
     steps, observed = well_record()
     observed[2] = outlier
-    terms, health = assert_all_the_same(evaluations(filter_, WELL, steps + 1, observed, theta))
+    terms, health = everywhere(filter_, WELL, steps + 1, observed, theta)
     assert health[1] == code
+    assert health[2] == 2 or code != ZERO_WEIGHTS
     assert np.all(terms[int(health[2]) :] == -np.inf)
 
 
-def terms_on_ranks(system, filter_, arguments):
+def test_members_that_explode_on_some_ranks():
+    terms, health = everywhere(PFEnKF(N), WELL, *well_record(), theta=WILD_START)
+    assert np.all(np.isfinite(terms))
+    assert health[1] == NONE
+
+
+@pytest.mark.parametrize("surprise", [4.0, 12.0, 1e3])
+def test_a_surprising_observation(surprise):
+    system, steps, observed = LINE
+    observed = observed.copy()
+    observed[4] += surprise
+    terms, _ = everywhere(PFEnKF(N), system, steps, observed)
+    assert terms[4] < -surprise
+
+
+def test_all_weight_on_one_particle_falls_back_to_bootstrap_weights():
+    # never resampled, and so precise a first observation that the second finds one particle
+    observed = np.array([[80.0], [0.1], [0.2], [0.1]])
+    filter_ = PFEnKF(130, resample_below=0)
+    terms, health = everywhere(
+        filter_, WELL, np.arange(4), observed, theta=PLAIN_START, numbers=(1, 2)
+    )
+    assert health[0] < 1.01
+    assert np.all(np.isfinite(terms))
+
+
+def by_evaluators(system, filter_, arguments):
     """Terms by the evaluator of one, two and three ranks, which are the same."""
-    results = [
-        result
-        for size in (1, 2, 3)
-        for result in on_ranks(
-            size, lambda ours: distributed_evaluator(system, filter_, ours)(*arguments)
-        )
-    ]
-    return assert_all_the_same(results)[0]
+    return on_ranks_alike(
+        lambda ours: distributed_evaluator(system, filter_, ours)(*arguments), (1, 2, 3)
+    )[0]
 
 
-@pytest.mark.parametrize("filter_", [EnKF(200), BootstrapPF(200, resample_below=1)], ids=str)
+@pytest.mark.parametrize(
+    "filter_",
+    [EnKF(200), BootstrapPF(200, resample_below=1), GuidedPF(200)],
+    ids=str,
+)
 def test_a_system_with_inputs_by_the_evaluator_of_one_and_of_several_ranks(filter_):
     record = np.array([0.9]), STEPS, FORCED_DATA[:, None], FORCE[:, None], 0.0, 5
-    terms = terms_on_ranks(FORCED, filter_, record)
+    terms = by_evaluators(FORCED, filter_, record)
     alone = psf.log_likelihood(
         FORCED, filter_, {"a": 0.9}, FORCED_DATA, steps=STEPS, inputs=FORCE, seed=5
     )
@@ -242,7 +320,7 @@ def test_counts_are_the_same_on_one_and_several_ranks():
         system, [60.0, 55.0, 70.0], steps=steps, times=None, inputs=None, t0=0.0
     )
     arguments = np.array([0.1]), record.steps, record.observed, record.inputs, 0.0, 5
-    terms = terms_on_ranks(system, filter_, arguments)
+    terms = by_evaluators(system, filter_, arguments)
     alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)
     assert np.isfinite(alone).all()
     assert np.array_equal(terms, alone)
@@ -251,15 +329,13 @@ def test_counts_are_the_same_on_one_and_several_ranks():
 def test_a_likelihood_has_few_exchanges():
     """They cost more than the sums: two an update, one in a particle filter, one to resample."""
     for filter_, each in ((EnKF(N), 2), (BootstrapPF(N, resample_below=1), 2)):
-        machine, steps, observed = OSCILLATOR
-        run = distributed_function(filter_, machine)
-        arguments = np.ones(1), steps, observed, np.zeros((0, 0)), 0.0, 3
+        evaluate = evaluator(DistributedLogLikelihood(written(OSCILLATOR[0]), filter_))
 
-        def count(ours, run=run, arguments=arguments):
-            run(*arguments, ours.rank, ours.size, ours.exchange)
+        def count(ours, evaluate=evaluate):
+            evaluate(*arguments(*OSCILLATOR), 3, ours.rank, ours.size, ours.exchange)
             return len(ours.exchanged)
 
-        n_updates = np.sum(~np.isnan(observed).all(axis=1))
+        n_updates = np.sum(~np.isnan(OSCILLATOR[2]).all(axis=1))
         assert on_ranks(2, count) == [each * n_updates] * 2
 
 

@@ -5,7 +5,7 @@ import pymc as pm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters
-from tests.sampling.autoregression import autoregression, simulated
+from tests.systems import autoregression, simulated
 
 STEPS = np.arange(1, 31)
 LINEAR = autoregression()

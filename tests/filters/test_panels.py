@@ -28,7 +28,7 @@ from pymc_statespace_filters.ops.panel import (
     PanelTapePullback,
     TapedPanelLogLikelihood,
 )
-from tests.small_systems import PAIR, pair_terms
+from tests.systems import PAIR, pair_terms
 
 T0, SEED = np.array(0.5), np.array(0)
 

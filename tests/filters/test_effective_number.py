@@ -9,8 +9,8 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.diagnostics import TermHealth
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
-from tests.filters.truth_systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 from tests.references.records import PRECISE_DOUBLE_WELL, SURPRISES, double_well_with_surprises
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
 N = 200
 PARAMETERS = double_well_parameters(PRECISE_DOUBLE_WELL)

@@ -1,0 +1,134 @@
+"""Arguments of the evidence that cannot be, as (call, argument, value, message)."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, compare_evidence
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.importance import Importance
+from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
+
+EVIDENCE = Evidence(-8.0, 0.05, "chib_jeliazkov", 2, 21, -5.0, "same")
+RIVALS = {"a": EVIDENCE, "b": replace(EVIDENCE, log_evidence=-9.0)}
+DRAWS = az.from_dict({"posterior": {"x": np.random.default_rng(1).normal(size=(2, 100))}})
+LEVELS = np.zeros((2, 100))
+
+
+def each(call, argument, values, message):
+    """A row for each value."""
+    return [(call, argument, value, message) for value in values]
+
+
+def of_draws(call):
+    """The call for these draws of a normal distribution."""
+
+    def inside(**arguments):
+        with pm.Model() as model:
+            pm.Normal("x")
+        return call(DRAWS, model, **arguments)
+
+    return inside
+
+
+def without_observations(correction):
+    return compare_evidence({"a": replace(EVIDENCE, n_observations=0)}, correction=correction)
+
+
+NOT_POSITIVE = [0, -0.1, math.nan, math.inf, "small", True]
+compare = partial(compare_evidence, RIVALS)
+curves = partial(psf.prior_sensitivity, RIVALS)
+estimate, chib = of_draws(psf.estimate_evidence), of_draws(psf.chib_jeliazkov)
+TABLE = [
+    # tables of models and curves
+    *each(
+        compare,
+        "prior",
+        [{"a": 1}, {"a": 1, "b": 0}, {"a": 1, "b": -1}, {"a": 1, "c": 1}, [1, 1]],
+        "prior must",
+    ),
+    *each(
+        compare,
+        "prior",
+        [{"a": a, "b": b} for a, b in [(1e-320, 1e308), ("much", 1.0), (None, 1.0), (-1, 0)]],
+        "prior must be positive and finite",
+    ),
+    *each(compare, "ci_prob", [0, 1, 95, None], "ci_prob must"),
+    *each(compare, "correction", [3], "correction must"),
+    *each(without_observations, "correction", [DimensionCorrection()], "n_observations=0"),
+    *each(DimensionCorrection, "exponent", [math.nan], "must be a finite number, got nan"),
+    *each(
+        compare_evidence,
+        "evidences",
+        [{}, [EVIDENCE], {"a": -8.0}, {"a": {"bridge": -8.0}}],
+        "evidences",
+    ),
+    *each(curves, "ci_prob", [95], "ci_prob must"),
+    *each(curves, "prior", [{"a": 1}], "prior must"),
+    *each(psf.prior_sensitivity, "evidences", [{"a": 3.0}], "evidences"),
+    *each(curves, "widths", [[1, 2]], "models must be given with widths or var_names"),
+    *each(curves, "var_names", ["w"], "models must be given with widths or var_names"),
+    *each(partial(replace, EVIDENCE), "log_volume", [math.inf], "must be a finite number, got inf"),
+    # draws
+    *each(
+        psf.marginal_modes,
+        "idatas",
+        [{}, None, [DRAWS]],
+        "idatas must be a DataTree or a mapping",
+    ),
+    *each(
+        psf.marginal_modes,
+        "idatas",
+        [{"a": 3}, {"a": az.from_dict({"prior": {"x": LEVELS}})}],
+        r"idatas\['a'\] must be a DataTree with a group 'post",
+    ),
+    # estimators
+    *(
+        row
+        for call in (chib, estimate)
+        for row in each(call, "cores", [0, -1, 1.5, "two"], "cores must be an integer of at least")
+    ),
+    *each(chib, "n_proposals", [10, 500.0, "many"], "n_proposals must be an integer of at least 1"),
+    *each(ChibJeliazkov, "n_blocks", [0, 1.5, True], "n_blocks must be an integer of at least 1"),
+    *each(PriorMonteCarlo, "n_draws", [99, 1e4, None], "n_draws must be an integer of at least"),
+    *each(TemperedSMC, "n_particles", [49, 1e3], "n_particles must be an integer of at least 50"),
+    *each(TemperedSMC, "n_runs", [6, 9], "n_runs must be an even integer of at least 8"),
+    *each(estimate, "target_se", [*NOT_POSITIVE, None], "target_se must be a positive number"),
+    *(
+        row
+        for make in (
+            ChibJeliazkov, Bridge, partial(Bridge, warped=True), Importance, PriorMonteCarlo
+        )
+        for row in each(make, "target_se", NOT_POSITIVE, "target_se must be a positive number")
+    ),
+    (estimate, "estimators", [], r"estimators must have at least one of \['chib_j.*got \[\]"),
+    (
+        estimate,
+        "estimators",
+        ["bridge", "harmonic_mean"],
+        r"names among \['chib_j.* objects, got 'harmonic_mean'",
+    ),
+    (estimate, "estimators", 3, "or Estimator objects, got 3"),
+    (estimate, "estimators", ["bridge", 3], "or Estimator objects, got 3"),
+    (
+        estimate,
+        "estimators",
+        ["bridge", Bridge()],
+        "must have different names, got 'bridge' more than once",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "argument", "value", "message"), TABLE)
+def test_a_wrong_argument_is_named(call, argument, value, message):
+    with pytest.raises(ModelError, match=message):
+        call(**{argument: value})
