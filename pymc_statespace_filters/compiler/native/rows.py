@@ -78,8 +78,7 @@ class Rows:
     def _one_by_one(self, columns: Sequence[np.ndarray], m: int) -> list[np.ndarray]:
         results = [np.empty((m, *shape), dtype) for shape, dtype in self._function.kinds]
         for i in range(m):
-            with held_interrupts():
-                values = self._function(*(column[i, ...] for column in columns), *self._constant)
+            values = self._function(*(column[i, ...] for column in columns), *self._constant)
             for result, value in zip(results, values, strict=True):
                 result[i] = value
             self.on_progress(1)
