@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.sampling.run import model_task
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -52,7 +52,7 @@ class Clock:
     def running(self) -> Iterator[None]:
         """Count in this block; earlier versions have neither a search nor a common warm-up."""
         task = model_task.ModelTask
-        prepare, extend, call = task.prepare, getattr(task, "extend", None), ParallelMap.__call__
+        prepare, extend, call = task.prepare, getattr(task, "extend", None), Rows.__call__
         search = getattr(model_task, "find_population", None)
 
         def prepared(this):
@@ -63,7 +63,7 @@ class Clock:
 
         def found(*args, **kwargs):
             began = time.process_time()
-            with patch.object(ParallelMap, "__call__", rows):
+            with patch.object(Rows, "__call__", rows):
                 population = search(*args, **kwargs)
             self.starts += time.process_time() - began
             return population

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
-from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_points
+from pymc_statespace_filters.compiler.native.rows import interpreted_at_points
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.equations import as_vector
 from pymc_statespace_filters.system.model import StateSpaceModel

@@ -1,10 +1,14 @@
-"""Compilation of a model's log-density."""
+"""Compilation of a model's log-density, and of other graphs of its variables."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
+from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.compilation import (
     COMPILATION,
@@ -21,3 +25,25 @@ def compile_density(inputs: Sequence[Variable], outputs: Sequence[Variable], **o
     """
     with COMPILATION, undamaged_files(), warning_filter("ignore", "Loop fusion failed"):
         return compile_pymc(inputs, outputs, **options)
+
+
+def compile_raveled(
+    point: Mapping[str, np.ndarray],
+    outputs: Sequence[Variable],
+    variables: Sequence[TensorVariable],
+    seeds: Mapping[str, TensorVariable] | None = None,
+    further: Sequence[Variable] = (),
+    **options: Any,
+) -> tuple[Any, NDArray[np.float64]]:
+    """Compile graphs over the vector of all variables: the function, and the vector at a point.
+
+    The other arguments of the function are a seed for each shared one, which ``seeds`` has by the
+    name of its StateSpace variable, and ``further``.
+    """
+    inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in (seeds or {}).items()}
+    graphs, joined = join_nonshared_inputs(point, outputs, variables, inputs)
+    arguments = [joined, *inputs.values(), *further]
+    function = compile_density(arguments, graphs, **({"on_unused_input": "ignore"} | options))
+    function.trust_input = True
+    start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
+    return function, start

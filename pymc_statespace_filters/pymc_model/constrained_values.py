@@ -3,7 +3,8 @@
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
-from pymc.pytensorf import compile as compile_pymc
+
+from pymc_statespace_filters.pymc_model.compilation import compile_raveled
 
 Array = NDArray[np.float64]
 
@@ -21,14 +22,10 @@ class ConstrainedValues:
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         outputs = model.replace_rvs_by_values(model.free_RVs)
         # Machine code would take seconds to compile.
-        self._function = compile_pymc(values, outputs, mode="FAST_COMPILE")
-        start = model.initial_point()
-        self._shapes = [np.shape(start[value.name]) for value in values]
-        self._ends = np.cumsum([int(np.prod(shape)) for shape in self._shapes])[:-1]
+        mode = "FAST_COMPILE"
+        self._function, _ = compile_raveled(model.initial_point(), outputs, values, mode=mode)
         self.names = [rv.name for rv in model.free_RVs]
 
     def __call__(self, x: Array) -> dict[str, np.ndarray]:
         """Values by name at the unconstrained point x (k,)."""
-        parts = zip(np.split(x, self._ends), self._shapes, strict=True)
-        found = self._function(*(part.reshape(shape) for part, shape in parts))
-        return dict(zip(self.names, map(np.asarray, found), strict=True))
+        return dict(zip(self.names, map(np.asarray, self._function(x)), strict=True))

@@ -5,16 +5,17 @@ noise seeds of its estimate, so that the values depend neither on the order nor 
 threads.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.compilation import compile_density
+from pymc_statespace_filters.pymc_model.compilation import compile_raveled
 from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters, with_filter
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 
@@ -37,6 +38,7 @@ class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
     ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
+    ``extra`` are graphs that `calls` evaluates, too.
 
     Attributes
     ----------
@@ -44,22 +46,21 @@ class RowFunction:
         Names of the noisy state-space variables, in the order of the columns of a seed array.
     model_seeds : ndarray of int64
         The model's seeds for them.
-    calls : ParallelMap
+    calls : Rows
+        From points (m, k) and their m seeds of each variable to the results (m, ...).
     """
 
-    def __init__(self, model: pm.Model, output: TensorVariable) -> None:
+    def __init__(
+        self, model: pm.Model, output: TensorVariable, extra: Sequence[TensorVariable] = ()
+    ) -> None:
         shared = noise_seeds(model)
         self.seed_names = tuple(shared)
         self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        seeds = {seed: pt.lscalar(f"{name}_seed") for name, seed in shared.items()}
         start = model.initial_point()
-        (output,), joined = join_nonshared_inputs(start, [output], values, seeds)
-        inputs = [joined, *seeds.values()]
-        function = compile_density(inputs, [output], on_unused_input="ignore")
-        function.trust_input = True
-        point = np.concatenate([np.ravel(start[v.name]) for v in values], dtype=np.float64)
-        self.calls = ParallelMap(function, [point, *self.model_seeds])
+        function, point = compile_raveled(start, [output, *extra], values, shared)
+        example = [point, *self.model_seeds]
+        self.calls = Rows(NativeFunction(function, example), len(example))
 
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
         """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.
@@ -68,7 +69,7 @@ class RowFunction:
         """
         if seeds is None:
             seeds = np.broadcast_to(self.model_seeds, (len(x), self.model_seeds.size))
-        values = self.calls(x, *seeds.T)[:, 0]
+        values = self.calls(x, *seeds.T)[0]
         return np.where(np.isnan(values), -np.inf, values)
 
 

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 import pymc as pm
 import pytensor
-import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import NDArray
 from pymc.initial_point import make_initial_point_fn
-from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.replace import graph_replace
 
+from pymc_statespace_filters.compiler.native.rows import at_points
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
@@ -96,8 +96,7 @@ def _unconstrained(model: pm.Model, posterior: xr.Dataset) -> dict[str, np.ndarr
         transform = model.rvs_to_transforms[rv]
         graphs.append(symbol if transform is None else transform.forward(symbol, *rv.owner.inputs))
     graphs = graph_replace(graphs, dict(zip(free, symbols, strict=True)), strict=False)
-    batches = [pt.tensor(dtype=s.type.dtype, shape=(None, *s.type.shape)) for s in symbols]
-    results = vectorize_graph(graphs, dict(zip(symbols, batches, strict=True)))
+    batches, results = at_points(symbols, graphs)
     # A single call for all draws does not repay compilation to machine code.
     function = pytensor.function(batches, results, mode="FAST_COMPILE", on_unused_input="ignore")
     values = []

@@ -7,19 +7,18 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.pytensorf import compile as compile_pymc
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
-from pymc_statespace_filters.compiler.native.interpreted import interpreted_at_points
+from pymc_statespace_filters.compiler.native.rows import interpreted_at_points
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.ekf import EKF
 from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
 from pymc_statespace_filters.ops.panel import PanelLogLikelihood
+from pymc_statespace_filters.pymc_model.compilation import compile_raveled
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.system.accumulators import without_resets
 from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
@@ -151,8 +150,7 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
     values = [model.rvs_to_values[rv] for rv in model.free_RVs]
     # theta, steps, inputs and t0, but not data and seed.
     needed = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]
-    outputs, joined = join_nonshared_inputs(model.initial_point(), needed, values)
-    record = compile_pymc([joined], outputs, mode="FAST_COMPILE")
+    record, _ = compile_raveled(model.initial_point(), needed, values, mode="FAST_COMPILE")
 
     def is_stable(x: Array) -> NDArray[np.bool_]:
         columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]

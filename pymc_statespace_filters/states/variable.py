@@ -15,7 +15,8 @@ from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
 from pymc_statespace_filters.compiler.native.compilation import undamaged_files
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about
@@ -207,12 +208,10 @@ class VariableAtDraws:
         self, function: Any, drawn: Sequence[np.ndarray], constant: Sequence[np.ndarray]
     ) -> list[Array]:
         columns = [np.arange(self.n_draws), *self._columns, *drawn]
-        calls = ParallelMap(function, [column[0] for column in columns], constant)
-        calls.on_progress = self.on_progress
-        results = calls(*columns)
-        ends = np.cumsum([int(np.prod(shape)) for shape in calls.shapes])[:-1]
-        parts = np.split(results, ends, axis=1)
-        return [part.reshape(-1, *shape) for part, shape in zip(parts, calls.shapes, strict=True)]
+        first = [column[0] for column in columns]
+        rows = Rows(NativeFunction(function, [*first, *constant]), len(columns))
+        rows.on_progress = self.on_progress
+        return rows(*columns)
 
     def _interpret(self, graph: Variable) -> Array:
         # Microseconds for each draw: machine code would take longer to compile than it saves.

@@ -12,7 +12,7 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native import parallel_map as many_calls
+from pymc_statespace_filters.compiler.native import rows as many_calls
 from pymc_statespace_filters.pymc_model import compilation
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds

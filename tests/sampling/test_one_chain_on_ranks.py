@@ -247,12 +247,30 @@ def evaluate_ten(ranks):
     return [density(np.zeros(2), (), [i, i]) for i in range(10)]
 
 
+def evaluate_rows(ranks=None):
+    """Log-densities at ten points, and what the watch hears of them."""
+    target = Target(MODEL, None, DRAMSettings(), group=ranks)
+    target.prepare()
+    rows, counts = target.density.at_rows(), []
+    rows.on_progress = counts.append
+    x = np.random.default_rng(3).normal(0.0, 0.3, (10, 2))
+    return rows(x, np.arange(10), np.arange(10, 20))[:2], counts
+
+
+def test_many_points_are_those_of_one_rank():
+    (together, counts), *_ = on_ranks(2, lambda ranks: led(ranks, evaluate_rows, ranks))
+    alone, _ = evaluate_rows()
+    np.testing.assert_array_equal(together, alone)
+    assert counts == [1] * 10
+
+
 @pytest.mark.parametrize("rank", [0, 1, 2])
-def test_an_error_in_an_evaluation_ends_all(rank, monkeypatch):
+@pytest.mark.parametrize("evaluate", [evaluate_ten, evaluate_rows])
+def test_an_error_in_an_evaluation_ends_all(evaluate, rank, monkeypatch):
     """Of a follower's the leader learns as MPI lets it: here by the barrier, else by the abort."""
     fail_on(rank, monkeypatch)
     with pytest.raises(Unlucky, match=f"on rank {rank}"):
-        on_ranks(3, lambda ranks: led(ranks, evaluate_ten, ranks))
+        on_ranks(3, lambda ranks: led(ranks, evaluate, ranks))
 
 
 def outcomes(size, lead, *arguments):

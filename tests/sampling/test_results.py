@@ -304,6 +304,15 @@ def test_one_by_one_with_and_without_machine_code(monkeypatch):
         np.testing.assert_allclose(fast[name], slow[name], rtol=1e-13)
 
 
+def test_random_quantities_are_drawn_at_every_position():
+    with pm.Model() as model:
+        x = pm.Normal("x")
+        pm.Deterministic("noisy", pm.Normal.dist(x, 1.0))
+    found = Deterministics(model, raveled_of(model))(np.arange(50.0)[:, None])
+    assert np.unique(found["noisy"]).size == 50
+    assert np.abs(found["noisy"] - found["x"]).max() < 6.0
+
+
 @pytest.fixture(scope="module")
 def state_space():
     """Two records, one quantity computed from a likelihood, and a tree of some draws."""

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
 from pymc_statespace_filters.sampling.target.target import Target
@@ -136,13 +136,13 @@ def narrow():
 @pytest.fixture
 def evaluated(monkeypatch):
     """Numbers of points that searches evaluate from now on."""
-    found, call = [], ParallelMap.__call__
+    found, call = [], Rows.__call__
 
     def counting(mapped, *columns):
         found.append(len(columns[0]))
         return call(mapped, *columns)
 
-    monkeypatch.setattr(ParallelMap, "__call__", counting)
+    monkeypatch.setattr(Rows, "__call__", counting)
     return found
 
 

@@ -11,8 +11,9 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import progress
-from pymc_statespace_filters.compiler.native import parallel_map as many_calls
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native import rows as many_calls
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws
@@ -44,24 +45,29 @@ def test_draws_one_by_one_are_those_of_all_at_once(drawn):
         np.testing.assert_array_equal(some["filtered_states"][name], expected)
 
 
-def test_results_of_several_shapes_and_types():
+@pytest.mark.parametrize("in_turn", [False, True])
+def test_results_of_several_shapes_and_types(in_turn):
     """Words of eight bytes, read as what they are."""
     x, n, c = pt.dvector("x"), pt.lscalar("n"), pt.lvector("c")
     function = pytensor.function([x, n, c], [x[::-1] * n, pt.outer(x, c), n], trust_input=True)
     columns = np.array([[1.5, 2.5], [0.5, -1.0], [3.0, 4.0]]), np.array([2**60, -3, 5])
-    calls = ParallelMap(function, [column[0] for column in columns], [np.array([10, 20, 30])])
+    native = NativeFunction(function, [column[0] for column in columns] + [np.array([10, 20, 30])])
+    calls = Rows(native, 2, in_turn=in_turn)
     found = calls(*columns)
-    assert calls.shapes == [(2,), (2, 3), ()]
-    for row, (a, k) in zip(found, zip(*columns, strict=True), strict=True):
-        outer = np.outer(a, [10, 20, 30]).ravel()
-        np.testing.assert_array_equal(row, [*(a[::-1] * k), *outer, k])
+    assert [part.shape for part in found] == [(3, 2), (3, 2, 3), (3,)]
+    assert [part.dtype for part in found] == [np.float64, np.float64, np.int64]
+    for a, k, reverse, outer, same in zip(*columns, *found, strict=True):
+        np.testing.assert_array_equal(reverse, a[::-1] * k)
+        np.testing.assert_array_equal(outer, np.outer(a, [10, 20, 30]))
+        assert same == k
     counts = []
     calls.on_progress = counts.append
     calls(*columns)
     assert sum(counts) == 3
     # Strided columns, of another type.
     again = calls(np.asfortranarray(columns[0])[::-1], columns[1].astype(object)[::-1])
-    np.testing.assert_array_equal(again, found[::-1])
+    for part, before in zip(again, found, strict=True):
+        np.testing.assert_array_equal(part, before[::-1])
 
 
 class Screen:

@@ -7,8 +7,8 @@ a second function of the same types needs no compilation.
 """
 
 import ctypes
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from threading import Lock
 from typing import Any, NamedTuple
@@ -59,46 +59,59 @@ def make_call(call):
 class NativeFunction:
     """A compiled PyTensor function whose inputs and outputs are arrays of numbers.
 
-    ``example`` holds the inputs of a first call, which determines types and ``shapes`` of the
-    results. In PyTensor's modes without numba, machine code calls Python instead.
+    ``example`` holds the inputs of a first call, which determines ``kinds``, shape and dtype, of
+    the results. In PyTensor's modes without numba, or if it has a state to update, as of a
+    generator, machine code calls Python instead. ``errors`` surrounds every call from Python.
     """
 
-    def __init__(self, function: Any, example: Sequence[np.ndarray]):
-        self._function = function
+    def __init__(
+        self,
+        function: Any,
+        example: Sequence[np.ndarray],
+        errors: Callable[[], AbstractContextManager] = nullcontext,
+    ):
+        self._function, self._errors = function, errors
         self._one_at_a_time = Lock()  # PyTensor functions have one storage for all threads
+        self.example = [np.require(value, requirements=("C", "W")) for value in example]
         shared = [cell.storage[0] for cell in function.input_storage[len(example) :]]
-        self._is_native = hasattr(function.vm, "jit_fn") and all(
-            isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared
+        has_updates = len(function.maker.fgraph.outputs) > len(function.maker.outputs)
+        self.is_native = (
+            hasattr(function.vm, "jit_fn")
+            and not has_updates
+            and all(isinstance(value, np.ndarray) and value.dtype.kind in "bif" for value in shared)
         )
-        if self._is_native:
+        if self.is_native:
             with_internal_linkage(function.vm.jit_fn)
         # Current values of shared variables, in the memory layout of the adapters.
-        self._data = [np.array(v, order="C") for v in shared] if self._is_native else []
+        self._data = [np.array(v, order="C") for v in shared] if self.is_native else []
         with held_interrupts(), slow_compilation("the functions of the model"):
-            self.shapes = [np.shape(result) for result in self(*example)]
+            results = [np.asarray(result) for result in self(*self.example)]
+        self.kinds = [(result.shape, result.dtype) for result in results]
 
     @property
     def size(self) -> int:
         """Total number of elements of the results."""
-        return sum(int(np.prod(shape)) for shape in self.shapes)
+        return sum(int(np.prod(shape)) for shape, _ in self.kinds)
 
     def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
         """Call from Python."""
-        if self._is_native:
-            return call_machine_code(self._function.vm.jit_fn, *inputs, *self._data)
-        with self._one_at_a_time:
-            return self._function(*inputs)
+        with self._errors():
+            if self.is_native:
+                return call_machine_code(self._function.vm.jit_fn, *inputs, *self._data)
+            with self._one_at_a_time:
+                return self._function(*inputs)
 
-    def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Any]:
-        """A call that reads these contiguous arrays, and the object that holds its memory.
+    def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Callable[[], object]]:
+        """A call that reads these contiguous arrays, and a function that repeats it from Python.
 
-        Keep the object as long as the call.
+        The function raises the exception of the call, and holds its memory: keep it as long.
         """
         out = np.zeros(1 + self.size)
-        if not self._is_native:
+        if not self.is_native:
             callback = self._callback(inputs, out)
             address = ctypes.cast(callback, ctypes.c_void_p).value
-            return Call(np.array([address], dtype=np.int64), out), (callback, inputs)
+            call = Call(np.array([address], dtype=np.int64), out)
+            return call, lambda _memory=callback: self(*inputs)
         arrays = [*inputs, *self._data]
         kinds = types.Tuple([typeof(array) for array in arrays])
         overloads = self._function.vm.jit_fn.overloads
@@ -111,7 +124,8 @@ class NativeFunction:
             *(array.ctypes.data for array in arrays),
         ]
         lengths = [length for array in arrays for length in array.shape]
-        return Call(np.array([*addresses, *lengths, out.size], dtype=np.int64), out), arrays
+        call = Call(np.array([*addresses, *lengths, out.size], dtype=np.int64), out)
+        return call, lambda: self(*inputs)
 
     def _callback(self, inputs: Sequence[np.ndarray], out: np.ndarray) -> Any:
         def evaluate(table: int, results: int) -> None:

@@ -22,9 +22,10 @@ from pymc.distributions.distribution import support_point
 from pymc.distributions.transforms import _default_transform
 from pymc.logprob.transforms import IntervalTransform, LogTransform
 from pymc.pytensorf import compile as compile_pymc
-from pytensor.graph.replace import clone_replace, vectorize_graph
+from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.native.rows import at_points
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.log_mean import (
     MIN_EFFECTIVE,
@@ -82,17 +83,11 @@ class ScaledPrior:
         sizes = {name: int(np.prod(shape)) for name, shape in model.eval_rv_shapes().items()}
         terms = [_log_ratio(rv, values[rv], width, sizes[rv.name]) for rv in scaled]
         outputs = [pt.sum(pt.stack(of_each)) for of_each in zip(*terms, strict=True)]
-        rows = {
-            value: pt.tensor(value.name, dtype=value.dtype, shape=(None, *value.type.shape))
-            for value in values.values()
-        }
-        self._types = {value.name: value.dtype for value in rows}
+        self._types = {value.name: value.dtype for value in values.values()}
+        points, at_draws = at_points(list(values.values()), clone_replace(outputs, values))
         # One call handles all draws, which is not worth machine code.
         self._function = compile_pymc(
-            [width, *rows.values()],
-            vectorize_graph(clone_replace(outputs, values), rows),
-            on_unused_input="ignore",
-            mode="FAST_COMPILE",
+            [width, *points], at_draws, on_unused_input="ignore", mode="FAST_COMPILE"
         )
 
     def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
@@ -104,7 +99,7 @@ class ScaledPrior:
         ]
         with np.errstate(all="ignore"):  # a narrow prior may be zero at a draw
             log_ratio, beyond = self._function(width, *rows)
-        return average_ratios(log_ratio.reshape(shape), np.broadcast_to(beyond, log_ratio.shape))
+        return average_ratios(log_ratio.reshape(shape), beyond)
 
 
 def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:

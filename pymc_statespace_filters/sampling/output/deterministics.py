@@ -6,19 +6,17 @@ and without compiling. The others (loops and likelihoods within Deterministics, 
 are evaluated by one compiled function, called for each position.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
 from pymc.model import Model
 from pymc.pytensorf import compile as compile_pymc
-from pymc.pytensorf import join_nonshared_inputs
 from pymc.util import get_default_varnames
 from pytensor.compile.mode import Mode
 from pytensor.compile.ops import ViewOp
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.fg import FunctionGraph
-from pytensor.graph.replace import vectorize_graph
 from pytensor.graph.rewriting.basic import in2out, node_rewriter
 from pytensor.graph.rewriting.db import RewriteDatabaseQuery
 from pytensor.graph.traversal import ancestors
@@ -36,10 +34,12 @@ from pytensor.tensor.elemwise import CAReduce, DimShuffle, Elemwise
 from pytensor.tensor.extra_ops import CumOp
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.type import TensorType, tensor
+from pytensor.tensor.type import TensorType
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.pymc_model.compilation import compile_density
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.compiler.native.rows import Rows, at_points
+from pymc_statespace_filters.pymc_model.compilation import compile_raveled
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
 
 # Positions in a block, whose intermediate results stay in the processor's cache.
@@ -118,23 +118,17 @@ class _Vectorized:
         point = raveled.unravel(np.zeros(raveled.dim))
         self._shapes = [point[v.name].shape for v in raveled.variables]
         self._ends = np.cumsum([point[v.name].size for v in raveled.variables])[:-1]
-        blocks = [
-            tensor(dtype=v.dtype, shape=(None, *shape))
-            for v, shape in zip(raveled.variables, self._shapes, strict=True)
-        ]
-        graphs = _without_views(
-            vectorize_graph(list(wanted), dict(zip(raveled.variables, blocks, strict=True)))
-        )
-        kept = [
-            (v, graph) for v, graph in zip(wanted, graphs, strict=True) if _is_vectorizable(graph)
-        ]
-        self.names = [v.name for v, _ in kept]
+        blocks, graphs = at_points(raveled.variables, wanted)
+        kept = {
+            v.name: graph
+            for v, graph in zip(wanted, _without_views(graphs), strict=True)
+            if _is_vectorizable(graph)
+        }
+        self.names = list(kept)
         self._dtypes = [block.dtype for block in blocks]
-        # A constant has no axis for the positions.
-        self._has_axis = [graph.ndim > v.ndim for v, graph in kept]
         self._function = compile_pymc(
             blocks,
-            [graph for _, graph in kept],
+            list(kept.values()),
             mode=NUMPY_MODE,
             on_unused_input="ignore",
             trust_input=True,
@@ -147,10 +141,7 @@ class _Vectorized:
             with np.errstate(all="ignore"):  # infinities and NaN are values, as in machine code
                 values = self._function(*self._split(block))
             if not results:
-                results = [
-                    np.empty((len(positions), *np.shape(value)[has_axis:]), value.dtype)
-                    for value, has_axis in zip(values, self._has_axis, strict=True)
-                ]
+                results = [np.empty((len(positions), *v.shape[1:]), v.dtype) for v in values]
             for result, value in zip(results, values, strict=True):
                 result[begin : begin + BLOCK] = value
         return results
@@ -166,37 +157,15 @@ class _Vectorized:
 class _PerPosition:
     """Evaluates by machine code, one call for each position."""
 
-    def __init__(self, wanted: Sequence[Variable], raveled: RaveledVariables):
+    def __init__(self, wanted: Sequence[TensorVariable], raveled: RaveledVariables):
         self.names = [v.name for v in wanted]
         point = raveled.unravel(np.zeros(raveled.dim))
-        outputs, joined = join_nonshared_inputs(point, list(wanted), raveled.variables)
-        self._dtypes = [output.dtype for output in outputs]
-        self._function = compile_density(
-            [joined], outputs, on_unused_input="ignore", trust_input=True
-        )
-        self._dtype = joined.dtype
+        self._function, _ = compile_raveled(point, wanted, raveled.variables)
 
     def __call__(self, positions: np.ndarray) -> list[np.ndarray]:
-        call = self._machine_code()
-        positions = positions.astype(self._dtype, copy=False)
-        results = [
-            np.empty((len(positions), *np.shape(value)), dtype)
-            for value, dtype in zip(call(positions[0]), self._dtypes, strict=True)
-        ]
-        for i, position in enumerate(positions):
-            for result, value in zip(results, call(position), strict=True):
-                result[i] = value
-        return results
-
-    def _machine_code(self) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
-        """Call the jitted function directly when PyTensor's wrapper has no state to update."""
-        function = self._function
-        has_updates = len(function.maker.fgraph.outputs) > len(self.names)  # of generators
-        if has_updates or not hasattr(function.vm, "jit_fn"):  # no jit_fn: a mode without numba
-            return function
-        machine_code = function.vm.jit_fn
-        data = [cell.storage[0] for cell in function.input_storage[1:]]
-        return lambda position: machine_code(position, *data)
+        # With the data as they are now.
+        rows = Rows(NativeFunction(self._function, [positions[0]]), 1, in_turn=True)
+        return rows(positions)
 
 
 def _is_vectorizable(graph: Variable) -> bool:

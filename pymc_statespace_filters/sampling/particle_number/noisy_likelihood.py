@@ -6,14 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymc.model import Model
 
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.pymc_model.aligned_axes import records_of_rows
-from pymc_statespace_filters.pymc_model.graph_rewrites import (
-    likelihood_terms,
-    with_filter,
-)
+from pymc_statespace_filters.pymc_model.density import RowFunction
+from pymc_statespace_filters.pymc_model.graph_rewrites import likelihood_terms, with_filter
 from pymc_statespace_filters.pymc_model.inspection import (
     noise_seeds,
     noisy_filters,
@@ -35,7 +32,6 @@ from pymc_statespace_filters.sampling.particle_number.pilot_chain import (
     pilot_chains,
     run_pilot,
 )
-from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import (
     RaveledVariables,
@@ -85,7 +81,7 @@ class NoisyLikelihood:
         self._raveled = RaveledVariables(continuous_value_vars(None, model), self._point)
         if not self._raveled.dim:
             raise ModelError("model must have at least one free variable, it has none")
-        self._densities: dict[Filter, ParallelMap] = {}
+        self._densities: dict[Filter, RowFunction] = {}
         self._records = _records_moved_alone(model, self.name)
 
     def points(self) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -118,12 +114,11 @@ class NoisyLikelihood:
         began = time.process_time()
         seeds = np.tile([int(s.get_value()) for s in self._seeds.values()], (n_seeds, 1))
         seeds[:, list(self._seeds).index(self.name)] = draw_seeds(self._rng, (n_seeds,))
-        results = density(np.tile(position, (n_seeds, 1)), *seeds.T)
-        totals, terms = results[:, 0], results[:, -density.shapes[-1][0] :]
+        totals, terms = density.calls(np.tile(position, (n_seeds, 1)), *seeds.T)
         seconds = (time.process_time() - began) / n_seeds
         return Estimates(np.where(totals < np.inf, totals, -np.inf), terms, seconds, self._records)
 
-    def prepare(self, filter: Any) -> ParallelMap:
+    def prepare(self, filter: Any) -> RowFunction:
         """Compile what `estimates` evaluates, unless it is there."""
         if filter not in self._densities:
             name = type(filter).__name__
@@ -132,16 +127,12 @@ class NoisyLikelihood:
                 self._densities[filter] = self._compiled(filter)
         return self._densities[filter]
 
-    def _compiled(self, filter: Filter) -> ParallelMap:
+    def _compiled(self, filter: Filter) -> RowFunction:
         logp = self._model.logp()
         terms = likelihood_terms(logp, self._model, self.name)
         graph, terms = with_filter([logp, terms], self._model, {self.name: filter})
-        variables = self._raveled.variables
-        density = LogDensity(
-            self._model, variables, self._point, self._seeds, graph=graph, extra=[terms]
-        ).at_rows()
-        assert isinstance(density, ParallelMap)  # no ranks share the evaluations
-        density.on_progress = self._effort.advance
+        density = RowFunction(self._model, graph, [terms])
+        density.calls.on_progress = self._effort.advance
         return density
 
     def _pilot(self, filter: Filter, start: np.ndarray, share: float) -> Pilot:

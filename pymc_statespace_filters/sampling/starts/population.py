@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
 
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.progress import row_progress
 from pymc_statespace_filters.pymc_model.support import can_sample
@@ -24,7 +24,6 @@ from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
 from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
 from pymc_statespace_filters.sampling.starts.modes import Points, find_modes
 from pymc_statespace_filters.sampling.starts.nested import nested_reference
-from pymc_statespace_filters.sampling.target.log_density import RowsOnAllRanks
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.sampling.target.variables import RaveledVariables
@@ -172,16 +171,14 @@ def _without_stragglers(population: Population) -> Population:
     return population.at(np.flatnonzero(log_density >= least))
 
 
-def _densities(
-    rows: ParallelMap | RowsOnAllRanks, target: Target, rng: np.random.Generator
-) -> Densities:
+def _densities(rows: Rows, target: Target, rng: np.random.Generator) -> Densities:
     """Log-densities of prior and posterior; an estimate gets new noise, unless it is fixed."""
 
     def evaluate(x: Array) -> tuple[Array, Array]:
         seeds = draw_seeds(rng, (len(x), len(target.seed_names)))
         if not target.settings.refresh_noise:
             seeds = np.broadcast_to(target.fixed_seeds, seeds.shape)
-        posterior, prior = rows(x, *seeds.T)[:, :2].T
+        posterior, prior = rows(x, *seeds.T)[:2]
         return _number(prior), _number(posterior)
 
     return evaluate

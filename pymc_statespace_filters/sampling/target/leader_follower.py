@@ -28,7 +28,11 @@ from pymc_statespace_filters.parallel.communicator import (
     Message,
     describe_error,
 )
-from pymc_statespace_filters.parallel.signals import deferred_interrupts, ignored_interrupts
+from pymc_statespace_filters.parallel.signals import (
+    deferred_interrupts,
+    held_interrupts,
+    ignored_interrupts,
+)
 from pymc_statespace_filters.pymc_model.inspection import noisy_filters, panel_variables
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 
@@ -146,14 +150,18 @@ class Leader:
 
 
 @contextmanager
-def leader_errors(leader: Leader | None) -> Iterator[None]:
-    """Raise the error of the leader's callback instead of the machine code's report of one."""
-    try:
-        yield
-    except Exception:
-        if leader is not None and leader.error is not None:
-            raise leader.error from None
-        raise
+def leader_errors(leader: Leader) -> Iterator[None]:
+    """Raise the error of the leader's callback instead of the machine code's report of one.
+
+    An interrupt, which would be lost in the callback, comes at the end.
+    """
+    with held_interrupts():
+        try:
+            yield
+        except Exception:
+            if leader.error is not None:
+                raise leader.error from None
+            raise
 
 
 @contextmanager

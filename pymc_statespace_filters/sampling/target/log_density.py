@@ -6,23 +6,24 @@ filters, so that the reason of a failure costs no second evaluation.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import ArrayLike
 from pymc.model import Model
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.parallel_map import ParallelMap
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
+from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.pymc_model.compilation import compile_density
+from pymc_statespace_filters.pymc_model.compilation import compile_density, compile_raveled
 from pymc_statespace_filters.pymc_model.graph_rewrites import (
     autoregressive_noise,
     with_filter,
@@ -66,8 +67,6 @@ class LogDensity:
     group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together. The first, this one, evaluates the
         log-density; the others call `leader_follower.follow`.
-    extra : sequence of TensorVariable
-        Further results for `at_rows`.
     """
 
     def __init__(
@@ -82,15 +81,12 @@ class LogDensity:
         correlation: float | None = None,
         graph: TensorVariable | None = None,
         group: Communicator | None = None,
-        extra: Sequence[TensorVariable] = (),
     ):
         others = [v for v in model.value_vars if v not in variables]
         self.others = tuple(v.name for v in others)
         density = model.logp() if graph is None else graph
         outputs = [density, model.logp(vars=model.free_RVs), *health_outputs([density])]
         self._n_healths = len(outputs) - 2
-        outputs += extra
-        seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
         noise_inputs: list[Variable] = []
         noise: list[Variable] = []
         self._leader: Leader | None = None
@@ -112,14 +108,11 @@ class LogDensity:
         # The stored normals, or their numbers, which depend on the data.
         self._make_noise: Any = compile_density([], noise) if noise else list
         self._n_noises = len(noise)
-        outputs, joined = join_nonshared_inputs(
-            point, outputs, variables, shared_inputs=seed_inputs
+        further = [*others, *noise_inputs]
+        self._function, self._start = compile_raveled(
+            point, outputs, variables, seeds, further, **(compile_kwargs or {})
         )
-        inputs = [joined, *seed_inputs.values(), *others, *noise_inputs]
-        self._function = compile_density(inputs, outputs, **(compile_kwargs or {}))
-        self._function.trust_input = True
         self._n_seeds = len(seeds)
-        self._start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
         self._others = [np.array(point[name]) for name in self.others]
         self._native: NativeFunction | None = None
         self._normals: list[np.ndarray] = []
@@ -135,60 +128,40 @@ class LogDensity:
 
     def prepare(self) -> NativeFunction:
         """Load the machine code, and read the data as they are now."""
+        noise = [np.zeros(())] if self._carries_noise else []
+        errors: Any = nullcontext
+        if self._has_callback:
+            noise = [np.zeros((), np.int64) if self._leader is None else self._leader.address]
+        if self._leader is not None:
+            errors = partial(leader_errors, self._leader)
         self._normals = self._first_normals()
-        seeds = np.zeros(self._n_seeds, dtype=np.int64)
-        inputs = self._inputs(self._start, self._others, np.zeros(()), self._normals, seeds)
-        with leader_errors(self._leader):
-            self._native = NativeFunction(self._function, inputs)
+        seeds = [np.zeros((), np.int64)] * self._n_seeds
+        inputs = [self._start, *seeds, *self._others, *noise, *self._normals]
+        self._native = NativeFunction(self._function, inputs, errors)
         return self._native
 
-    def at_rows(self) -> "ParallelMap | RowsOnAllRanks":
+    def at_rows(self) -> Rows:
         """A function of positions (m, d) and m seeds of each noisy variable.
 
-        The first columns of its results are the log-density and that of the prior, the last ones
-        are ``extra``. It works in threads, unless all ranks evaluate together.
+        The first of its results are the log-density and that of the prior.
         """
-        if self._leader is not None:
-            return RowsOnAllRanks(self.bind())
-        seeds = np.zeros(self._n_seeds, dtype=np.int64)
-        inputs = self._inputs(self._start, self._others, np.zeros(()), self._first_normals(), seeds)
-        n = 1 + self._n_seeds
-        return ParallelMap(self._function, inputs[:n], inputs[n:])
+        native, n_varying = self._native or self.prepare(), 1 + self._n_seeds
+        return Rows(native, n_varying, in_turn=self._leader is not None)
 
     def bind(self) -> "BoundLogDensity":
         """Make the log-density callable from one thread, with separate arrays."""
         native = self._native or self.prepare()
         position, others = self._start.copy(), [value.copy() for value in self._others]
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
+        each_seed = [seeds[i : i + 1].reshape(()) for i in range(seeds.size)]
         correlation, carried = np.zeros(()), np.zeros(self.n_carried)
-        normals = self._normals
+        noise = native.example[1 + len(seeds) + len(others) :]  # not copied: there may be millions
         if self._carries_noise:
-            ends = np.cumsum([values.size for values in normals])
-            normals = np.split(carried, ends[:-1])
-        inputs = self._inputs(position, others, correlation, normals, seeds)
-        call, buffers = native.bind(inputs)
-
-        def raise_error(_keep_alive: Any = buffers) -> None:
-            with leader_errors(self._leader):
-                native(*inputs)
-
+            ends = np.cumsum([values.size for values in self._normals])
+            noise = [correlation, *np.split(carried, ends[:-1])]
+        call, raise_error = native.bind([position, *each_seed, *others, *noise])
         arguments = NativeLogDensity(call, position, seeds, self._n_healths)
         return BoundLogDensity(arguments, others, correlation, carried, raise_error)
-
-    def _inputs(
-        self,
-        position: np.ndarray,
-        others: Sequence[np.ndarray],
-        correlation: np.ndarray,
-        normals: Sequence[np.ndarray],
-        seeds: np.ndarray,
-    ) -> list[np.ndarray]:
-        """Arguments of the compiled function; parts of an array are views of it."""
-        first = [correlation] if self._carries_noise else []
-        if self._has_callback:
-            first = [np.zeros((), np.int64) if self._leader is None else self._leader.address]
-        each_seed = [seeds[i : i + 1].reshape(()) for i in range(seeds.size)]
-        return [position, *each_seed, *others, *first, *normals]
 
     def _first_normals(self) -> list[np.ndarray]:
         """The stored normals; none if ranks divide the particles, as each draws its part."""
@@ -206,9 +179,8 @@ class BoundLogDensity:
     others: list[np.ndarray]  # values of the variables that are not in the vector
     correlation: np.ndarray  # (), of an evaluation's noise with that carried; 0 draws fresh noise
     carried: np.ndarray  # (n_carried,), the normals that the chain carries
-    # Evaluates again in Python, to raise the error of the machine code, and keeps the memory of the
-    # machine code's arguments alive.
-    raise_error: Callable[[], None]
+    # Evaluates again in Python, to raise the error of the machine code, and keeps its memory alive.
+    raise_error: Callable[[], object]
 
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: ArrayLike
@@ -233,23 +205,6 @@ class BoundLogDensity:
         if result.failure == RAISED:
             self.raise_error()
         return result
-
-
-class RowsOnAllRanks:
-    """A log-density at many points, one after the other, as ranks evaluate each together."""
-
-    def __init__(self, density: BoundLogDensity) -> None:
-        self._density = density
-        self.on_progress: Callable[[int], None] = lambda count: None
-
-    def __call__(self, x: np.ndarray, *seeds: np.ndarray) -> np.ndarray:
-        """Log-densities of posterior and prior, (m, 2), at positions (m, d)."""
-        results = np.empty((len(x), 2))
-        for i, position in enumerate(x):
-            self._density(position, self._density.others, [column[i] for column in seeds])
-            results[i] = self._density.native.call.out[1:3]
-            self.on_progress(1)
-        return results
 
 
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:

@@ -6,17 +6,15 @@ which takes microseconds: the moves of the population evaluate it alone.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
 from pymc.model import Model
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.pymc_model.compilation import compile_density
+from pymc_statespace_filters.pymc_model.compilation import compile_raveled
 from pymc_statespace_filters.pymc_model.inspection import health_outputs
 from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
 from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
@@ -55,17 +53,11 @@ class RecordDensities:
         likelihoods = [structure.likelihood, pt.zeros(()) if other is None else other]
         healths = health_outputs(likelihoods)
         self._n_healths, self._n_terms = len(healths), structure.n_records + 1
-        seed_inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in seeds.items()}
-        outputs, joined = join_nonshared_inputs(
-            point, [*likelihoods, *healths], variables, shared_inputs=seed_inputs
+        self._likelihood, self._start = compile_raveled(
+            point, [*likelihoods, *healths], variables, seeds
         )
-        self._likelihood = _compiled([joined, *seed_inputs.values()], outputs)
-        outputs, joined = join_nonshared_inputs(
-            point, [structure.prior, structure.rest], variables, shared_inputs={}
-        )
-        self._prior = _compiled([joined], outputs)
+        self._prior, _ = compile_raveled(point, [structure.prior, structure.rest], variables)
         self._n_seeds = len(seeds)
-        self._start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
         self._native: tuple[NativeFunction, NativeFunction] | None = None
 
     def __getstate__(self) -> dict:
@@ -87,12 +79,12 @@ class RecordDensities:
         position = self._start.copy()
         seeds = np.zeros(self._n_seeds, dtype=np.int64)
         inputs = _inputs(position, seeds)
-        likelihood_call, first_buffers = likelihood.bind(inputs)
-        prior_call, buffers = prior.bind(inputs[:1])
+        likelihood_call, repeat_likelihood = likelihood.bind(inputs)
+        prior_call, repeat_prior = prior.bind(inputs[:1])
 
-        def raise_error(_keep_alive: Any = (first_buffers, buffers)) -> None:
-            likelihood(*inputs)
-            prior(*inputs[:1])
+        def raise_error() -> None:
+            repeat_likelihood()
+            repeat_prior()
 
         native = NativeRecordDensities(
             likelihood_call, prior_call, position, seeds, self._n_healths
@@ -106,8 +98,7 @@ class BoundRecordDensities:
 
     native: NativeRecordDensities
     n_terms: int  # one for each record, and one more
-    # Evaluates again in Python, to raise the error of the machine code, and keeps the memory of the
-    # machine code's arguments alive.
+    # Evaluates again in Python, to raise the error of the machine code, and keeps its memory alive.
     raise_error: Callable[[], None]
 
     def estimate(
@@ -132,12 +123,6 @@ class BoundRecordDensities:
         if not found:
             self.raise_error()
         return priors
-
-
-def _compiled(inputs: list, outputs: list) -> Any:
-    function = compile_density(inputs, outputs, on_unused_input="ignore")
-    function.trust_input = True
-    return function
 
 
 def _inputs(position: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:

@@ -59,7 +59,7 @@ def test_inputs_data_and_results_of_all_kinds(mode):
         rng.normal(size=(2, 5)).astype(np.float32),
     ]
     native = NativeFunction(function, inputs)
-    assert native.shapes == [(4,), (), (), (5,), ()]
+    assert [shape for shape, _ in native.kinds] == [(4,), (), (), (5,), ()]
     assert native.size == 12
     bound, kept = native.bind(inputs)
     for _ in range(3):

@@ -1,0 +1,153 @@
+"""Functions at many rows of arguments: machine code in threads, or graphs that are interpreted."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
+from pytensor.graph.replace import vectorize_graph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.native.entry_point import njit_cached
+from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
+from pymc_statespace_filters.parallel.cpu_affinity import available_cores
+from pymc_statespace_filters.parallel.signals import held_interrupts
+
+_REFRESH_SECONDS = 0.1
+# Control block of each thread: rows done, written by the thread; stop, written by the main thread.
+_N_DONE, _STOP = 0, 1
+
+
+@njit_cached
+def _call_rows(call, argument, rows, results, control):
+    """Call with every row of words (m, size), until stopped; False if a call raised."""
+    for i in range(len(rows)):
+        if control[_STOP]:
+            return True
+        for j in range(argument.size):
+            argument[j] = rows[i, j]
+        if not make_call(call):
+            return False
+        for j in range(results.shape[1]):
+            results[i, j] = call.out[1 + j]
+        control[_N_DONE] = i + 1
+    return True
+
+
+class Rows:
+    """A function whose first ``n_varying`` arguments, float64 or int64, differ from row to row.
+
+    The others are those of the function's example. Machine code runs in threads, by way of results
+    in float64. What needs Python, or is asked for ``in_turn``, as all ranks share each evaluation,
+    runs in the calling thread, one row after the other. Results depend neither on the order of the
+    rows nor on the number of threads. ``on_progress`` is called in the main thread with the number
+    of rows done since its last call.
+    """
+
+    def __init__(self, function: NativeFunction, n_varying: int, *, in_turn: bool = False) -> None:
+        self._function, self._in_turn = function, in_turn or not function.is_native
+        self._varying = function.example[:n_varying]
+        self._constant = function.example[n_varying:]
+        self.on_progress: Callable[[int], None] = lambda count: None
+
+    def __call__(self, *columns: np.ndarray) -> list[np.ndarray]:
+        """Each of the results at every row, (m, ...).
+
+        ``columns`` are the varying arguments, each with a first dimension of length m.
+        """
+        m = len(columns[0])
+        columns = tuple(
+            np.require(column, value.dtype, ("C", "W")).reshape(m, *value.shape)
+            for column, value in zip(columns, self._varying, strict=True)
+        )
+        if self._in_turn or m == 0:
+            return self._one_by_one(columns, m)
+        # The arguments of a row, of either type, as words of eight bytes.
+        words = [column.reshape(m, -1).view(np.int64) for column in columns]
+        results = self._in_threads(np.concatenate(words, axis=1))
+        kinds = self._function.kinds
+        ends = np.cumsum([int(np.prod(shape)) for shape, _ in kinds])[:-1]
+        return [
+            part.reshape(m, *shape).astype(dtype, copy=False)
+            for part, (shape, dtype) in zip(np.split(results, ends, axis=1), kinds, strict=True)
+        ]
+
+    def _one_by_one(self, columns: Sequence[np.ndarray], m: int) -> list[np.ndarray]:
+        results = [np.empty((m, *shape), dtype) for shape, dtype in self._function.kinds]
+        for i in range(m):
+            values = self._function(*(column[i, ...] for column in columns), *self._constant)
+            for result, value in zip(results, values, strict=True):
+                result[i] = value
+            self.on_progress(1)
+        return results
+
+    def _in_threads(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The results of rows of words, (m, size); NaN for rows not reached."""
+        results = np.full((len(rows), self._function.size), np.nan)
+        n_threads = min(available_cores(), len(rows))
+        ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
+        control = np.zeros((n_threads, 2), dtype=np.int64)
+        if len(rows) == 1:  # as in a search; a thread would take a millisecond
+            with held_interrupts():
+                self._call_part(rows, results, control[0])
+            self.on_progress(1)
+            return results
+        parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
+        with ThreadPoolExecutor(n_threads) as pool:
+            futures = [
+                pool.submit(self._call_part, rows[part], results[part], control[i])
+                for i, part in enumerate(parts)
+            ]
+            try:
+                self._wait(futures, control)
+            finally:
+                control[:, _STOP] = True
+        return results
+
+    def _call_part(
+        self, rows: NDArray[np.int64], results: NDArray[np.float64], control: NDArray[np.int64]
+    ) -> None:
+        argument = np.concatenate([np.ravel(value).view(np.int64) for value in self._varying])
+        ends = np.cumsum([value.size for value in self._varying])[:-1]
+        varying = [  # views of the vector of words
+            part.view(value.dtype).reshape(value.shape)
+            for part, value in zip(np.split(argument, ends), self._varying, strict=True)
+        ]
+        call, repeat = self._function.bind([*varying, *self._constant])
+        if not _call_rows(call, argument, rows, results, control):
+            repeat()
+
+    def _wait(self, futures: Sequence[Future], control: NDArray[np.int64]) -> None:
+        n_reported, pending = 0, set(futures)
+        while pending:
+            done, pending = wait(pending, _REFRESH_SECONDS, return_when=FIRST_EXCEPTION)
+            for future in done:
+                future.result()
+            n_done = int(control[:, _N_DONE].sum())
+            self.on_progress(n_done - n_reported)
+            n_reported = n_done
+
+
+def at_points(
+    arguments: Sequence[TensorVariable], outputs: Sequence[TensorVariable]
+) -> tuple[list[TensorVariable], list[Variable]]:
+    """Symbols of m points, (m, ...) for each argument, and the outputs there, each (m, ...)."""
+    points = [pt.tensor(dtype=a.dtype, shape=(None, *a.type.shape)) for a in arguments]
+    graphs = vectorize_graph(list(outputs), dict(zip(arguments, points, strict=True)))
+    # A constant output, such as an initial mean given as numbers, has no axis of points yet.
+    return points, [
+        graph if graph.ndim > output.ndim else pt.alloc(graph, points[0].shape[0], *graph.shape)
+        for graph, output in zip(graphs, outputs, strict=True)
+    ]
+
+
+def interpreted_at_points(arguments: Sequence[TensorVariable], output: TensorVariable) -> Callable:
+    """The function of arrays (m, ...), one for each argument, that gives the outputs (m, ...).
+
+    Machine code would take longer to compile than it saves in some thousand calls.
+    """
+    points, (graph,) = at_points(arguments, [output])
+    return pytensor.function(points, graph, mode="FAST_COMPILE", on_unused_input="ignore")
