@@ -9,11 +9,18 @@ import xarray as xr
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
+from pymc_statespace_filters.evaluation.resumption import (
+    attributes,
+    going_on,
+    resumes,
+    states_before,
+    stored,
+)
 from pymc_statespace_filters.filters.protocol import Filter
 from pymc_statespace_filters.filters.recommendation import check_system_and_filter
 from pymc_statespace_filters.filters.records import single_records
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.states import FilterRun
+from pymc_statespace_filters.ops.states import FilterRun, ResumableRun
 from pymc_statespace_filters.system.model import StateSpaceModel
 from pymc_statespace_filters.system.panel import checked_panel, row_coords
 from pymc_statespace_filters.system.panel_parameters import panel_parameters
@@ -35,6 +42,7 @@ def run_filter(
     t0: float = 0.0,
     seed: int = 0,
     at: str = "observations",
+    state: xr.Dataset | None = None,
 ) -> xr.Dataset:
     """Run a filter along a record at one value of each parameter, and return terms and states.
 
@@ -51,6 +59,11 @@ def run_filter(
         this seed.
     at : {"observations", "steps"}
         When the states are kept: at the observations, or at every step from 0 to the last of them.
+    state : xarray.Dataset, optional
+        An earlier run, of the same system, filter, parameters, seed and t0, that goes on with these
+        rows. Steps and times count from the old step 0 and come after the last old row; ``inputs``
+        cover old and new steps; of a panel, every record goes on. Terms and states are those of one
+        run over all rows, bit for bit.
 
     Returns
     -------
@@ -64,12 +77,15 @@ def run_filter(
         -inf and states NaN. Of a panel, the dimension of the states is ``row`` instead of ``time``,
         with the coordinates ``record``, ``step`` and ``time`` of each row, the records one below
         the other; that of ``log_likelihood`` is ``obs``, with ``obs_record``, ``obs_step`` and
-        ``obs_time``.
+        ``obs_time``. ``filter_state`` is what the filter goes on from with ``state``, a vector, or
+        one for each record of a panel; `GuidedPF`, which needs the record ahead, and `GridFilter`
+        have none.
 
     Raises
     ------
     ModelError
-        If an argument does not fit the system.
+        If an argument does not fit the system, or ``state`` is of a filter that cannot go on, or of
+        a run that failed or differs in more than its rows.
 
     Warns
     -----
@@ -108,6 +124,7 @@ def run_filter(
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
     data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+    labels = None
     if panel is None:
         record = checked_record(system, observed, **data)
         theta = flat_parameters(system, params)
@@ -118,24 +135,36 @@ def run_filter(
         arguments: list[Any] = [(theta, *record, noise)]
     else:
         table = checked_panel(system, panel, observed, **data)
+        labels = table.records.labels
         of_records = panel_parameters(system, params, table.records)
         records = single_records(table, noise)
         arguments = [(own, *each) for own, each in zip(of_records, records, strict=True)]
-    evaluate = evaluator(FilterRun(system, filter))
+    common = attributes(system, filter, [each[0] for each in arguments], noise, arguments[0][4])
+    first = [np.int64(0)] * len(arguments)
+    before = [np.empty(0)] * len(arguments)
+    if state is not None:
+        before = states_before(state, filter, common, labels)
+        names = labels or [None]
+        arguments = [going_on(system, *each) for each in zip(arguments, before, names, strict=True)]
+        first = [np.int64(one[0]) + 1 for one in before]
     at_steps = [each[1] for each in arguments]
-    rows = [rows_at(at, own) for own in at_steps]
-    runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
+    rows = [own[own >= k] for own, k in zip((rows_at(at, s) for s in at_steps), first, strict=True)]
+    left: list[np.ndarray] = []
+    if resumes(filter):
+        evaluate = evaluator(ResumableRun(system, filter))
+        parts = zip(arguments, rows, before, strict=True)
+        found = [evaluate(*each, own, start) for each, own, start in parts]
+        runs, left = [one[:-1] for one in found], [one[-1] for one in found]
+    else:
+        evaluate = evaluator(FilterRun(system, filter))
+        runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
     terms, health, *states = (list(parts) for parts in zip(*runs, strict=True))
-    warn_about(
-        system,
-        filter,
-        np.array(health),
-        lambda i: arguments[i],
-        labels=None if panel is None else table.records.labels,
-    )
+    warn_about(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
     dataset = _dataset(system, row_dim, *map(np.concatenate, states))
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
+    if left:
+        dataset = dataset.assign(stored(left, labels))
     begin = float(arguments[0][4])
     if panel is None:
         coords: dict[str, Any] = {
@@ -143,9 +172,8 @@ def run_filter(
         }
     else:
         coords_of = partial(row_coords, t0=begin, dt=system.dt)
-        labels = table.records.labels
         coords = coords_of(row_dim, labels, rows) | coords_of(term_dim, labels, at_steps, "obs_")
-    return dataset.assign_coords(coords).assign_attrs(filter=repr(filter), at=at)
+    return dataset.assign_coords(coords).assign_attrs(common, at=at)
 
 
 def _dataset(

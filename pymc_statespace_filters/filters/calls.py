@@ -58,11 +58,16 @@ class Record(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Where the results of one record go: terms (J,), effective numbers (J,), and health (3,)."""
+    """Where the results of one record go: terms (J,), effective numbers (J,), and health (3,).
+
+    ``state`` is the filter after the last row, of a length that the filter knows; none is wanted
+    where it is empty.
+    """
 
     terms: np.ndarray
     n_effective: np.ndarray
     health: np.ndarray
+    state: np.ndarray
 
 
 @njit_internal
@@ -93,10 +98,9 @@ def opened(plan, record, request, results):
     sizes[RESULTS.n_wanted] = call.request[REQUEST.n_wanted]
     sizes[RESULTS.n_states], sizes[RESULTS.n_members] = words[PLAN.n], words[PLAN.n_members]
     sizes[RESULTS.n_observables] = words[PLAN.p]
-    sizes[RESULTS.n_records], sizes[RESULTS.n_theta] = (
-        given[RECORD.n_records],
-        given[RECORD.n_theta],
-    )
+    sizes[RESULTS.n_records] = given[RECORD.n_records]
+    sizes[RESULTS.n_theta] = given[RECORD.n_theta]
+    sizes[RESULTS.n_state] = words[PLAN.state_size]
     return _check_record(call), call
 
 
@@ -129,6 +133,19 @@ def _check_record(call):
     if given[RECORD.n_observed] != n_rows or given[RECORD.n_observables] != plan[PLAN.p]:
         return np.int64(OBSERVED)
     return OK
+
+
+@njit_internal
+def state_given(request):
+    """The state from which the filter goes on; empty where it starts."""
+    return reals_at(request[REQUEST.state], (request[REQUEST.n_state],))
+
+
+@njit_internal
+def state_wanted(call):
+    """Where the state of the filter after the last row goes; empty if it is not wanted."""
+    address = call.results[RESULTS.state]
+    return reals_at(address, (call.results[RESULTS.n_state] if address != 0 else 0,))
 
 
 @njit_internal
@@ -238,7 +255,7 @@ def likelihood_entry(
             health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
             status = evaluate(
                 call.plan, single_record(call, number, first, last), call.request,
-                _seed(call, first), Terms(own, numbers, health),
+                _seed(call, first), Terms(own, numbers, health, state_wanted(call)),
             )  # fmt: skip
             if status != OK:
                 return status

@@ -198,6 +198,8 @@ class GuidedPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
+    resumes: ClassVar[bool] = False
+    needs_record_ahead: ClassVar[bool] = True
     entry: ClassVar[EntryPoint] = likelihood_entry("guided_pf", _evaluate, needs=(FILL_NORMALS,))
     resample_below: float = 0.5
 

@@ -57,6 +57,7 @@ class PlanSlots(NamedTuple):
     last_event: int = N_HEADER + 27
     updates: int = N_HEADER + 28
     lag: int = N_HEADER + 29
+    state_size: int = N_HEADER + 30  # of the state of a filter between two rows, as a vector
 
 
 PLAN = PlanSlots()

@@ -264,7 +264,11 @@ class Filter(Protocol):
 
 @runtime_checkable
 class RunFilter(Filter, Protocol):
-    """A filter that `run_filter` can show."""
+    """A filter that `run_filter` can show.
+
+    With an attribute ``resumes`` that is true, it is planned and can go on from its state after
+    earlier rows, see `plan.RequestSlots`.
+    """
 
     def compile_run(self, system: System) -> Compiled[RunFunction]:
         """Compile one run with all that it computes."""

@@ -130,8 +130,11 @@ def evaluator(op: FilterOp) -> Any:
     """
     with COMPILATION:
         compiled = kernel(op)
+        if isinstance(compiled, PlannedFunction):
+            function: Callable = compiled.loaded()
+        else:
+            function = _jitted(op, compiled)
     kinds = [np.dtype(dtype) for _, dtype, _ in op.input_types]
-    function = compiled if isinstance(compiled, PlannedFunction) else _jitted(op, compiled)
     call = TimedCall(function)
 
     def evaluate(*values: Any) -> tuple:

@@ -45,3 +45,11 @@ class FilterRun(FilterOp):
     def compile(self, system: CompiledSystem) -> Compiled:
         """The filter's run."""
         return self.filter.compile_run(system)
+
+
+class ResumableRun(FilterRun):
+    """`FilterRun` from a state of the filter, empty at the start, with the state that it leaves."""
+
+    input_types = (*FilterRun.input_types, ("state", "float64", 1))
+    output_types = (*FilterRun.output_types, pt.dvector)
+    result_names = (*FilterRun.result_names, "state")

@@ -78,6 +78,8 @@ class RequestSlots(NamedTuple):
     observer_reals: int = 17
     replacement: int = 18  # a function to call instead of the filter, and its number of the record
     number: int = 19
+    state: int = 20  # of the filter after earlier rows, from which it goes on
+    n_state: int = 21
 
 
 class ResultSlots(NamedTuple):
@@ -94,23 +96,25 @@ class ResultSlots(NamedTuple):
     n_normals: int = 8
     n_records: int = 9
     n_theta: int = 10
-    terms: int = 11
-    health: int = 12
-    n_effective: int = 13
-    mean: int = 14
-    sd: int = 15
-    cov: int = 16
-    drawn: int = 17
-    n_effective_wanted: int = 18
-    members: int = 19
-    weights: int = 20
-    predicted: int = 21
-    predicted_cov: int = 22
-    log_below: int = 23
-    log_above: int = 24
-    tape: int = 25
-    theta_bar: int = 26
-    normals: int = 27
+    n_state: int = 11
+    terms: int = 12
+    health: int = 13
+    n_effective: int = 14
+    mean: int = 15
+    sd: int = 16
+    cov: int = 17
+    drawn: int = 18
+    n_effective_wanted: int = 19
+    members: int = 20
+    weights: int = 21
+    predicted: int = 22
+    predicted_cov: int = 23
+    log_below: int = 24
+    log_above: int = 25
+    tape: int = 26
+    theta_bar: int = 27
+    normals: int = 28
+    state: int = 29
 
 
 class HeaderSlots(NamedTuple):
@@ -145,6 +149,7 @@ SHAPES: Mapping[str, tuple[str | int, ...]] = {
     "tape": ("n_tape", "tape_width"),
     "theta_bar": ("n_records", "n_theta"),
     "normals": ("n_normals",),
+    "state": ("n_state",),
 }
 """Shapes of the results; a caller that wants fewer dimensions leaves out the first."""
 
@@ -175,6 +180,7 @@ ARGUMENTS: Mapping[tuple[str, int], Argument] = {
     ("wanted", 1): Argument("request", REQUEST.wanted, (REQUEST.n_wanted,)),
     ("draw_seed", 0): _value(REQUEST.draw_seed),
     ("terms_bar", 1): Argument("request", REQUEST.terms_bar, (REQUEST.n_terms_bar,)),
+    ("state", 1): Argument("request", REQUEST.state, (REQUEST.n_state,)),
     ("tape", 2): Argument("request", REQUEST.tape, (REQUEST.n_tape, REQUEST.tape_width)),
     ("rank", 0): _value(REQUEST.rank),
     ("n_ranks", 0): _value(REQUEST.n_ranks),
@@ -204,12 +210,13 @@ REFUSALS: dict[int, str] = {
     "of records replace the parameters' dimension too",
     9: "normals must be those of this filter, system and steps",
     10: "the callback of a likelihood raised an error",
+    11: "the state of the filter must be one that it left after earlier rows of this record",
 }
 """Why a call was refused, by its status."""
 
 (
     DAMAGED, STEPS, INPUT_COLUMNS, INPUT_ROWS, OBSERVED, PANEL_COLUMNS, PANEL_STEPS, PANEL_RECORDS,
-    NORMALS, RAISED,
+    NORMALS, RAISED, STATE,
 ) = REFUSALS  # fmt: skip
 
 PLAN_ARGUMENTS = {"plan": I64_PTR, "record": I64_PTR, "request": I64_PTR, "results": I64_PTR}
@@ -304,6 +311,10 @@ class Plan:
         words = _kept.setdefault(self._symbol, words)
         llvm.add_symbol(self._symbol, words.ctypes.data)
         return words.ctypes.data
+
+    def load(self) -> None:
+        """Compile the functions, or load them from disk, and define the symbol."""
+        _ = self.address
 
     @property
     def symbol(self) -> str:

@@ -89,6 +89,11 @@ class PlannedFunction:
         """Identifies the code; None if it cannot be cached on disk."""
         return key_of(__name__, repr((self.arguments, self.results)), self.plan.key)
 
+    def loaded(self) -> "PlannedFunction":
+        """Compile or load the functions of the plan now, not in the first call."""
+        self.plan.load()
+        return self
+
     def __call__(self, *values: Any) -> Any:
         """Call from Python; arrays are contiguous and of the right types."""
         words = _DEFAULT_WORDS[:]

@@ -32,12 +32,15 @@ class EnsembleFilterBase:
         Whether the mean of the estimates is the likelihood, for any number of members.
     simulates : bool
         Whether an update simulates an observation of every member.
+    resumes : bool
+        Whether the filter can go on from its state after earlier rows.
     """
 
     noisy: ClassVar[bool] = True
     unbiased: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
+    resumes: ClassVar[bool] = True
     entry: ClassVar[EntryPoint]
 
     def size(self) -> int:
@@ -163,4 +166,7 @@ class EnsembleFilterBase:
         settings = (size, *self.noise_sizes(system), *self.settings())
         if order is not None:
             others = {**others, "order": order}
-        return make_plan(system, run, functions, settings, n_members=size, **others)
+        state_size = 1 + (system.n + 1) * size if self.resumes else 0  # see `loop.dump`
+        return make_plan(
+            system, run, functions, settings, n_members=size, state_size=state_size, **others
+        )

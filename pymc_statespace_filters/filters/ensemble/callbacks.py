@@ -64,6 +64,7 @@ def run_observed(call, plan, record, integers, reals):
     request[REQUEST.observer_reals] = reals.ctypes.data
     terms, health = np.empty(call.record[RECORD.n_rows]), np.empty(HEALTH_SIZE)
     results[RESULTS.terms], results[RESULTS.health] = terms.ctypes.data, health.ctypes.data
+    results[RESULTS.state] = call.results[RESULTS.state]
     status = call_for_status(call.plan[PLAN.evaluate], (plan, record, request, results))
     keep_alive(integers)
     keep_alive(reals)

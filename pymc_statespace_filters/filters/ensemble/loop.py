@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import NORMALS, REQUEST
+from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
+from pymc_statespace_filters.compiler.native.plan import NORMALS, REQUEST, STATE
 from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
-from pymc_statespace_filters.filters.calls import OK, likelihood_entry, reals_at
+from pymc_statespace_filters.filters.calls import OK, likelihood_entry, reals_at, state_given
 from pymc_statespace_filters.filters.ensemble.callbacks import (
     ENDED,
     FORECAST,
@@ -141,6 +141,26 @@ def no_resampling(resampler, noise, j, k, n_weighted, members, local):
     return False
 
 
+@njit_internal
+def dump(k, members, state):
+    """Write the step, NaN after a failure, the members and their log weights to a vector."""
+    n, N = members.X.shape
+    state[0] = k
+    for a in range(n):
+        copy_into(state[1 + a * N : 1 + (a + 1) * N], members.X[a])
+    copy_into(state[1 + n * N :], members.log_w)
+
+
+@njit_internal
+def restore(state, members):
+    """Read what `dump` wrote; returns the step."""
+    n, N = members.X.shape
+    for a in range(n):
+        copy_into(members.X[a], state[1 + a * N : 1 + (a + 1) * N])
+    copy_into(members.log_w, state[1 + n * N :])
+    return np.int64(state[0])
+
+
 def ensemble_filter(
     name: str,
     workspace: Callable,
@@ -192,10 +212,15 @@ def ensemble_filter(
         width, dt, health = local.width, system.dt, to.health
         observer = observer_of(request)
         health[0], health[1], health[2] = n_members, NONE, -1
-        initialise(system, initial_normals(noise), width, members.X)
-        k = np.int64(0)
         nothing, ancestors = np.empty(0), resampling.ancestors
-        emit(observer, FORECAST, -1, k, members, nothing, ancestors)
+        k, before = np.int64(0), state_given(request)
+        if before.size == 0:
+            initialise(system, initial_normals(noise), width, members.X)
+            emit(observer, FORECAST, -1, k, members, nothing, ancestors)
+        elif before.size == plan[PLAN.state_size] and noise.stored.size == 0:
+            k = restore(before, members)
+        else:
+            return STATE
         for j in range(steps.size):
             while k < steps[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
@@ -217,6 +242,8 @@ def ensemble_filter(
                 emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
         if health[1] == NONE:
             emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
+        if to.state.size:
+            dump(np.float64(k) if health[1] == NONE else np.nan, members, to.state)
         return OK
 
     parts = (str(n_settings), workspace, update, resampler, resample)

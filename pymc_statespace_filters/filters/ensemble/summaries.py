@@ -220,9 +220,8 @@ def _run(plan, record, request, results):
     if status != OK or call.request[REQUEST.sizes_only]:
         return status
     rows, to, integers = wanted_rows(call), call.results, _header(call, wanted_rows(call))
-    mean, cov, members, weights = parts = _stored(integers)
-    for part in parts:
-        part[:] = np.nan
+    mean, cov, members, weights = _stored(integers)
+    mean[:], cov[:], members[:], weights[:] = np.nan, np.nan, np.nan, np.nan
     status, terms, health = run_observed(call, plan, record, integers, np.empty(0))
     until = first_unknown(call, health)
     for row in range(rows.size):
