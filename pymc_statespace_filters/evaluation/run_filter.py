@@ -166,7 +166,7 @@ def run_filter(
     if left:
         dataset = dataset.assign(stored(left, labels))
     begin = float(arguments[0][4])
-    if panel is None:
+    if labels is None:
         coords: dict[str, Any] = {
             dim: begin + own[0] * system.dt for dim, own in ((row_dim, rows), (term_dim, at_steps))
         }

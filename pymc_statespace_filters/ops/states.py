@@ -1,6 +1,9 @@
 """States along a record, and whole runs of a filter: operations without a derivative."""
 
+from typing import ClassVar
+
 import pytensor.tensor as pt
+from pytensor.tensor.type import TensorType
 
 from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
 from pymc_statespace_filters.filters.protocol import Compiled, RunFilter, StatesFilter
@@ -37,9 +40,14 @@ class FilterRun(FilterOp):
     without members.
     """
 
-    input_types = (*RECORD_INPUTS, ("wanted", "int64", 1))
+    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (
+        *RECORD_INPUTS,
+        ("wanted", "int64", 1),
+    )
     output_types = (pt.dvector, pt.dvector, pt.dmatrix, pt.dtensor3, pt.dtensor3, pt.dmatrix)
-    result_names = ("terms", "health", "mean", "cov", "members", "weights")
+    result_names: ClassVar[tuple[str, ...]] = (
+        "terms", "health", "mean", "cov", "members", "weights",
+    )  # fmt: skip
     filter: RunFilter
 
     def compile(self, system: CompiledSystem) -> Compiled:
@@ -50,6 +58,9 @@ class FilterRun(FilterOp):
 class ResumableRun(FilterRun):
     """`FilterRun` from a state of the filter, empty at the start, with the state that it leaves."""
 
-    input_types = (*FilterRun.input_types, ("state", "float64", 1))
-    output_types = (*FilterRun.output_types, pt.dvector)
-    result_names = (*FilterRun.result_names, "state")
+    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (
+        *FilterRun.input_types,
+        ("state", "float64", 1),
+    )
+    output_types: ClassVar[tuple[TensorType, ...]] = (*FilterRun.output_types, pt.dvector)
+    result_names: ClassVar[tuple[str, ...]] = (*FilterRun.result_names, "state")
