@@ -83,12 +83,19 @@ def test_killed_and_resumed(kind, tmp_path):
 # The moments at which a process dies, without a process: quick enough for many of them.
 
 
-@pytest.fixture
+SMALL = {"draws": 700, "tune": 400}
+
+
+@pytest.fixture(scope="module")
 def small():
     return state_space_model(psf.BootstrapPF(10))
 
 
-SMALL = {"draws": 700, "tune": 400}
+@pytest.fixture(scope="module")
+def finished(small, tmp_path_factory):
+    """The folder of a run and its draws, which no test may change."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, sample_dram(small, checkpoint=folder, **SMALL)
 
 
 @pytest.fixture
@@ -96,9 +103,12 @@ def often(monkeypatch):
     monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
 
 
-def test_a_segment_torn_anywhere(small, tmp_path, often):
-    expected = sample_dram(small, **SMALL)
-    folder = tmp_path / "run"
+def test_a_checkpoint_changes_no_draw(small, finished):
+    assert_identical(sample_dram(small, **SMALL), finished[1])
+
+
+def test_a_segment_torn_anywhere(small, finished, tmp_path, often):
+    folder, (_, expected) = tmp_path / "run", finished
     assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
     for share in (0.0, 0.3, 1.0):
         path = sorted(folder.glob("chains.*/chain-1.*.segment"))[int(-share)]
@@ -111,10 +121,10 @@ def test_a_segment_torn_anywhere(small, tmp_path, often):
         assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
 
 
-def test_a_finished_run_returns_at_once(small, tmp_path, monkeypatch):
-    first = sample_dram(small, checkpoint=tmp_path, **SMALL)
+def test_a_finished_run_returns_at_once(small, finished, monkeypatch):
+    folder, first = finished
     monkeypatch.setattr(chain_task.ChainTask, "_advance", None)
-    assert_identical(sample_dram(small, checkpoint=tmp_path, cores=1, **SMALL), first)
+    assert_identical(sample_dram(small, checkpoint=folder, cores=1, **SMALL), first)
 
 
 @pytest.mark.parametrize("random_seed", [None, "generator"])
@@ -155,11 +165,9 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
         ({"screen": psf.EKF()}, r"screen: "),
     ],
 )
-def test_a_checkpoint_of_another_run(tmp_path, changes, message):
-    asked = {"model": state_space_model(psf.BootstrapPF(10)), **SMALL}
-    sample_dram(**asked, checkpoint=tmp_path)
+def test_a_checkpoint_of_another_run(small, finished, changes, message):
     with pytest.raises(DataMismatchError, match=message):
-        sample_dram(**asked | changes, checkpoint=tmp_path)
+        sample_dram(**{"model": small, **SMALL} | changes, checkpoint=finished[0])
 
 
 def test_numbers_of_numpy_are_numbers(small, tmp_path):
