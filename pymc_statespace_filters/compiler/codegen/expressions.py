@@ -5,7 +5,7 @@ expressions are one object, constants are folded, and products with zero vanish.
 of the cost of Jacobians and identity matrices, which are mostly zeros and ones.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import reduce
 
@@ -216,3 +216,22 @@ def _fold(op: ps.ScalarOp, args: tuple) -> Value:
     with np.errstate(all="ignore"):
         # PyTensor's implementations follow the dtypes of their arguments.
         return python_type(op.impl(*(np.float64(a) if kind_of(a) == FLOAT else a for a in args)))
+
+
+def in_order(values: Iterable[Value], written: Collection[Value]) -> list[Expression]:
+    """Expressions that ``values`` depend on, arguments first; not recursive, for deep graphs."""
+    order: list[Expression] = []
+    seen = set(written)
+    for root in values:
+        stack = [(root, False)]
+        while stack:
+            value, arguments_done = stack.pop()
+            if not isinstance(value, Expression) or value in seen:
+                continue
+            if arguments_done or value.op is None:
+                seen.add(value)
+                order.append(value)
+            else:
+                stack.append((value, True))
+                stack.extend((a, False) for a in reversed(value.args))
+    return order

@@ -9,6 +9,8 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.codegen.function_types import (
     CompiledFunction,
     Graph,
+    MemberFunction,
+    ParameterFunction,
     VectorFunction,
 )
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
@@ -67,8 +69,8 @@ class CompiledSystem:
       its state, see `guided_noise`; X has one row more, to which log density ratios are added.
     * ``linearized_step(c, inputs, k, t, noise, X, out)`` writes the next state of every column of X
       with this noise and its Jacobians, see `linearize_step`.
-    * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
-      its information.
+    * ``observation_information(c, inputs, k, t, d, X, out)`` writes log p(d | x), its score and its
+      information, for one member.
     * ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
       and ``start_back`` are the algebra of a guide, see `guidance`.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
@@ -148,15 +150,17 @@ class CompiledSystem:
     # Functions
 
     @cached_property
-    def prepare(self) -> CompiledFunction:
+    def prepare(self) -> ParameterFunction:
         """Theta -> c."""
-        theta = pt.tensor("theta", shape=(self.n_theta,), dtype="float64")
+        given = theta = pt.tensor("theta", shape=(self._written.n_theta,), dtype="float64")
+        if self._extension is not None:
+            (theta,) = self._extension.bind([given])
         mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
-        prepare = followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
-        return self.at_parameters(prepare)
+        outputs = [theta, mean]
+        return followed_by_square_roots(outputs, self.model, given, theta, self._covariances)
 
     @cached_property
-    def initialise(self) -> CompiledFunction:
+    def initialise(self) -> MemberFunction:
         """Draw the state at step 0."""
         z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
         draw = self.model.equations.initial_draw
@@ -164,18 +168,18 @@ class CompiledSystem:
             state = mean + self._square_roots["initial_cov"] @ z
         else:
             (state,) = draw.bind([self._symbols["theta"], z])
-        return self._member_function("initialise", "c, Z, X", state, "X[{i}, member]", z=z)
+        return self._member_function("initialise", "c, Z, X", state, "X", z=z)
 
     @cached_property
-    def propagate(self) -> CompiledFunction:
+    def propagate(self) -> MemberFunction:
         """Move every member one step, in place."""
         z = _normals(self.m)
         arguments = "c, inputs, k, t, Z, X"
         step = self._step(self._symbols["x"], z)
-        return self._member_function("propagate", arguments, step, "X[{i}, member]", "xut", z=z)
+        return self._member_function("propagate", arguments, step, "X", "xut", z=z)
 
     @cached_property
-    def propagate_guided(self) -> CompiledFunction:
+    def propagate_guided(self) -> MemberFunction:
         """Move every member one step by guided noise, in place, and weigh its move."""
         n, m, z = self.n, self.m, _normals(self.m)
         member = pt.tensor("x", shape=(n + 1,), dtype="float64")
@@ -185,25 +189,25 @@ class CompiledSystem:
         inputs = {"theta": self._c, "u": self._symbols["u"], "t": self._symbols["t"]}
         graph = Graph(inputs | {"x": member, "z": z, "gains": gains}, [moved])
         arguments = "c, inputs, k, t, gains, Z, X"
-        return member_function("propagate_guided", arguments, graph, "X[{i}, member]")
+        return member_function("propagate_guided", arguments, graph, "X")
 
     @cached_property
-    def linearized_step(self) -> CompiledFunction:
+    def linearized_step(self) -> MemberFunction:
         """The next state and its Jacobians, at points with the same noise."""
         x, noise = self._symbols["x"], pt.tensor("noise", shape=(self.m,), dtype="float64")
         linearized = linearize_step(self._step(x, noise), x, noise, self.free)
         inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xut"}, "noise": noise}
         arguments = "c, inputs, k, t, noise, X, out"
         graph = Graph(inputs, [linearized])
-        return member_function("linearized_step", arguments, graph, "out[{i}, member]")
+        return member_function("linearized_step", arguments, graph, "out")
 
     @cached_property
-    def observation_information(self) -> CompiledFunction:
+    def observation_information(self) -> MemberFunction:
         """log p(d | x), its score and its information, at one state."""
         information = observation_information(self.model, self._given("xutd"), self.free)
         inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xutd"}}
-        arguments = "c, inputs, k, t, d, X, member"
-        return _vector_function("observation_information", arguments, Graph(inputs, [information]))
+        arguments, graph = "c, inputs, k, t, d, X, out", Graph(inputs, [information])
+        return member_function("observation_information", arguments, graph, "out", vector=False)
 
     @cached_property
     def smoothed_cov(self) -> CompiledFunction:
@@ -221,34 +225,34 @@ class CompiledSystem:
         return _vector_function("start_back", "step, path, psi", step_back(self.n, self.n))
 
     @cached_property
-    def observe(self) -> CompiledFunction:
+    def observe(self) -> MemberFunction:
         """Simulate an observation of every member."""
         z = _normals(self.r)
         noise = {"e": self._coloured("observation_noise", z)}
         seen = call(self.model.equations.observation, self.model, self._given("xut") | noise)
         arguments = "c, inputs, k, t, Z, X, D"
-        return self._member_function("observe", arguments, seen, "D[{i}, member]", "xut", z=z)
+        return self._member_function("observe", arguments, seen, "out", "xut", z=z)
 
     @cached_property
-    def expect(self) -> CompiledFunction:
+    def expect(self) -> MemberFunction:
         """The observation of every member without noise."""
         seen = expected_observation(self.model, self._given("xut"))
         arguments = "c, inputs, k, t, X, D"
-        return self._member_function("expect", arguments, seen, "D[{i}, member]", "xut")
+        return self._member_function("expect", arguments, seen, "out", "xut")
 
     @cached_property
-    def log_density(self) -> CompiledFunction:
+    def log_density(self) -> MemberFunction:
         """log p(d | x) of every member."""
         density = pt.atleast_1d(observation_log_density(self.model, self._given("xutd")))
         arguments = "c, inputs, k, t, d, X, out"
-        return self._member_function("log_density", arguments, density, "out[member]", "xutd")
+        return self._member_function("log_density", arguments, density, "out", "xutd")
 
     @cached_property
-    def step_moments(self) -> CompiledFunction:
+    def step_moments(self) -> MemberFunction:
         """Mean and variance of the next state, for one state and additive noise."""
         arguments = "c, inputs, k, t, X, M"
         moments = structure.step_moments(self.model, self._given("xut"))
-        return self._member_function("step_moments", arguments, moments, "M[{i}, member]", "xut")
+        return self._member_function("step_moments", arguments, moments, "out", "xut")
 
     def _step(self, x: TensorVariable, z: TensorVariable) -> TensorVariable:
         """The next state, from standard normals."""
@@ -267,7 +271,7 @@ class CompiledSystem:
 
     def _member_function(
         self, name: str, arguments: str, output: TensorVariable, target: str, inputs: str = "", **z
-    ) -> CompiledFunction:
+    ) -> MemberFunction:
         graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 

@@ -24,7 +24,7 @@ from pytensor.tensor.math import Dot
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, staged
+from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, on_arrays, staged
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -126,7 +126,7 @@ def _size(variable: TensorVariable) -> int:
 def extend(extension: FrozenFunctionGraph) -> CompiledFunction:
     """theta -> (theta, constants), an array."""
     theta, extended = _symbols(extension)
-    return staged([theta], extended)
+    return on_arrays(staged("extend", [theta], extended))
 
 
 def pull_back(extension: FrozenFunctionGraph) -> CompiledFunction:
@@ -134,7 +134,8 @@ def pull_back(extension: FrozenFunctionGraph) -> CompiledFunction:
     theta, extended = _symbols(extension)
     cotangent = extended.type("c_bar")
     (bar,) = pytensor.grad(None, [theta], known_grads={extended: cotangent})
-    return staged([theta, cotangent], pt.specify_shape(bar, theta.type.shape))
+    theta_bar = pt.specify_shape(bar, theta.type.shape)
+    return on_arrays(staged("pull_back", [theta, cotangent], theta_bar))
 
 
 def after_extension(

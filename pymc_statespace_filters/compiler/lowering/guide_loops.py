@@ -63,7 +63,10 @@ def follow_loop(
                 for b in range(n):
                     X[a, 1 + b] = E[k, a] + reach * root[a, b]
                     X[a, 1 + n + b] = E[k, a] - reach * root[a, b]
-            linearize(constants, rows, k, t0 + k * dt, step[n_means:], X, results)
+            linearize(
+                constants.ctypes.data, rows.ctypes.data, k, t0 + k * dt, step[n_means:].ctypes.data, 0,
+                X.ctypes.data, results.ctypes.data, n_points,
+            )  # fmt: skip
             for i in range(n_means):
                 total = 0.0
                 for point in range(1, n_points):
