@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    MemberArguments,
+    jit,
+)
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.entry_points import MemberArguments, entry_point
+from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.compiler.lowering.observation_sampler import distribution_sampler
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import (
@@ -329,9 +333,7 @@ def simulate(
     )
 
 
-def _run(
-    run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *rest: Any
-) -> Any:
+def _run(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *rest: Any) -> Any:
     """Call a simulator; in a thread if it takes long, so that an interrupt ends the wait."""
     is_long = steps.size > 0 and steps[-1] > _MANY_STEPS
     return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *rest)

@@ -73,7 +73,7 @@ def test_a_member_function_is_the_same_on_arrays(on_arrays):
 def test_what_no_member_enters_is_computed_before_the_loop():
     text = member_function("move", "c, Z, X", member_graph(), "X").entry.code.text
     before, _, inside = text.partition("for.body:")
-    assert "@\"psf.exp\"(double" in before
+    assert '@"psf.exp"(double' in before
     assert "call" not in inside.partition("declare")[0]
     # The parameters are read before; in the loop, two states and two normals of the member.
     assert inside.count("load double") == 4

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from numba import njit
-
 from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE
+
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
 

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-
 from ctypes import CFUNCTYPE, c_void_p
 
 import numpy as np

@@ -21,6 +21,7 @@ from pymc_statespace_filters.compiler.codegen.machine_code import ModuleEntryPoi
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR
 
+
 def mixed(c):
     """Truth values, whole numbers and floats in all operations that mix them."""
     small = c[0] < c[1]

@@ -106,7 +106,9 @@ def _at_address(inputs: Mapping[str, Variable]) -> str:
 def _build(
     name: str, arguments: str, body: list[str], **parts: CompiledFunction
 ) -> CompiledFunction:
-    namespace = {"np": np, "nan": np.nan} | {part: compiled.function for part, compiled in parts.items()}
+    namespace = {"np": np, "nan": np.nan} | {
+        part: compiled.function for part, compiled in parts.items()
+    }
     function, source = function_of(name, arguments, body, namespace)
     keys = (part.key for part in parts.values())
     return CompiledFunction(function, key_of(__name__, source, *keys))

@@ -7,7 +7,7 @@ PyTensor has code for.
 """
 
 import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -109,7 +109,12 @@ class Emitter:
     """
 
     def __init__(
-        self, module: Module, builder: ir.IRBuilder, read: Callable[[str], ir.Value], *, vector: bool
+        self,
+        module: Module,
+        builder: ir.IRBuilder,
+        read: Callable[[str], ir.Value],
+        *,
+        vector: bool,
     ) -> None:
         self._module, self.builder, self._read, self._vector = module, builder, read, vector
         self._emitted: dict[Value, ir.Value] = {}

@@ -12,7 +12,7 @@ from numba import types
 from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
 from pymc_statespace_filters.compiler.native.jit import linked
 
 # Inputs that differ between the members of an ensemble.
@@ -38,6 +38,8 @@ MEMBER_ARGUMENTS = {
 }  # fmt: skip
 """Arguments of a function of all members. ``z`` holds normals in rows of ``width``, or one
 vector for all members: an observation or noise. ``out`` may hold gains, which are read."""
+
+MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
 
 PARAMETER_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "out": F64_PTR}
 """Arguments of a function of parameters."""

@@ -29,7 +29,6 @@ DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 POINTER = DOUBLE.as_pointer()
 
 
-
 def constant(number: int) -> ir.Constant:
     """A whole number."""
     return ir.Constant(INT, number)
@@ -63,11 +62,14 @@ class Module:
         kinds = [_LLVM_TYPES[a] for a in arguments]
         return self.declared(symbol, kinds, kinds[0])
 
+    def entry(self, entry: EntryPoint, arguments: Sequence[Any] = ()) -> ir.Function:
+        """An entry point, known by its symbol."""
+        self._needs[entry.symbol] = entry
+        return self.declared(entry.symbol, arguments, ir.VoidType())
+
     def call(self, builder: ir.IRBuilder, entry: EntryPoint, values: Sequence[ir.Value]) -> None:
         """Call an entry point by its symbol."""
-        self._needs[entry.symbol] = entry
-        kinds = [value.type for value in values]
-        builder.call(self.declared(entry.symbol, kinds, ir.VoidType()), values)
+        builder.call(self.entry(entry, [value.type for value in values]), values)
 
     def distinct(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Metadata of accesses to places that do not overlap, for `marked`."""

@@ -8,7 +8,7 @@ computes its arguments for a block of members; the function maps these rows to a
 stage goes on with that. What a stage needs of earlier ones is kept in rows too.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 

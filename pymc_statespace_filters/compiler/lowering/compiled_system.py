@@ -11,9 +11,8 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     Graph,
     MemberFunction,
     ParameterFunction,
-    VectorFunction,
 )
-from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import member_function
 from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.constants import (
     after_extension,
@@ -33,8 +32,6 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
     linearize_step,
     n_gains,
     observation_information,
-    smoothed_cov,
-    step_back,
 )
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
@@ -71,13 +68,11 @@ class CompiledSystem:
       with this noise and its Jacobians, see `linearize_step`.
     * ``observation_information(c, inputs, k, t, d, X, out)`` writes log p(d | x), its score and its
       information, for one member.
-    * ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
-      and ``start_back`` are the algebra of a guide, see `guidance`.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
 
-    Each is a `CompiledFunction`: ``system.propagate.function`` is called from compiled code, and
-    ``system.propagate.key`` identifies its code.
+    Each has an entry point, for machine code, and a ``function`` that Python calls with these
+    arguments. They are what `entry_points.entry_point` gives filters.
 
     Attributes
     ----------
@@ -210,21 +205,6 @@ class CompiledSystem:
         return member_function("observation_information", arguments, graph, "out", vector=False)
 
     @cached_property
-    def smoothed_cov(self) -> CompiledFunction:
-        """Covariance of the next state given the record."""
-        return _vector_function("smoothed_cov", "step, gains, cov", smoothed_cov(self.n, self.m))
-
-    @cached_property
-    def step_back(self) -> CompiledFunction:
-        """A step of the recursion of a guide."""
-        return _vector_function("step_back", "step, path, psi", step_back(self.n, self.m))
-
-    @cached_property
-    def start_back(self) -> CompiledFunction:
-        """The same for the normals of the state at step 0."""
-        return _vector_function("start_back", "step, path, psi", step_back(self.n, self.n))
-
-    @cached_property
     def observe(self) -> MemberFunction:
         """Simulate an observation of every member."""
         z = _normals(self.r)
@@ -334,10 +314,6 @@ class CompiledSystem:
     def has_exact_observation_density(self) -> bool:
         """Whether `log_density` is exact; noise that is not additive enters by linearization."""
         return self.additive_noise or not self.gaussian_observation
-
-
-def _vector_function(name: str, arguments: str, graph: Graph) -> CompiledFunction:
-    return vector_functions({name: VectorFunction(arguments, graph)})[name]
 
 
 def _normals(size: int) -> TensorVariable:

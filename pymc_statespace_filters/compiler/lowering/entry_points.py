@@ -3,35 +3,56 @@
 from functools import lru_cache
 from typing import Any
 
-from pymc_statespace_filters.compiler.codegen.function_types import MEMBER_ARGUMENTS
+from llvmlite import ir
+
+from pymc_statespace_filters.compiler.codegen.function_types import VectorFunction
+from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.machine_code import INT, Module, ModuleEntryPoint
+from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES
+from pymc_statespace_filters.compiler.lowering.guidance import smoothed_cov, step_back
 from pymc_statespace_filters.compiler.lowering.guide_loops import (
     FOLLOW_ARGUMENTS,
     LOOK_BACK_ARGUMENTS,
+    LOOP_ARGUMENTS,
     follow_loop,
     look_back_loop,
 )
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, arguments_class
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 
-MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
 
 @lru_cache(maxsize=2048)
 def entry_point(system: Any, name: str) -> EntryPoint:
     """A function of a compiled system by its name, not compiled yet."""
-    if name in ("follow", "look_back", "start_back"):
-        return _of_guide(system, name)
+    if name == "follow":
+        return _follow(system)
+    if name in ("look_back", "start_back"):
+        return _look_back(system.n, system.n if name == "start_back" else system.m)
     return getattr(system, name).entry
 
 
-def _of_guide(system: Any, name: str) -> EntryPoint:
-    """A loop of a guide."""
-    n, m = system.n, system.n if name == "start_back" else system.m
-    if name == "follow":
-        step, smooth = system.linearized_step, system.smoothed_cov
-        sizes = (n, m, system.n_inputs, system.n_constants)
-        step.entry.compile()
-        loop = follow_loop(step.entry.external, smooth.function, *sizes)
-        keys = step.key, smooth.key
-        return EntryPoint(loop, FOLLOW_ARGUMENTS, name, (repr(sizes), *keys), (step.entry,))
-    back = getattr(system, "start_back" if name == "start_back" else "step_back")
+def _follow(system: Any) -> EntryPoint:
+    """The loop of a guide that linearises the steps of a system."""
+    module = Module()
+    main = module.function("main", [LLVM_TYPES[kind] for kind in FOLLOW_ARGUMENTS.values()])
+    builder = ir.IRBuilder(main.append_basic_block())
+    linearize = builder.ptrtoint(module.entry(system.linearized_step.entry), INT)
+    module.call(builder, _follow_loop(system.n, system.m), [*main.args, linearize])
+    builder.ret_void()
+    return ModuleEntryPoint(module.finished(), FOLLOW_ARGUMENTS, "follow")
+
+
+@lru_cache
+def _follow_loop(n: int, m: int) -> EntryPoint:
+    function = VectorFunction("step, gains, cov", smoothed_cov(n, m))
+    smooth = vector_functions({"smoothed_cov": function})["smoothed_cov"]
+    loop = follow_loop(smooth.function, n, m)
+    return EntryPoint(loop, LOOP_ARGUMENTS, "follow", (repr((n, m)), smooth.key))
+
+
+@lru_cache
+def _look_back(n: int, m: int) -> EntryPoint:
+    """The loop of a guide that goes back; none of its arithmetic is the system's."""
+    function = VectorFunction("step, path, psi", step_back(n, m))
+    back = vector_functions({"step_back": function})["step_back"]
     loop = look_back_loop(back.function, n, m)
-    return EntryPoint(loop, LOOK_BACK_ARGUMENTS, name, (repr((n, m)), back.key))
+    return EntryPoint(loop, LOOK_BACK_ARGUMENTS, "look_back", (repr((n, m)), back.key))

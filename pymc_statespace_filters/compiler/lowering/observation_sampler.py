@@ -46,4 +46,6 @@ def distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) ->
         "no_inputs": no_inputs,
     }
     exec(compile(source, "<observe of a state-space system>", "exec"), namespace)
-    return CompiledFunction(jit(namespace["observe"]), key_of(__name__, source + repr(n_theta), code.key))
+    return CompiledFunction(
+        jit(namespace["observe"]), key_of(__name__, source + repr(n_theta), code.key)
+    )

@@ -19,10 +19,10 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
 from pymc_statespace_filters.compiler.codegen.emitter import Emitter
 from pymc_statespace_filters.compiler.codegen.function_types import (
+    PARAMETER_ARGUMENTS,
     CompiledFunction,
     Graph,
     ParameterFunction,
-    PARAMETER_ARGUMENTS,
     jit,
 )
 from pymc_statespace_filters.compiler.codegen.functions import unrolled
