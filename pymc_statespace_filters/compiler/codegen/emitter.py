@@ -191,10 +191,10 @@ class Emitter:
             return self._call(_CALLS[type(op)], numbers)
         if type(op) in _WRITTEN_OUT:
             return _WRITTEN_OUT[type(op)](self, *numbers)
-        name = getattr(op, "machine_code", None)
+        name = getattr(op, "machine_code", "")
         if name in _INLINED:
             return self._inlined(name, numbers)
-        entry = _other_operation(op, len(args)) if name is None else _quantile(name, len(args))
+        entry = _quantile(name, len(args)) if name else _other_operation(op, len(args))
         return self._called(entry, numbers)
 
     # Instructions

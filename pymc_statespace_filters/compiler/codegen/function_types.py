@@ -1,9 +1,8 @@
 """Types of compiled functions and of the graphs they come from; compilation of their source."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from ctypes import CFUNCTYPE, c_double, c_int64, c_void_p
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numba
@@ -12,7 +11,13 @@ from numba import types
 from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint, arguments_class
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    EntryPoint,
+    address_of,
+    arguments_class,
+    call_address,
+)
 from pymc_statespace_filters.compiler.native.jit import linked
 
 # Inputs that differ between the members of an ensemble.
@@ -45,12 +50,11 @@ PARAMETER_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "out": F64_PTR}
 """Arguments of a function of parameters."""
 
 _PLACES = {"Z": "z", "d": "z", "noise": "z", "D": "out", "M": "out", "gains": "out"}
-_C_TYPES = {F64_PTR: c_void_p, types.intp: c_int64, types.float64: c_double}
 
 
 @dataclass(frozen=True)
 class MemberFunction:
-    """An entry point with `MEMBER_ARGUMENTS`, and the arguments with which Python calls it."""
+    """An entry point with `MEMBER_ARGUMENTS`, and the arguments of its ``function``."""
 
     entry: EntryPoint
     arguments: str
@@ -60,14 +64,16 @@ class MemberFunction:
         """Identifies the code."""
         return self.entry.key
 
-    def function(self, *given: Any) -> None:
-        """Call it with arrays."""
-        values: dict[str, Any] = dict.fromkeys(MEMBER_ARGUMENTS, 0)
-        for name, value in zip(self.arguments.split(", "), given, strict=True):
-            values[_PLACES.get(name, name)] = value
-            if name in ("X", "Z"):
-                values["n_members" if name == "X" else "width"] = value.shape[1]
-        _call(self.entry, MEMBER_ARGUMENTS, values.values())
+    @cached_property
+    def function(self) -> Any:
+        """Call it with arrays, from Python or from compiled functions."""
+        values = dict.fromkeys(MEMBER_ARGUMENTS, "np.int64(0)") | {"t": "0.0"}
+        for name in (names := self.arguments.split(", ")):
+            values[_PLACES.get(name, name)] = f"{name} * 1.0" if name == "t" else name
+        values |= {"k": "np.int64(k)"} if "k" in names else {}
+        values |= {"width": "np.int64(Z.shape[1])"} if "Z" in names else {}
+        values["n_members"] = "np.int64(X.shape[1])"
+        return _jitted(self.entry, self.arguments, values)
 
 
 @dataclass(frozen=True)
@@ -82,18 +88,29 @@ class ParameterFunction:
         """Identifies the code."""
         return self.entry.key
 
-    def function(self, theta: np.ndarray) -> np.ndarray:
-        """Call it with an array."""
-        out = np.empty(self.length)
-        _call(self.entry, PARAMETER_ARGUMENTS, (theta, theta.size, out))
-        return out
+    @cached_property
+    def function(self) -> Any:
+        """Call it with an array, from Python or from compiled functions; an array is returned."""
+        values = {"theta": "theta", "n_theta": "np.int64(theta.size)", "out": "out"}
+        before, after = f"out = np.empty({self.length})", "return out"
+        return _jitted(self.entry, "theta", values, before, after)
 
 
-def _call(entry: EntryPoint, arguments: Mapping[str, Any], values: Iterable[Any]) -> None:
-    """Call an entry point with numbers and arrays."""
+def _jitted(entry: EntryPoint, arguments: str, values: Mapping[str, str], *around: str) -> Any:
+    """The function of these arguments that calls an entry point with these values."""
     entry.compile()
-    call = CFUNCTYPE(None, *(_C_TYPES[kind] for kind in arguments.values()))(entry.address)
-    call(*(v.ctypes.data if isinstance(v, np.ndarray) else v for v in values))
+    arrays = [name for name in arguments.split(", ") if name not in ("k", "t")]
+    before, after = around or ("", "")
+    lines = [
+        *(f"if not {name}.flags.c_contiguous: raise ValueError(message)" for name in arrays),
+        before, f"call_address(address_of(symbol), ({', '.join(values.values())}))", after,
+    ]  # fmt: skip
+    scope = {
+        "np": np, "address_of": address_of, "call_address": call_address, "symbol": entry.symbol,
+        "message": "arrays must be contiguous, in C order",
+    }  # fmt: skip
+    exec(f"def function({arguments}):\n" + "".join(f"    {line}\n" for line in lines), scope)
+    return jit(scope["function"])
 
 
 @dataclass(frozen=True)

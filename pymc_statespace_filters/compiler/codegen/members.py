@@ -168,7 +168,8 @@ class _Stages:
             self._row("result", i)
         self._wanted, self._known = self._plan()
         self._stored = [self._stored_by(stage) for stage in range(self._n)]
-        self._buffer = self._block = None
+        self._buffer: ir.Value | None = None
+        self._block = BLOCK
 
     def _row(self, *key: object) -> int:
         return self._rows.setdefault(key, len(self._rows))
@@ -254,7 +255,6 @@ class _Stages:
                 build.store(value, self._place(row, loop.index))
 
     def _place(self, row: int, j: ir.Value) -> ir.Value:
-        assert self._block is not None
         at = self._code.builder.add(constant(row * self._block), j)
         return self._code.builder.gep(self._buffer, [at], inbounds=True)
 

@@ -168,7 +168,7 @@ class _Lanes:
                 name: build.gep(given[name], [build.mul(i, constant(size * LANES))])
                 for name, size in self._sizes.items()
             }
-            shared = self._shared(values, known)
+            shared = self._shared(values)
             emitter.emit(shared)
             with cgutils.for_range(build, given["n_lanes"]) as lanes:
                 self._lane = lanes.index
@@ -179,11 +179,11 @@ class _Lanes:
                     self._marked(build.store(result, self._place(name, row)), name)
         build.ret_void()
 
-    def _shared(self, values: Sequence[Value], known: Mapping[Value, int]) -> list[Expression]:
+    def _shared(self, values: Sequence[Value]) -> list[Expression]:
         """What depends on the time alone and is read in the lanes."""
         inputs = frozenset(e.args[0] for e in in_order(values, ()) if e.op is None)
-        of_lane = depends_on(values, inputs - {f"{TIME}.0"}) | set(known)
-        used = [*values, *(a for e in of_lane - set(known) if e.op is not None for a in e.args)]
+        of_lane = depends_on(values, inputs - {f"{TIME}.0"})
+        used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
         return sorted_by_number({v for v in used if v not in of_lane})
 
     def _read(self, name: str) -> ir.Value:

@@ -119,7 +119,7 @@ class CompiledSystem:
     # Constants of an evaluation
 
     @cached_property
-    def _extend(self) -> CompiledFunction | None:
+    def _extend(self) -> ParameterFunction | None:
         return None if self._extension is None else extend(self._extension)
 
     def at_parameters(

@@ -13,7 +13,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     ParameterFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.lowering.staged import on_arrays, staged
+from pymc_statespace_filters.compiler.lowering.staged import staged
 from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
@@ -63,7 +63,7 @@ def covariance_check(system: StateSpaceModel) -> CompiledFunction:
     if not graphs:
         return CompiledFunction(jit(lambda theta: True), key_of(__name__, "nothing to check"))
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    prepare = on_arrays(followed_by_square_roots([], system, theta, theta, graphs))
+    prepare = followed_by_square_roots([], system, theta, theta, graphs)
     roots = prepare.function
 
     def check(theta):

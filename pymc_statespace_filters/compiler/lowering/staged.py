@@ -20,7 +20,6 @@ from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
 from pymc_statespace_filters.compiler.codegen.emitter import Emitter
 from pymc_statespace_filters.compiler.codegen.function_types import (
     PARAMETER_ARGUMENTS,
-    CompiledFunction,
     Graph,
     ParameterFunction,
     jit,
@@ -35,9 +34,7 @@ from pymc_statespace_filters.compiler.codegen.machine_code import (
     constant,
 )
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.native.jit import keep_alive
 from pymc_statespace_filters.system.linear_step import LinearStep, LinearStepBack, make_functions
 
 _STEP = make_functions(jit)
@@ -156,19 +153,3 @@ def _on_arrays(known: Sequence[TensorVariable], vector: TensorVariable) -> Entry
     exec(compile(source, "<values of a state-space system>", "exec"), scope)
     arguments = dict.fromkeys([*names, "out"], F64_PTR)
     return EntryPoint(scope["values"], arguments, "values", (source, code.key))
-
-
-def on_arrays(staged: ParameterFunction) -> CompiledFunction:
-    """A function of parameters from an array, to an array, for compiled functions."""
-    entry, length = staged.entry, staged.length
-    entry.compile()
-    call = entry.external
-
-    @jit
-    def evaluate(values):
-        out = np.empty(length)
-        call(values.ctypes.data, values.size, out.ctypes.data)
-        keep_alive(values)
-        return out
-
-    return CompiledFunction(evaluate, key_of(__name__, f"on arrays {length}", entry.key))
