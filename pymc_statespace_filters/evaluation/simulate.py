@@ -59,8 +59,7 @@ class Simulator(NamedTuple):
     """A loop over the steps of one system: for Python, and for functions that numba compiles."""
 
     function: Callable
-    jitted: Callable
-    key: str | None
+    jitted: CompiledFunction
 
 
 @jit
@@ -174,27 +173,30 @@ def _simulator(system: StateSpaceModel, make: Callable, noise: bool = True) -> S
         names.append("")
     else:
         names.append("observe" if noise else "expect")
-    entries = [entry_point(compiled, name) for name in names if name]
-    for entry in entries:
+    entries = [entry_point(compiled, name) if name else None for name in names]
+    for entry in filter(None, entries):
         entry.compile()
-    addresses = [entry_point(compiled, name).address if name else 0 for name in names]
     sizes = (
         system.n, compiled.n_start, compiled.m, compiled.r if noise else 0, system.p,
         system.n_theta, compiled.n_constants,
     )  # fmt: skip
-    functions, run, dt = _Functions(*addresses, *sizes), loop.function, system.dt
-    symbols = [entry_point(compiled, name).symbol if name else "" for name in names]
-    prepare, initialise, propagate, observe = symbols
+    functions = _Functions._make([*(e.address if e else 0 for e in entries), *sizes])
+    prepare, initialise, propagate, observe = (e.symbol if e else "" for e in entries)
+    run, dt = loop.function, system.dt
 
     @jit
     def jitted(rng, *arguments):
-        addresses = (
-            address_of(prepare), address_of(initialise), address_of(propagate), address_of(observe)
+        functions = _Functions(
+            address_of(prepare), address_of(initialise), address_of(propagate),
+            address_of(observe), *sizes,
         )  # fmt: skip
-        return run(rng, _Functions(*addresses, *sizes), dt, *arguments)
+        return run(rng, functions, dt, *arguments)
 
-    key = key_of(__name__, repr((dt, sizes)), loop.key, *(entry.key for entry in entries))
-    return Simulator(lambda rng, *rest: run(rng, functions, dt, *rest), jitted, key)
+    keys = (entry.key for entry in entries if entry)
+    key = key_of(__name__, repr((dt, sizes)), loop.key, *keys)
+    return Simulator(
+        lambda rng, *rest: run(rng, functions, dt, *rest), CompiledFunction(jitted, key)
+    )
 
 
 @lru_cache(maxsize=256)

@@ -73,8 +73,8 @@ def _single_records(
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system, True)
-    simulate, check, p = compiled.jitted, _check(op), op.system.p
+    compiled = simulator(op.system, True).jitted
+    simulate, check, p = compiled.function, _check(op), op.system.p
 
     @numba_njit
     def draw_record(rng, theta, steps, inputs, t0, seed):
