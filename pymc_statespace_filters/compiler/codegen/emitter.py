@@ -47,7 +47,7 @@ QUANTILES = {
 }  # fmt: skip
 """By the names that operations have as ``machine_code``."""
 
-_INLINED = {
+INLINED = {
     function.py_func.__name__: function
     for function in (
         exponential.exp, exponential.exp2, exponential.expm1, exponential.log, exponential.log2,
@@ -192,7 +192,7 @@ class Emitter:
         if type(op) in _WRITTEN_OUT:
             return _WRITTEN_OUT[type(op)](self, *numbers)
         name = getattr(op, "machine_code", "")
-        if name in _INLINED:
+        if name in INLINED:
             return self._inlined(name, numbers)
         entry = _quantile(name, len(args)) if name else _other_operation(op, len(args))
         return self._called(entry, numbers)
@@ -243,7 +243,7 @@ class Emitter:
     # Calls
 
     def _call(self, name: str, numbers: list[ir.Value]) -> ir.Value:
-        if self._vector and name in _INLINED:
+        if self._vector and name in INLINED:
             return self._inlined(name, numbers)
         if name in _DIVISIONS:
             return self._inlined(f"scalar_{name}", numbers, _division(name))
@@ -252,7 +252,7 @@ class Emitter:
         return self.builder.call(function, numbers, fastmath=_FAST)
 
     def _inlined(self, name: str, numbers: list[ir.Value], function: Any = None) -> ir.Value:
-        function = _INLINED[name] if function is None else function
+        function = INLINED[name] if function is None else function
         declared = self._module.inlined(name, function, [types.float64] * len(numbers))
         return self.builder.call(declared, numbers)
 

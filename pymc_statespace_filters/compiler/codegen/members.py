@@ -44,7 +44,7 @@ MAX_ROWS_WRITTEN = 32
 
 _MAX_BUFFER = 8192  # numbers, on the stack
 
-_BLOCKS = {
+BLOCKS = {
     "poisson_quantile": poisson_block,
     "binomial_quantile": binomial_block,
     "gamma_quantile": gamma_block,
@@ -56,7 +56,7 @@ LLVM_TYPES = {F64_PTR: POINTER, types.intp: INT, types.float64: DOUBLE}
 
 def is_block(value: Value) -> bool:
     """Whether a value is the result of a function with branches."""
-    return isinstance(value, Expression) and getattr(value.op, "machine_code", None) in _BLOCKS
+    return isinstance(value, Expression) and getattr(value.op, "machine_code", None) in BLOCKS
 
 
 def sorted_by_number(values: Any) -> list[Expression]:
@@ -275,7 +275,7 @@ def _block_entry(name: str, n_arguments: int) -> EntryPoint:
         f"    block(carray(buffer, (1, {BLOCK})), {given}, size)"
     )
     scope: dict[str, Any] = {
-        "np": np, "carray": carray, "block": _BLOCKS[name], "__name__": __name__
+        "np": np, "carray": carray, "block": BLOCKS[name], "__name__": __name__
     }  # fmt: skip
     exec(source, scope)
     arguments: Mapping[str, Any] = {
