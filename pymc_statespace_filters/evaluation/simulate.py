@@ -2,20 +2,25 @@
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numba import typeof
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.observation_sampler import (
-    observation_mean,
-    observation_sampler,
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    MemberArguments,
+    jit,
 )
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
+from pymc_statespace_filters.compiler.lowering.observation_sampler import distribution_sampler
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
+from pymc_statespace_filters.compiler.native.entry_point import (
+    address_of,
+    cached_on_disk,
+    call_address,
+)
 from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.compiler.native.python_call import call_in_thread, call_machine_code
 from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
@@ -34,120 +39,197 @@ from pymc_statespace_filters.system.steps import steps_of
 _MANY_STEPS = 100_000  # some milliseconds at the least
 
 
+class _Functions(NamedTuple):
+    """Addresses of the functions of a system, and sizes; ``initialise`` is 0 without noise."""
+
+    prepare: int
+    initialise: int
+    propagate: int
+    observe: int
+    n: int
+    n_start: int
+    m: int
+    r: int
+    p: int
+    n_theta: int
+    n_constants: int
+
+
+class Simulator(NamedTuple):
+    """A loop over the steps of one system: for Python, and for functions that numba compiles."""
+
+    function: Callable
+    jitted: CompiledFunction
+
+
+@jit
+def _call(address, c, inputs, k, t, z, X, out):
+    arguments = MemberArguments(
+        c=c, inputs=inputs, k=k, t=t, z=z, width=np.int64(1), X=X, out=out, n_members=np.int64(1)
+    )
+    call_address(address, arguments)
+
+
+@jit
+def _normals(rng, functions, size):
+    """Standard normals for one member; zeros without noise."""
+    z = np.zeros(size)
+    if functions.initialise != 0:
+        for i in range(size):
+            z[i] = rng.standard_normal()
+    return z
+
+
+@jit
+def _constants(functions, theta):
+    c = np.empty(functions.n_constants)
+    call_address(functions.prepare, (theta, np.int64(theta.size), c))
+    return c
+
+
+@jit
+def _observe_by_address(rng, functions, c, inputs, k, t, x, out):
+    _call(functions.observe, c, inputs, k, t, _normals(rng, functions, functions.r), x, out)
+
+
+def _simulation(observe: Any) -> Callable:
+    def simulate(rng, functions, dt, theta, steps, inputs, t0):
+        c = _constants(functions, theta)
+        n_steps = steps[-1] if steps.size else 0
+        states = np.empty((n_steps + 1, functions.n))
+        observations = np.empty((steps.size, functions.p))
+        x = np.empty((functions.n, 1))
+        if functions.initialise != 0:
+            z = _normals(rng, functions, functions.n_start)
+            _call(functions.initialise, c, inputs, 0, t0, z, x, x)
+        else:  # by the mean itself: the covariance may be infinite
+            copy_into(x[:, 0], c[functions.n_theta : functions.n_theta + functions.n])
+        j = 0
+        for k in range(n_steps + 1):
+            copy_into(states[k], x[:, 0])
+            t = t0 + k * dt
+            if j < steps.size and steps[j] == k:
+                observe(rng, functions, c, inputs, k, t, x, observations[j])
+                j += 1
+            if k < n_steps:
+                z = _normals(rng, functions, functions.m)
+                _call(functions.propagate, c, inputs, k, t, z, x, x)
+        return states, observations
+
+    return simulate
+
+
+def _continuation(observe: Any) -> Callable:
+    def run(rng, functions, dt, theta, x, first, steps, inputs, t0):
+        c, n, p = _constants(functions, theta), functions.n, functions.p
+        states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
+        now, k = x.copy().reshape(n, 1), first
+        for j in range(steps.size):
+            while k < steps[j]:
+                z = _normals(rng, functions, functions.m)
+                _call(functions.propagate, c, inputs, k, t0 + k * dt, z, now, now)
+                k += 1
+            copy_into(states[j], now[:, 0])
+            observe(rng, functions, c, inputs, k, t0 + k * dt, now, observations[j])
+        return states, observations
+
+    return run
+
+
+def _observations(observe: Any) -> Callable:
+    def run(rng, functions, dt, theta, states, steps, inputs, t0):
+        c, observations = _constants(functions, theta), np.empty((steps.size, functions.p))
+        for i in range(steps.size):
+            x, k = states[i].copy().reshape(-1, 1), steps[i]
+            observe(rng, functions, c, inputs, k, t0 + k * dt, x, observations[i])
+        return observations
+
+    return run
+
+
+def _loop(make: Callable, observe: CompiledFunction) -> CompiledFunction:
+    """A loop over steps, compiled once for all systems whose observations are a function."""
+    loop = cached_on_disk(jit(make(observe.function)), observe.key)
+    return CompiledFunction(loop, key_of(__name__, make.__name__, observe.key))
+
+
+_BY_ADDRESS = CompiledFunction(_observe_by_address, key_of(__name__, "observe by address"))
+_LOOPS = {
+    make: _loop(make, _BY_ADDRESS) for make in (_simulation, _continuation, _observations)
+}  # fmt: skip
+
+
+def _simulator(system: StateSpaceModel, make: Callable, noise: bool = True) -> Simulator:
+    equations = system.equations
+    if equations.observation is None and equations.observation_draw is None:
+        raise ModelError(
+            "simulating needs observation and observation_noise, or observation_dist, got a system "
+            "with a density of observations alone (observation_logp)"
+        )
+    compiled = compile_system(system if noise else system.gaussian)
+    names, loop = ["prepare", "initialise" if noise else "", "propagate"], _LOOPS[make]
+    if noise and equations.observation_draw is not None:
+        loop = _loop(make, distribution_sampler(system, equations.observation_draw))
+        names.append("")
+    else:
+        names.append("observe" if noise else "expect")
+    entries = [entry_point(compiled, name) if name else None for name in names]
+    for entry in filter(None, entries):
+        entry.compile()
+    sizes = (
+        system.n, compiled.n_start, compiled.m, compiled.r if noise else 0, system.p,
+        system.n_theta, compiled.n_constants,
+    )  # fmt: skip
+    functions = _Functions._make([*(e.address if e else 0 for e in entries), *sizes])
+    prepare, initialise, propagate, observe = (e.symbol if e else "" for e in entries)
+    run, dt = loop.function, system.dt
+
+    @jit
+    def jitted(rng, *arguments):
+        functions = _Functions(
+            address_of(prepare), address_of(initialise), address_of(propagate),
+            address_of(observe), *sizes,
+        )  # fmt: skip
+        return run(rng, functions, dt, *arguments)
+
+    keys = (entry.key for entry in entries if entry)
+    key = key_of(__name__, repr((dt, sizes)), loop.key, *keys)
+    return Simulator(
+        lambda rng, *rest: run(rng, functions, dt, *rest), CompiledFunction(jitted, key)
+    )
+
+
 @lru_cache(maxsize=256)
-def continuation(system: StateSpaceModel) -> CompiledFunction:
+def continuation(system: StateSpaceModel) -> Simulator:
     """The function (rng, theta, x, first, steps, inputs, t0) -> states (R, n), observations (R, p).
 
     It starts at the state x (n,) of step ``first`` and returns states and observations at
     ``steps``, which increase and are not below ``first``.
     """
-    compiled, sampler = compile_system(system), _sampler(system)
-    prepare, propagate = compiled.prepare.function, compiled.propagate.function
-    observe, dt, n, m, p = sampler.function, system.dt, system.n, compiled.m, system.p
-
-    def run(rng, theta, x, first, steps, inputs, t0):
-        c = prepare(theta)
-        states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
-        now, k = x.copy().reshape(n, 1), first
-        for j in range(steps.size):
-            while k < steps[j]:
-                propagate(c, inputs, k, t0 + k * dt, rng.standard_normal((m, 1)), now)
-                k += 1
-            copy_into(states[j], now[:, 0])
-            observe(rng, c, inputs, k, t0 + k * dt, now, observations[j])
-        return states, observations
-
-    keys = compiled.prepare.key, compiled.propagate.key, sampler.key
-    return _cached(run, key_of(__name__, f"continuation {dt!r} {n} {m} {p}", *keys))
+    return _simulator(system, _continuation)
 
 
 @lru_cache(maxsize=256)
-def observer(system: StateSpaceModel) -> CompiledFunction:
+def observer(system: StateSpaceModel) -> Simulator:
     """The function (rng, theta, states, steps, inputs, t0) -> an observation (R, p) of each state.
 
     ``states`` (R, n) are those at ``steps`` (R,).
     """
-    constants, sampler = compile_system(system).prepare, _sampler(system)
-    prepare, observe, dt, p = constants.function, sampler.function, system.dt, system.p
-
-    def run(rng, theta, states, steps, inputs, t0):
-        c, observations = prepare(theta), np.empty((steps.size, p))
-        for i in range(steps.size):
-            x, k = states[i].copy().reshape(-1, 1), steps[i]
-            observe(rng, c, inputs, k, t0 + k * dt, x, observations[i])
-        return observations
-
-    return _cached(run, key_of(__name__, f"observer {dt!r} {p}", constants.key, sampler.key))
-
-
-def _cached(function: Callable, key: str | None) -> CompiledFunction:
-    """Compile a function, or load it from disk if it was compiled before."""
-    return CompiledFunction(cached_on_disk(jit(function), key), key)
-
-
-def _sampler(system: StateSpaceModel, noise: bool = True) -> CompiledFunction:
-    if system.equations.observation is None and system.equations.observation_draw is None:
-        raise ModelError(
-            "simulating needs observation and observation_noise, or observation_dist, got a system "
-            "with a density of observations alone (observation_logp)"
-        )
-    return observation_sampler(system) if noise else observation_mean(system)
-
-
-@jit
-def _standard_normals(rng, size):
-    return rng.standard_normal((size, 1))
-
-
-@jit
-def _zeros(rng, size):
-    return np.zeros((size, 1))
+    return _simulator(system, _observations)
 
 
 @lru_cache(maxsize=256)
-def simulator(system: StateSpaceModel, noise: bool) -> CompiledFunction:
+def simulator(system: StateSpaceModel, noise: bool) -> Simulator:
     """The function (rng, theta, steps, inputs, t0) -> (states (K + 1, n), observations (J, p)).
 
     Without ``noise`` the initial state is its mean, every noise is zero, and ``rng`` is not used.
     """
-    sampler = _sampler(system, noise)
-    compiled = compile_system(system if noise else system.gaussian)
-    parts = compiled.prepare, compiled.initialise, compiled.propagate, sampler
-    prepare, initialise, propagate, observe = (part.function for part in parts)
-    normals = _standard_normals if noise else _zeros
-    dt, n, n_start, m, p = system.dt, system.n, compiled.n_start, compiled.m, system.p
-    n_theta = system.n_theta
-
-    def simulate(rng, theta, steps, inputs, t0):
-        c = prepare(theta)
-        n_steps = steps[-1] if steps.size else 0
-        states = np.empty((n_steps + 1, n))
-        observations = np.empty((steps.size, p))
-        x = np.empty((n, 1))
-        if noise:
-            initialise(c, normals(rng, n_start), x)
-        else:  # by the mean itself: the covariance may be infinite
-            copy_into(x[:, 0], c[n_theta : n_theta + n])
-        j = 0
-        for k in range(n_steps + 1):
-            copy_into(states[k], x[:, 0])
-            if j < steps.size and steps[j] == k:
-                observe(rng, c, inputs, k, t0 + k * dt, x, observations[j])
-                j += 1
-            if k < n_steps:
-                propagate(c, inputs, k, t0 + k * dt, normals(rng, m), x)
-        return states, observations
-
-    keys = (part.key for part in parts)
-    cached = _cached(
-        simulate, key_of(__name__, f"simulate {noise} {dt!r} {n} {n_start} {m} {p}", *keys)
-    )
-    # At once and not by the first call, which PyMC makes when its bar is on the screen already.
-    vector, matrix, steps = np.zeros(1), np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
-    arguments = np.random.default_rng(0), vector, steps, matrix, 0.0
     with held_interrupts(), slow_compilation("the simulation of this system"):
-        cached.function.compile(tuple(map(typeof, arguments)))
-    return cached
+        found = _simulator(system, _simulation, noise)
+        # At once and not when PyMC calls it, whose bar is on the screen already.
+        at_start, steps = np.zeros(system.n_theta), np.zeros(0, dtype=np.int64)
+        found.function(np.random.default_rng(0), at_start, steps, np.zeros((1, 1)), 0.0)
+    return found
 
 
 def simulate(
@@ -235,7 +317,7 @@ def simulate(
         )
     with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
-    states, observations = _call(simulator(system, with_noise).function, rng, theta, at, forces, t0)
+    states, observations = _run(simulator(system, with_noise).function, rng, theta, at, forces, t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {
@@ -253,9 +335,7 @@ def simulate(
     )
 
 
-def _call(
-    run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *rest: Any
-) -> Any:
+def _run(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any, *rest: Any) -> Any:
     """Call a simulator; in a thread if it takes long, so that an interrupt ends the wait."""
     is_long = steps.size > 0 and steps[-1] > _MANY_STEPS
     return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *rest)
@@ -277,7 +357,7 @@ def _simulate_panel(
     generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
     records = single_records(table, 0)
     simulated = [
-        _call(run, rng, own, steps, inputs, float(t0))
+        _run(run, rng, own, steps, inputs, float(t0))
         for rng, own, (steps, _, inputs, t0, _) in zip(generators, theta, records, strict=True)
     ]
     states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))

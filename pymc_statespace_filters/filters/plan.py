@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.lowering.entry_points import MemberArguments, entry_point
+from pymc_statespace_filters.compiler.codegen.function_types import MemberArguments
+from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.compiler.lowering.guide_loops import (
     FollowArguments,
     LookBackArguments,

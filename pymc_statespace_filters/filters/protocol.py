@@ -19,7 +19,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    MemberFunction,
+    ParameterFunction,
+)
 from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.errors import ModelError
 
@@ -32,10 +36,12 @@ type Compiled[F] = CompiledFunction[F] | PlannedFunction
 class System(Protocol):
     """One system as a filter sees it: `compiler.lowering.compiled_system.CompiledSystem`.
 
-    Each function is a `CompiledFunction`, compiled when first asked for. Members of an ensemble, or
-    other points, are the N columns of ``X`` (n, N). ``c`` are the constants of an evaluation, ``k``
-    the step and ``t`` its time, ``Z`` standard normals with a column for each member (more are
-    allowed), ``D`` (p, N) observations, ``M`` (2, N) a mean and a variance for each column.
+    Each function is compiled when first asked for, and its ``function`` is called with arrays.
+    Members of an ensemble, or other points, are the N columns of ``X`` (n, N). ``c`` are the
+    constants of an evaluation, ``k`` the step and ``t`` its time, ``Z`` standard normals with a
+    column for each member (more are allowed), ``D`` (p, N) observations, ``M`` (2, N) a mean and a
+    variance for each column. Arrays are contiguous, in C order.
+
     ``m`` counts the normals of one step, which may be fewer than ``model.m``: noises with constant
     gains are merged. ``n_start`` counts those of a start. ``free`` are the states that an update
     may move.
@@ -71,52 +77,28 @@ class System(Protocol):
         """The same for a function that returns the cotangent of its parameters."""
 
     @property
-    def prepare(self) -> CompiledFunction:
+    def prepare(self) -> ParameterFunction:
         """Function (theta) -> c, the constants of one evaluation."""
 
     @property
-    def initialise(self) -> CompiledFunction:
+    def initialise(self) -> MemberFunction:
         """Function (c, Z, X) that draws the state at step 0."""
 
     @property
-    def propagate(self) -> CompiledFunction:
+    def propagate(self) -> MemberFunction:
         """Function (c, inputs, k, t, Z, X) that moves every member one step, in place."""
 
     @property
-    def observe(self) -> CompiledFunction:
+    def observe(self) -> MemberFunction:
         """Function (c, inputs, k, t, Z, X, D) that simulates observations."""
 
     @property
-    def log_density(self) -> CompiledFunction:
+    def log_density(self) -> MemberFunction:
         """Function (c, inputs, k, t, d, X, out) that writes log p(d | x)."""
 
     @property
-    def step_moments(self) -> CompiledFunction:
+    def step_moments(self) -> MemberFunction:
         """Function (c, inputs, k, t, X, M): mean and variance of the next state, one state."""
-
-    @property
-    def propagate_guided(self) -> CompiledFunction:
-        """Function (c, inputs, k, t, gains, Z, X) that moves every member by guided noise."""
-
-    @property
-    def linearized_step(self) -> CompiledFunction:
-        """Function (c, inputs, k, t, noise, X, out): the next states and their Jacobians."""
-
-    @property
-    def observation_information(self) -> CompiledFunction:
-        """Function (c, inputs, k, t, d, X, member) -> log p(d | x), score and information."""
-
-    @property
-    def smoothed_cov(self) -> CompiledFunction:
-        """Function (step, gains, cov) -> covariance of the next state given the record."""
-
-    @property
-    def step_back(self) -> CompiledFunction:
-        """Function (step, path, psi) -> psi before the step, and the gains of its noise."""
-
-    @property
-    def start_back(self) -> CompiledFunction:
-        """The same for the normals of the state at step 0."""
 
     @property
     def is_deterministic(self) -> bool:

@@ -73,7 +73,7 @@ def _single_records(
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system, True)
+    compiled = simulator(op.system, True).jitted
     simulate, check, p = compiled.function, _check(op), op.system.p
 
     @numba_njit

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE
+from pymc_statespace_filters.compiler.codegen.emitter import INLINED
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
+from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial, sqrt
 
 N = 40_000
 LARGEST, SMALLEST = np.finfo(float).max, 5e-324
@@ -56,7 +56,7 @@ NEEDS_LONG_DOUBLE = pytest.mark.skipif(
 
 def elementwise(name):
     """The function in a loop that is compiled as generated loops are."""
-    function = VECTOR_NAMESPACE[name]
+    function = (INLINED | {"sqrt": sqrt})[name]
     options = {"fastmath": FAST_MATH, "error_model": "numpy"}
 
     @njit(**options)

@@ -11,7 +11,8 @@ import pytest
 from numba import njit
 from scipy import special, stats
 
-from pymc_statespace_filters.compiler.codegen.source import BLOCKS, QUANTILES
+from pymc_statespace_filters.compiler.codegen.emitter import QUANTILES
+from pymc_statespace_filters.compiler.codegen.members import BLOCKS
 from pymc_statespace_filters.compiler.numerics.normals import fill_normals
 from pymc_statespace_filters.compiler.numerics.quantiles.binomial import exact_binomial
 from pymc_statespace_filters.compiler.numerics.quantiles.poisson import exact_poisson

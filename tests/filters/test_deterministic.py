@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER
@@ -122,7 +123,7 @@ def test_a_guide_can_be_written_out_without_process_noise():
     """`GuidedPF` treats equations without noise whose start is not known."""
     system = compile_system(decay(transition=lambda x: 0.9 * x, initial_cov=1.0))
     assert system.m == 0
-    assert system.step_back.key
+    assert entry_point(system, "look_back").key
 
 
 def test_the_gaussian_filters_are_one():

@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import pytensor
+from numba import carray
 from pytensor.compile.mode import get_mode
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FunctionGraph
@@ -11,21 +13,29 @@ from pytensor.link.numba.dispatch.basic import numba_funcify_and_cache_key
 
 from pymc_statespace_filters.compiler.codegen.array_linalg import use_loops
 from pymc_statespace_filters.compiler.codegen.function_types import (
+    MEMBER_ARGUMENTS,
     MEMBER_INPUTS,
     CompiledFunction,
     Graph,
     VectorFunction,
     function_of,
 )
-from pymc_statespace_filters.compiler.codegen.source import SCALAR_NAMESPACE
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.compilation import undamaged_files, warning_filter
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import LoweringError
 
 # The code that reads a whole input, if not its name.
 _WHOLE = {
-    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "x": "X[:, member].copy()",
-    "z": "Z[:{n}, member].copy()", "term_bar": "np.asarray(term_bar)", "tape": "tape[row]",
+    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "term_bar": "np.asarray(term_bar)",
+    "tape": "tape[row]",
+}  # fmt: skip
+
+# The same where arguments are addresses; others are vectors at z.
+_AT_ADDRESS = {
+    "theta": "carray(c, ({n},))", "u": "carray(inputs, (k + 1, {n}))[k]", "t": "np.asarray(t)",
+    "gains": "carray(out, ({n},))", "x": "carray(X, ({n}, n_members))[:, member].copy()",
+    "z": "carray(z, ({n}, width))[:, member].copy()",
 }  # fmt: skip
 
 
@@ -52,7 +62,7 @@ def array_vector_function(name: str, function: VectorFunction) -> CompiledFuncti
     return _build(name, function.arguments, body, array_code=compiled)
 
 
-def array_member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
+def array_member_function(name: str, graph: Graph, target: str) -> EntryPoint:
     """A member function that calls array code for each member."""
     members = {n: v for n, v in graph.inputs.items() if n in MEMBER_INPUTS}
     others = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
@@ -60,40 +70,52 @@ def array_member_function(name: str, arguments: str, graph: Graph, target: str) 
     others, members = _used(others, common), _used(members, graph.outputs)
     before = array_code(list(others.values()), common)
     inside = array_code([*members.values(), *common], graph.outputs)
-    whole, _, element = target.partition("[")
-    row = "i, " if "{i}" in element else ""
-    calls = [_whole(members)] * bool(members) + [f"common[{i}]" for i in range(len(common))]
-    body = [
-        "try:",
-        f"    common = before({_whole(others)})",
-        "except Exception:",  # a singular matrix, say
-        f"    {whole}[:] = nan",
-        "    return",
-        f"for member in range({whole}.shape[-1]):",
+    calls = [_at_address(members)] * bool(members) + [f"common[{i}]" for i in range(len(common))]
+    lines = [
+        f"    results = carray({target}, ({graph.outputs[0].type.shape[0]}, n_members))",
         "    try:",
-        f"        result = inside({', '.join(calls)})[0]",
-        "    except Exception:",
-        f"        {whole}[..., member] = nan",
-        "    else:",
-        "        for i in range(result.size):",
-        f"            {whole}[{row}member] = result[i]",
+        f"        common = before({_at_address(others)})",
+        "    except Exception:",  # a singular matrix, say
+        "        results[:] = nan",
+        "        return",
+        "    for member in range(n_members):",
+        "        try:",
+        f"            result = inside({', '.join(calls)})[0]",
+        "        except Exception:",
+        "            results[:, member] = nan",
+        "        else:",
+        "            for i in range(result.size):",
+        "                results[i, member] = result[i]",
     ]
-    return _build(name, arguments, body, before=before, inside=inside)
+    source = "\n".join([f"def {name}({', '.join(MEMBER_ARGUMENTS)}):", *lines])
+    scope = {
+        "np": np, "nan": np.nan, "carray": carray, "before": before.function,
+        "inside": inside.function, "__name__": __name__,
+    }  # fmt: skip
+    exec(compile(source, f"<{name} of a state-space system>", "exec"), scope)
+    return EntryPoint(scope[name], MEMBER_ARGUMENTS, name, (source, before.key, inside.key))
+
+
+def _at_address(inputs: Mapping[str, Variable]) -> str:
+    sizes = {n: (v.type.shape[0] if v.type.ndim else 1) for n, v in inputs.items()}
+    return ", ".join(
+        _AT_ADDRESS.get(name, "carray(z, ({n},))").format(n=n) for name, n in sizes.items()
+    )
 
 
 def _build(
     name: str, arguments: str, body: list[str], **parts: CompiledFunction
 ) -> CompiledFunction:
-    namespace = SCALAR_NAMESPACE | {part: compiled.function for part, compiled in parts.items()}
+    namespace = {"np": np, "nan": np.nan} | {
+        part: compiled.function for part, compiled in parts.items()
+    }
     function, source = function_of(name, arguments, body, namespace)
-    return CompiledFunction(
-        function, key_of(__name__, source, *(part.key for part in parts.values()))
-    )
+    keys = (part.key for part in parts.values())
+    return CompiledFunction(function, key_of(__name__, source, *keys))
 
 
 def _whole(inputs: Mapping[str, Variable]) -> str:
-    sizes = {n: (v.type.shape[0] if v.type.ndim else 1) for n, v in inputs.items()}
-    return ", ".join(_WHOLE.get(name, name).format(n=n) for name, n in sizes.items())
+    return ", ".join(_WHOLE.get(name, name) for name in inputs)
 
 
 def _used(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[str, Variable]:

@@ -2,13 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numba
+import numpy as np
+from numba import types
 from pytensor.graph.basic import Variable
 
 from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    EntryPoint,
+    address_of,
+    arguments_class,
+    call_address,
+)
 from pymc_statespace_filters.compiler.native.jit import linked
 
 # Inputs that differ between the members of an ensemble.
@@ -26,6 +35,82 @@ class CompiledFunction[F]:
     function: F
     key: str | None = None
     large: bool = False
+
+
+MEMBER_ARGUMENTS = {
+    "c": F64_PTR, "inputs": F64_PTR, "k": types.intp, "t": types.float64, "z": F64_PTR,
+    "width": types.intp, "X": F64_PTR, "out": F64_PTR, "n_members": types.intp,
+}  # fmt: skip
+"""Arguments of a function of all members. ``z`` holds normals in rows of ``width``, or one
+vector for all members: an observation or noise. ``out`` may hold gains, which are read."""
+
+MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
+
+PARAMETER_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "out": F64_PTR}
+"""Arguments of a function of parameters."""
+
+_PLACES = {"Z": "z", "d": "z", "noise": "z", "D": "out", "M": "out", "gains": "out"}
+
+
+@dataclass(frozen=True)
+class MemberFunction:
+    """An entry point with `MEMBER_ARGUMENTS`, and the arguments of its ``function``."""
+
+    entry: EntryPoint
+    arguments: str
+
+    @property
+    def key(self) -> str | None:
+        """Identifies the code."""
+        return self.entry.key
+
+    @cached_property
+    def function(self) -> Any:
+        """Call it with arrays, from Python or from compiled functions."""
+        values = dict.fromkeys(MEMBER_ARGUMENTS, "np.int64(0)") | {"t": "0.0"}
+        for name in (names := self.arguments.split(", ")):
+            values[_PLACES.get(name, name)] = f"{name} * 1.0" if name == "t" else name
+        values |= {"k": "np.int64(k)"} if "k" in names else {}
+        values |= {"width": "np.int64(Z.shape[1])"} if "Z" in names else {}
+        values["n_members"] = "np.int64(X.shape[1])"
+        return _jitted(self.entry, self.arguments, values)
+
+
+@dataclass(frozen=True)
+class ParameterFunction:
+    """An entry point with `PARAMETER_ARGUMENTS` that writes a vector of this length."""
+
+    entry: EntryPoint
+    length: int
+
+    @property
+    def key(self) -> str | None:
+        """Identifies the code."""
+        return self.entry.key
+
+    @cached_property
+    def function(self) -> Any:
+        """Call it with an array, from Python or from compiled functions; an array is returned."""
+        values = {"theta": "theta", "n_theta": "np.int64(theta.size)", "out": "out"}
+        before, after = f"out = np.empty({self.length})", "return out"
+        return _jitted(self.entry, "theta", values, before, after)
+
+
+def _jitted(entry: EntryPoint, arguments: str, values: Mapping[str, str], *around: str) -> Any:
+    """The function of these arguments that calls an entry point with these values."""
+    entry.compile()
+    arrays = [name for name in arguments.split(", ") if name not in ("k", "t")]
+    before, after = around or ("", "")
+    lines = [
+        *(f"if not {name}.flags.c_contiguous: raise ValueError(message)" for name in arrays),
+        before, f"call_address(address_of(symbol), ({', '.join(values.values())}))", after,
+    ]  # fmt: skip
+    scope = {
+        "np": np, "address_of": address_of, "call_address": call_address, "symbol": entry.symbol,
+        "message": "arrays must be contiguous, in C order",
+    }  # fmt: skip
+    exec(f"def function({arguments}):\n" + "".join(f"    {line}\n" for line in lines), scope)
+    return jit(scope["function"])
 
 
 @dataclass(frozen=True)

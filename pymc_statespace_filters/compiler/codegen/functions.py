@@ -1,43 +1,48 @@
 """Graphs of small vectors as compiled functions: written out in scalars, or array by array.
 
 A graph has named inputs, each a scalar or a vector of static length, and vector outputs. Two forms
-of function are made of it. A *vector function* maps vectors to vectors once; a *member function*
-does it for every column of an ensemble. Both are written out in scalars where that is possible and
-small enough, and call PyTensor's array code otherwise; both forms have the same interface.
+of function are made of it. A *vector function* maps vectors to vectors once, and is called from
+functions that numba compiles; a *member function* is an entry point that does it for every column
+of an ensemble. Both are written out in scalars where that is possible and small enough, and call
+PyTensor's array code otherwise; both forms have the same interface.
 """
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pytensor.scalar as ps
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing import signature
+from numba.extending import intrinsic
+from numba.np.arrayobj import load_item, make_array, store_item
 from pytensor.graph.basic import Variable
-from pytensor.link.numba.dispatch.basic import numba_funcify
 
 from pymc_statespace_filters.compiler.codegen.array_fallback import (
     array_member_function,
     array_vector_function,
 )
-from pymc_statespace_filters.compiler.codegen.expressions import Arena, Expression, Value
+from pymc_statespace_filters.compiler.codegen.emitter import Emitter, n_operations
+from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    MEMBER_INPUTS,
     CompiledFunction,
     Graph,
+    MemberFunction,
     VectorFunction,
     function_of,
 )
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
-from pymc_statespace_filters.compiler.codegen.source import (
-    VECTOR_NAMESPACE,
-    Writer,
-    depends_on,
-    n_operations,
+from pymc_statespace_filters.compiler.codegen.machine_code import (
+    DOUBLE,
+    POINTER,
+    Code,
+    Module,
+    constant,
 )
-from pymc_statespace_filters.compiler.codegen.stages import BLOCK, Stages, is_block
-from pymc_statespace_filters.compiler.codegen.straight_line import straight_line
+from pymc_statespace_filters.compiler.codegen.members import member_entry_point
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
 from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.errors import LoweringError
 
 _LOG = logging.getLogger("pymc_statespace_filters")
 
@@ -48,21 +53,11 @@ MAX_EXPRESSIONS = 30_000
 TRIED = 5  # times as many may be tried, at 20 us each: some turn out not to be needed
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
-# Above one of these numbers, of statements and of results, a function is optimised and becomes
+# Above one of these numbers, of operations and of results, a function is optimised and becomes
 # machine code in its callers only: 17 s instead of 28 s for the gradient of 20 states. The code of
 # a function that returns 1700 numbers, the constants of 40 states, took 40 s.
 LARGE = 1000
 LARGE_TUPLE = 400
-
-# LLVM vectorises a loop only if it needs at most 128 run-time checks that two rows do not overlap;
-# 8 rows that are written and as many that are only read need 92.
-MAX_ROWS_COMPARED = 8
-
-# The code that reads element i of an input, if not that of a vector; members are columns.
-_ELEMENT = {
-    "theta": "c[{i}]", "u": "inputs[k, {i}]", "t": "t", "x": "X[{i}, member]",
-    "z": "Z[{i}, member]", "term_bar": "term_bar", "tape": "tape[row, {i}]",
-}  # fmt: skip
 
 
 def unrolled(graph: Graph) -> list[list[Value]]:
@@ -88,12 +83,22 @@ def _input_elements(arena: Arena, name: str, variable: Variable) -> np.ndarray:
     return out
 
 
-def _element_code(graph: Graph) -> dict[str, str]:
-    return {
-        f"{name}.{i}": _ELEMENT.get(name, name + "[{i}]").format(i=i)
-        for name, variable in graph.inputs.items()
-        for i in range(variable.type.shape[0] if variable.type.ndim else 1)
-    }
+def member_function(
+    name: str, arguments: str, graph: Graph, target: str, *, vector: bool = True
+) -> MemberFunction:
+    """The entry point that writes the first output for every member to ``target``, X or out.
+
+    Python calls its ``function`` with these ``arguments``. Not in ``vector`` code if it is for one
+    member.
+    """
+    try:
+        (values,) = unrolled(graph)
+    except NotUnrollableError as reason:
+        _log_choice(name, reason)
+        return MemberFunction(array_member_function(name, graph, target), arguments)
+    _log_choice(name)
+    entry = member_entry_point(name, graph, values, target, vector=vector)
+    return MemberFunction(entry, arguments)
 
 
 def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, CompiledFunction]:
@@ -118,116 +123,130 @@ def _log_choice(names: str, reason: Exception | None = None) -> None:
 
 
 def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
-    writer = Writer(_element_code(function.graph))
-    lines = writer.statements(v for group in values for v in group)
-    results = [
-        writer.as_float(group[0])
-        if is_scalar
-        else "(" + "".join(f"{writer.as_float(v)}, " for v in group) + ")"
-        for group, is_scalar in zip(values, function.scalar, strict=True)
-    ]
-    lines.append(f"return {', '.join(results)}")
-    arguments, n_results = function.arguments, sum(map(len, values))
-    return build(
-        name,
-        arguments,
-        [f"return all({arguments})"],
-        writer,
-        n_results > LARGE_TUPLE,
-        all=(arguments, lines),
-    )
+    flat = [v for group in values for v in group]
+    code, used = vector_code(flat)
+    places = [_place(function.graph, element) for element in used]
+    sizes = [None if one else len(v) for v, one in zip(values, function.scalar, strict=True)]
+    arguments = function.arguments
+    scope = {"evaluate": _inserted(arguments, code, places, sizes)}
+    large = n_operations(flat) > LARGE or len(flat) > LARGE_TUPLE
+    body = [f"return evaluate({arguments})"]
+    compiled, source = function_of(name, arguments, body, scope, large)
+    return CompiledFunction(compiled, key_of(__name__, f"{source}{places}{sizes}", code.key), large)
 
 
-def member_function(name: str, arguments: str, graph: Graph, target: str) -> CompiledFunction:
-    """``name(arguments)`` writes the first output of every member to ``target``.
+def vector_code(values: Sequence[Value]) -> tuple[Code, list[str]]:
+    """``main(given, out)`` writes these values, and the names of the inputs that are given."""
+    module, used = Module(), list[str]()
+    main = module.function("main", [POINTER, POINTER])
+    given, out = main.args
+    builder = ir.IRBuilder(main.append_basic_block())
 
-    What does not depend on the member is computed once, before the loop.
+    def read(name: str) -> ir.Value:
+        used.append(name)
+        return builder.load(builder.gep(given, [constant(len(used) - 1)]))
+
+    emitter = Emitter(module, builder, read, vector=False)
+    for i, value in enumerate(emitter.floats(values)):
+        builder.store(value, builder.gep(out, [constant(i)]))
+    builder.ret_void()
+    return module.finished(), used
+
+
+# What inputs are elements of, if not of a vector of their name.
+_ARGUMENT = {"theta": ("c",), "u": ("inputs", "k"), "tape": ("tape", "row")}
+
+
+def _place(graph: Graph, element: str) -> tuple:
+    """An argument and indices in it, numbers or other arguments."""
+    name, _, i = element.partition(".")
+    return (*_ARGUMENT.get(name, (name,)), int(i)) if graph.inputs[name].type.ndim else (name,)
+
+
+def _inserted(
+    arguments: str, code: Code, places: Sequence[tuple], sizes: Sequence[int | None]
+) -> Callable:
+    """The function of these arguments, in compiled code, that calls ``main``.
+
+    Its results are vectors of these sizes, or single numbers.
     """
-    try:
-        (values,) = unrolled(graph)
-    except NotUnrollableError as reason:
-        _log_choice(name, reason)
-        return array_member_function(name, arguments, graph, target)
-    _log_choice(name)
-    writer = Writer(_element_code(graph), VECTOR_NAMESPACE)
-    members = frozenset(key for key in _element_code(graph) if key[0] in MEMBER_INPUTS)
-    dependent = depends_on(values, members)
-    common = [a for e in dependent for a in e.args if e.op is not None and a not in dependent]
-    kept = sorted_by_number({*common, *(v for v in values if v not in dependent)})
-    before = writer.statements(kept)
-    if any(map(is_block, dependent)):
-        return _in_stages(name, arguments, writer, (before, kept), values, dependent, target)
-    inside, results = writer.statements(values), [writer.as_float(v) for v in values]
-    names = [writer.name(v) for v in kept]
-    inside = [*(f"{name} = common[{i}]" for i, name in enumerate(names)), *inside]
-    before.append(f"return ({''.join(f'{name}, ' for name in names)})")
-    loop = _loop if len(values) <= MAX_ROWS_COMPARED else _staged_loop
-    body, inputs, inside = loop(f"{arguments}, member, common", inside, results, target)
-    return build(
-        name,
-        arguments,
-        [f"common = before({arguments})", *body],
-        writer,
-        before=(arguments, before),
-        inside=(inputs, inside),
-    )
+    kinds = [types.float64 if n is None else types.UniTuple(types.float64, n) for n in sizes]
+    returned = kinds[0] if len(kinds) == 1 else types.Tuple(kinds)
+    total = sum(1 if n is None else n for n in sizes)
+
+    def generate(frame: "_Frame") -> Any:
+        builder = frame.builder
+        given, out = (_room(builder, n) for n in (len(places), total))
+        for i, (name, *indices) in enumerate(places):
+            builder.store(frame.read(name, *indices), builder.gep(given, [constant(i)]))
+        code.call(frame.context, builder, [given, out])
+        numbers = iter([builder.load(builder.gep(out, [constant(i)])) for i in range(total)])
+        made = [
+            next(numbers)
+            if n is None
+            else frame.context.make_tuple(builder, kind, [next(numbers) for _ in range(n)])
+            for n, kind in zip(sizes, kinds, strict=True)
+        ]
+        return made[0] if len(made) == 1 else frame.context.make_tuple(builder, returned, made)
+
+    return _intrinsic(arguments, returned, generate)
 
 
-def _in_stages(
-    name: str,
-    arguments: str,
-    writer: Writer,
-    before: tuple[list[str], list],
-    values: list[Value],
-    dependent: set[Expression],
-    target: str,
-) -> CompiledFunction:
-    """A member function with functions that have branches, see `stages`."""
-    lines, kept = before
-    names = "".join(f"{writer.name(v)}, " for v in kept)
-    lines.append(f"return ({names})")
-    stages = Stages(writer, values, dependent, kept)
-    inputs = f"{arguments}, member, common, buffer, j"
-    given = f"{arguments}, np.uint64(first + j), common, buffer, np.uint64(j)"
-    body = [f"common = before({arguments})", *stages.body(given, target)]
-    blocks = {f"stage_{i}": (inputs, inside) for i, inside in enumerate(stages.inside)}
-    return build(name, arguments, body, writer, before=(arguments, lines), **blocks)
+def _room(builder: ir.IRBuilder, n: int) -> ir.Value:
+    return cgutils.alloca_once(builder, DOUBLE, size=constant(max(n, 1)))
 
 
-def _loop(
-    inputs: str, inside: list[str], results: list[str], target: str
-) -> tuple[list[str], str, list[str]]:
-    """A loop over all members; the arguments and lines of the code ``inside`` that it calls."""
-    stores = [f"{target.format(i=i)} = {result}" for i, result in enumerate(results)]
-    head = f"for member in range({target.partition('[')[0]}.shape[-1]):"
-    return [head, f"    inside({inputs})"], inputs, [*inside, *stores]
+class _Frame:
+    """The arguments of an intrinsic where it is inserted, by their names."""
+
+    def __init__(self, context: Any, builder: ir.IRBuilder, kinds: Mapping, values: Mapping):
+        self.context, self.builder, self._kinds, self._values = context, builder, kinds, values
+        self._arrays: dict[str, Any] = {}
+
+    def read(self, name: str, *indices: int | str) -> ir.Value:
+        """A number: an argument, or an element of one."""
+        kind, value = self._kinds[name], self._values[name]
+        if not indices:
+            return self.context.cast(self.builder, value, kind, types.float64)
+        if isinstance(kind, types.BaseTuple):
+            element = self.builder.extract_value(value, indices[0])
+            return self.context.cast(self.builder, element, kind[indices[0]], types.float64)
+        place = self._address(name, indices)
+        return load_item(self.context, self.builder, kind, place)
+
+    def write(self, value: ir.Value, name: str, *indices: int | str) -> None:
+        """Set an element of an array."""
+        place = self._address(name, indices)
+        store_item(self.context, self.builder, self._kinds[name], value, place)
+
+    def _address(self, name: str, indices: Sequence[int | str]) -> ir.Value:
+        kind = self._kinds[name]
+        if name not in self._arrays:
+            self._arrays[name] = make_array(kind)(self.context, self.builder, self._values[name])
+        at = [self._values[i] if isinstance(i, str) else constant(i) for i in indices]
+        array = self._arrays[name]
+        return cgutils.get_item_pointer(
+            self.context, self.builder, kind, array, at, wraparound=False
+        )
 
 
-def _staged_loop(
-    inputs: str, inside: list[str], results: list[str], target: str
-) -> tuple[list[str], str, list[str]]:
-    """The same loop over blocks of members, whose results are buffered and then copied.
+def _intrinsic(arguments: str, returned: Any, generate: Callable[[_Frame], Any]) -> Callable:
+    """A function of these arguments whose code is inserted into that of its callers."""
+    names = [argument.strip() for argument in arguments.split(",")]
 
-    The buffer does not overlap any row that is read, so LLVM needs no check for each pair of rows.
-    """
-    whole, inputs = target.partition("[")[0], f"{inputs}, buffer, j"
-    stores = [f"buffer[{i}, j] = {result}" for i, result in enumerate(results)]
-    block = [
-        f"size = min({BLOCK}, {whole}.shape[-1] - first)",
-        "for j in range(size):",
-        # A signed index might be negative and count from the end, which prevents vectorisation.
-        "    member = np.uint64(first + j)",
-        f"    inside({inputs})",
-        f"for i in range({len(results)}):",
-        "    for j in range(size):",
-        f"        {whole}[i, np.uint64(first + j)] = buffer[i, j]",
-    ]
-    body = [
-        f"buffer = np.empty(({len(results)}, {BLOCK}))",
-        f"for first in range(0, {whole}.shape[-1], {BLOCK}):",
-        *(f"    {line}" for line in block),
-    ]
-    return body, inputs, [*inside, *stores]
+    def typed(kinds: tuple) -> tuple:
+        by_name = dict(zip(names, kinds, strict=True))
+
+        def insert(context: Any, builder: Any, _: Any, values: Sequence) -> Any:
+            given = dict(zip(names, values, strict=True))
+            result = generate(_Frame(context, builder, by_name, given))
+            return context.get_dummy_value() if result is None else result
+
+        return signature(returned, *kinds), insert
+
+    scope = {"typed": typed}
+    exec(f"def code(typing, {arguments}): return typed(({arguments},))", scope)
+    return intrinsic(scope["code"])
 
 
 def copy_elements(arguments: str, target: str, source: str, size: int) -> Any:
@@ -235,59 +254,27 @@ def copy_elements(arguments: str, target: str, source: str, size: int) -> Any:
 
     A tuple that is indexed in a loop compiles to a branch for each of its elements.
     """
-    return straight_line(
-        arguments, [f"{target.format(i=i)} = {source}[{i}]" for i in range(size)], {}
-    )
+    name, _, place = target.rstrip("]").partition("[")
+    *before, last = (part.strip() for part in place.split(","))
+    first = sum(int(part) for part in last.replace("{i}", "0").split("+"))
+
+    def generate(frame: _Frame) -> None:
+        for i in range(size):
+            frame.write(frame.read(source, i), name, *before, first + i)
+
+    return _intrinsic(arguments, types.void, generate)
 
 
 def all_finite(size: int) -> Any:
     """``all_finite(vector)``: whether the first elements are finite, without a loop as above."""
-    tests = [f"abs(s[{i}]) < inf" for i in range(size)]
-    return straight_line("s", [f"return {' and '.join(tests)}"], {"inf": np.inf})
 
+    def generate(frame: _Frame) -> ir.Value:
+        build, result = frame.builder, cgutils.true_bit
+        infinity = ir.Constant(DOUBLE, float("inf"))
+        for i in range(size):
+            size_of = build.module.declare_intrinsic("llvm.fabs", [DOUBLE])
+            magnitude = build.call(size_of, [frame.read("s", i)])
+            result = build.and_(result, build.fcmp_ordered("<", magnitude, infinity))
+        return result
 
-def sorted_by_number(values: Iterable[Value]) -> list[Value]:
-    """Expressions in order of creation, so that the source is canonical."""
-    return sorted((v for v in values if hasattr(v, "number")), key=lambda v: v.number)
-
-
-def build(
-    name: str,
-    arguments: str,
-    body: Sequence[str],
-    writer: Writer,
-    large: bool = False,
-    /,
-    **blocks: tuple[str, Sequence[str]],
-) -> CompiledFunction:
-    """Compile a function body that calls blocks of a writer's statements.
-
-    A block is given by its arguments and lines.
-    """
-    namespace, key = blocks_of(writer, **blocks)
-    large |= sum(len(lines) for _, lines in blocks.values()) > LARGE
-    function, source = function_of(name, arguments, body, namespace, large)
-    return CompiledFunction(function, key_of(__name__, source, key), large)
-
-
-def blocks_of(
-    writer: Writer, **blocks: tuple[str, Sequence[str]]
-) -> tuple[dict[str, Any], str | None]:
-    """Blocks of a writer's statements, and what they call, as functions; and their key."""
-    others = {called: _scalar_function(*op) for called, op in writer.fallbacks.items()}
-    namespace = {**writer.namespace, **others}
-    code = {block: straight_line(*given, namespace) for block, given in blocks.items()}
-    texts = [f"{block}({given}):\n" + "\n".join(lines) for block, (given, lines) in blocks.items()]
-    operations = [repr(op) for op, _ in writer.fallbacks.values()]
-    return {**namespace, **code}, key_of(__name__, *texts, *operations)
-
-
-def _scalar_function(op: ps.ScalarOp, n_arguments: int) -> Any:
-    node = op.make_node(*(ps.float64() for _ in range(n_arguments)))
-    try:
-        return numba_funcify(op, node=node)
-    except NotImplementedError as error:
-        raise LoweringError(
-            f"functions of the system must consist of pytensor.tensor operations that numba "
-            f"supports, got {op}"
-        ) from error
+    return _intrinsic("s", types.boolean, generate)

@@ -7,19 +7,23 @@ offsets are constants of the source, so LLVM knows that rows do not overlap. The
 a variable, because LLVM would unroll a short loop of known length instead of vectorising it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 
-from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value
+from pymc_statespace_filters.compiler.codegen.emitter import Emitter, depends_on
+from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value, in_order
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.functions import (
-    blocks_of,
-    sorted_by_number,
-    unrolled,
+from pymc_statespace_filters.compiler.codegen.functions import unrolled
+from pymc_statespace_filters.compiler.codegen.machine_code import (
+    Module,
+    ModuleEntryPoint,
+    constant,
 )
-from pymc_statespace_filters.compiler.codegen.source import VECTOR_NAMESPACE, Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES, sorted_by_number
 from pymc_statespace_filters.compiler.native.entry_point import (
     F64_PTR,
     EntryPoint,
@@ -78,96 +82,127 @@ def lane_functions(
         name: [v for group in unrolled(function.graph) for v in group]
         for name, function in functions.items()
     }
-    code = {name: _element_code(function.graph, rows) for name, function in functions.items()}
-    known: dict[str, dict[Value, str]] = {first: {}}
+    known: dict[str, dict[Value, int]] = {first: {}}
     for name in others:
-        constants = _constants(values[name], code[name])
-        known[name] = {v: _row(n_rows + i) for i, v in enumerate(constants)}
+        constants = _constants(values[name], functions[name].graph)
+        known[name] = {v: n_rows + i for i, v in enumerate(constants)}
         n_rows += len(constants)
     entries = {}
     for name, function in functions.items():
         results, targets = values[name], _targets(function, rows, state_size)
-        given = code[name]
         if name == first:
             for other in others:
-                results, targets = [*results, *known[other]], [*targets, *known[other].values()]
-                given = given | code[other]
-        blocks, key = _blocks(given, known[name], results, targets)
-        sizes = state_size * LANES, n_inputs * LANES
-        loop = _loop(blocks["before"], blocks["inside"], *sizes, backwards=function.backwards)
-        parts = (repr((LANES, sizes, function.backwards)), key)
-        entries[name] = EntryPoint(loop, LANE_ARGUMENTS, name, parts)
+                results = [*results, *known[other]]
+                targets = [*targets, *(("W", row) for row in known[other].values())]
+        code = _Lanes(rows, state_size, n_inputs)
+        code.emit(results, targets, known[name], backwards=function.backwards)
+        entries[name] = ModuleEntryPoint(code.module.finished(), LANE_ARGUMENTS, name)
     return LaneFunctions(entries, n_rows)
 
 
-def _row(row: int) -> str:
-    return f"W[{row * LANES} + lane]"
-
-
-def _element_code(graph: Graph, rows: Mapping[str, int]) -> dict[str, str]:
-    """The code that reads each element of the inputs."""
-    places = {STATE: "states[state + {} + lane]", INPUTS: "forces[force + {} + lane]", TIME: TIME}
+def _elements(graph: Graph) -> set[str]:
     return {
-        f"{name}.{i}": places[name].format(i * LANES) if name in places else _row(rows[name] + i)
+        f"{name}.{i}"
         for name, variable in graph.inputs.items()
         for i in range(variable.type.shape[0] if variable.type.ndim else 1)
     }
 
 
-def _targets(function: LaneFunction, rows: Mapping[str, int], state_size: int) -> list[str]:
-    """Where each element of the outputs is written."""
+def _targets(
+    function: LaneFunction, rows: Mapping[str, int], state_size: int
+) -> list[tuple[str, int]]:
+    """The array and row that each element of the outputs is written to."""
     return [
-        f"states[state + {(state_size + i) * LANES} + lane]"
-        if name == STATE
-        else _row(rows[name] + i)
+        ("states", state_size + i) if name == STATE else ("W", rows[name] + i)
         for name, output in zip(function.targets, function.graph.outputs, strict=True)
         for i in range(output.type.shape[0])
     ]
 
 
-def _constants(values: Sequence[Value], code: Mapping[str, str]) -> list[Value]:
+def _constants(values: Sequence[Value], graph: Graph) -> list[Expression]:
     """Expressions of theta alone that are results, or are used by others."""
-    of_theta = frozenset(name for name in code if name.partition(".")[0] == PARAMETERS)
-    varying = depends_on(values, frozenset(code) - of_theta)
+    elements = _elements(graph)
+    of_theta = frozenset(name for name in elements if name.partition(".")[0] == PARAMETERS)
+    varying = depends_on(values, frozenset(elements) - of_theta)
     constant = depends_on(values, of_theta) - varying
     used = [*values, *(a for e in varying for a in e.args)]
     kept = {v for v in used if v in constant and v.op is not None and v.kind == FLOAT}
     return sorted_by_number(kept)
 
 
-_INSIDE = "W, states, state, forces, force, t, lane, shared"
+class _Lanes:
+    """A function with `LANE_ARGUMENTS` under construction: loops over steps and lanes."""
 
+    def __init__(self, rows: Mapping[str, int], state_size: int, n_inputs: int) -> None:
+        self.module, self._rows = Module(), rows
+        self._sizes = {"W": 0, "states": state_size, "forces": n_inputs}
+        main = self.module.function("main", [LLVM_TYPES[k] for k in LANE_ARGUMENTS.values()])
+        self._arguments = dict(zip(LANE_ARGUMENTS, main.args, strict=True))
+        self._builder = ir.IRBuilder(main.append_basic_block())
+        self._distinct = self.module.distinct(list(self._sizes))
+        self._starts: dict[str, ir.Value] = {}
+        self._lane = self._time = None
 
-def _blocks(
-    code: Mapping[str, str],
-    known: Mapping[Value, str],
-    values: Sequence[Value],
-    targets: Sequence[str],
-) -> tuple[dict[str, Any], str | None]:
-    """Code that writes ``values`` to ``targets``; what is equal in all lanes is computed before."""
-    writer = Writer(dict(code), VECTOR_NAMESPACE, known)
-    of_lane = depends_on(values, frozenset(code) - {f"{TIME}.0"})
-    used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
-    shared = sorted_by_number({v for v in used if isinstance(v, Expression) and v not in of_lane})
-    before, names = writer.statements(shared), [writer.name(v) for v in shared]
-    before.append(f"return ({''.join(f'{name}, ' for name in names)})")
-    inside = [f"{name} = shared[{i}]" for i, name in enumerate(names)]
-    inside += writer.statements(values)
-    inside += [f"{t} = {writer.as_float(v)}" for t, v in zip(targets, values, strict=True)]
-    return blocks_of(writer, before=(TIME, before), inside=(_INSIDE, inside))
+    def emit(
+        self,
+        values: Sequence[Value],
+        targets: Sequence[tuple[str, int]],
+        known: Mapping[Value, int],
+        *,
+        backwards: bool,
+    ) -> None:
+        """Write ``values`` to ``targets``; what is equal in all lanes is computed before.
 
+        The ``known`` are read from their rows of ``W``.
+        """
+        build, given = self._builder, self._arguments
+        emitter = Emitter(self.module, build, self._read, vector=True)
+        with cgutils.for_range(build, given["n_steps"]) as loop:
+            i = loop.index
+            if backwards:
+                i = build.sub(build.sub(given["n_steps"], constant(1)), i)
+            step = build.sitofp(build.add(given["k"], i), given["t0"].type)
+            elapsed = emitter.arithmetic("fmul", step, given["dt"])
+            self._time = emitter.arithmetic("fadd", given["t0"], elapsed)
+            self._starts = {
+                name: build.gep(given[name], [build.mul(i, constant(size * LANES))])
+                for name, size in self._sizes.items()
+            }
+            shared = self._shared(values)
+            emitter.emit(shared)
+            with cgutils.for_range(build, given["n_lanes"]) as lanes:
+                self._lane = lanes.index
+                for expression, row in known.items():
+                    emitter.set(expression, self._load("W", row))
+                results = emitter.floats(values)
+                for (name, row), result in zip(targets, results, strict=True):
+                    self._marked(build.store(result, self._place(name, row)), name)
+        build.ret_void()
 
-def _loop(
-    before: Any, inside: Any, state_size: int, force_size: int, *, backwards: bool
-) -> Callable:
-    """The loops over steps and lanes; the function of an entry point."""
+    def _shared(self, values: Sequence[Value]) -> list[Expression]:
+        """What depends on the time alone and is read in the lanes."""
+        inputs = frozenset(e.args[0] for e in in_order(values, ()) if e.op is None)
+        of_lane = depends_on(values, inputs - {f"{TIME}.0"})
+        used = [*values, *(a for e in of_lane if e.op is not None for a in e.args)]
+        return sorted_by_number({v for v in used if v not in of_lane})
 
-    def run(W, n_lanes, states, forces, t0, dt, k, n_steps):
-        for number in range(n_steps):
-            i = n_steps - 1 - number if backwards else number
-            t = t0 + (k + i) * dt
-            shared = before(t)
-            for lane in range(n_lanes):
-                inside(W, states, i * state_size, forces, i * force_size, t, lane, shared)
+    def _read(self, name: str) -> ir.Value:
+        vector, _, number = name.partition(".")
+        if vector == TIME:
+            return self._time
+        where = {STATE: "states", INPUTS: "forces"}.get(vector)
+        if where is not None:
+            return self._load(where, int(number))
+        return self._load("W", self._rows[vector] + int(number))
 
-    return run
+    def _load(self, name: str, row: int) -> ir.Value:
+        return self._marked(self._builder.load(self._place(name, row)), name)
+
+    def _place(self, name: str, row: int) -> ir.Value:
+        at = self._builder.add(constant(row * LANES), self._lane)
+        return self._builder.gep(self._starts[name], [at], inbounds=True)
+
+    def _marked(self, instruction: Any, name: str) -> Any:
+        for mark, metadata in self._distinct[name].items():
+            instruction.set_metadata(mark, metadata)
+        return instruction

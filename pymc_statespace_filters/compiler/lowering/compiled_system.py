@@ -9,9 +9,10 @@ from pytensor.tensor.variable import TensorVariable
 from pymc_statespace_filters.compiler.codegen.function_types import (
     CompiledFunction,
     Graph,
-    VectorFunction,
+    MemberFunction,
+    ParameterFunction,
 )
-from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import member_function
 from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.constants import (
     after_extension,
@@ -31,8 +32,6 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
     linearize_step,
     n_gains,
     observation_information,
-    smoothed_cov,
-    step_back,
 )
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
@@ -67,15 +66,13 @@ class CompiledSystem:
       its state, see `guided_noise`; X has one row more, to which log density ratios are added.
     * ``linearized_step(c, inputs, k, t, noise, X, out)`` writes the next state of every column of X
       with this noise and its Jacobians, see `linearize_step`.
-    * ``observation_information(c, inputs, k, t, d, X, member)`` returns log p(d | x), its score and
-      its information.
-    * ``smoothed_cov(step, gains, cov)``, ``step_back(step, path, psi)``
-      and ``start_back`` are the algebra of a guide, see `guidance`.
+    * ``observation_information(c, inputs, k, t, d, X, out)`` writes log p(d | x), its score and its
+      information, for one member.
     * ``step_moments(c, inputs, k, t, X, M)`` writes mean and variance of the next state given each
       column of X into M (2, N); for one state and additive noise.
 
-    Each is a `CompiledFunction`: ``system.propagate.function`` is called from compiled code, and
-    ``system.propagate.key`` identifies its code.
+    Each has an entry point, for machine code, and a ``function`` that Python calls with these
+    arguments. They are what `entry_points.entry_point` gives filters.
 
     Attributes
     ----------
@@ -122,7 +119,7 @@ class CompiledSystem:
     # Constants of an evaluation
 
     @cached_property
-    def _extend(self) -> CompiledFunction | None:
+    def _extend(self) -> ParameterFunction | None:
         return None if self._extension is None else extend(self._extension)
 
     def at_parameters(
@@ -148,15 +145,17 @@ class CompiledSystem:
     # Functions
 
     @cached_property
-    def prepare(self) -> CompiledFunction:
+    def prepare(self) -> ParameterFunction:
         """Theta -> c."""
-        theta = pt.tensor("theta", shape=(self.n_theta,), dtype="float64")
+        given = theta = pt.tensor("theta", shape=(self._written.n_theta,), dtype="float64")
+        if self._extension is not None:
+            (theta,) = self._extension.bind([given])
         mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
-        prepare = followed_by_square_roots([theta, mean], self.model, theta, self._covariances)
-        return self.at_parameters(prepare)
+        outputs = [theta, mean]
+        return followed_by_square_roots(outputs, self.model, given, theta, self._covariances)
 
     @cached_property
-    def initialise(self) -> CompiledFunction:
+    def initialise(self) -> MemberFunction:
         """Draw the state at step 0."""
         z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
         draw = self.model.equations.initial_draw
@@ -164,18 +163,18 @@ class CompiledSystem:
             state = mean + self._square_roots["initial_cov"] @ z
         else:
             (state,) = draw.bind([self._symbols["theta"], z])
-        return self._member_function("initialise", "c, Z, X", state, "X[{i}, member]", z=z)
+        return self._member_function("initialise", "c, Z, X", state, "X", z=z)
 
     @cached_property
-    def propagate(self) -> CompiledFunction:
+    def propagate(self) -> MemberFunction:
         """Move every member one step, in place."""
         z = _normals(self.m)
         arguments = "c, inputs, k, t, Z, X"
         step = self._step(self._symbols["x"], z)
-        return self._member_function("propagate", arguments, step, "X[{i}, member]", "xut", z=z)
+        return self._member_function("propagate", arguments, step, "X", "xut", z=z)
 
     @cached_property
-    def propagate_guided(self) -> CompiledFunction:
+    def propagate_guided(self) -> MemberFunction:
         """Move every member one step by guided noise, in place, and weigh its move."""
         n, m, z = self.n, self.m, _normals(self.m)
         member = pt.tensor("x", shape=(n + 1,), dtype="float64")
@@ -185,70 +184,55 @@ class CompiledSystem:
         inputs = {"theta": self._c, "u": self._symbols["u"], "t": self._symbols["t"]}
         graph = Graph(inputs | {"x": member, "z": z, "gains": gains}, [moved])
         arguments = "c, inputs, k, t, gains, Z, X"
-        return member_function("propagate_guided", arguments, graph, "X[{i}, member]")
+        return member_function("propagate_guided", arguments, graph, "X")
 
     @cached_property
-    def linearized_step(self) -> CompiledFunction:
+    def linearized_step(self) -> MemberFunction:
         """The next state and its Jacobians, at points with the same noise."""
         x, noise = self._symbols["x"], pt.tensor("noise", shape=(self.m,), dtype="float64")
         linearized = linearize_step(self._step(x, noise), x, noise, self.free)
         inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xut"}, "noise": noise}
         arguments = "c, inputs, k, t, noise, X, out"
         graph = Graph(inputs, [linearized])
-        return member_function("linearized_step", arguments, graph, "out[{i}, member]")
+        return member_function("linearized_step", arguments, graph, "out")
 
     @cached_property
-    def observation_information(self) -> CompiledFunction:
+    def observation_information(self) -> MemberFunction:
         """log p(d | x), its score and its information, at one state."""
         information = observation_information(self.model, self._given("xutd"), self.free)
         inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xutd"}}
-        arguments = "c, inputs, k, t, d, X, member"
-        return _vector_function("observation_information", arguments, Graph(inputs, [information]))
+        arguments, graph = "c, inputs, k, t, d, X, out", Graph(inputs, [information])
+        return member_function("observation_information", arguments, graph, "out", vector=False)
 
     @cached_property
-    def smoothed_cov(self) -> CompiledFunction:
-        """Covariance of the next state given the record."""
-        return _vector_function("smoothed_cov", "step, gains, cov", smoothed_cov(self.n, self.m))
-
-    @cached_property
-    def step_back(self) -> CompiledFunction:
-        """A step of the recursion of a guide."""
-        return _vector_function("step_back", "step, path, psi", step_back(self.n, self.m))
-
-    @cached_property
-    def start_back(self) -> CompiledFunction:
-        """The same for the normals of the state at step 0."""
-        return _vector_function("start_back", "step, path, psi", step_back(self.n, self.n))
-
-    @cached_property
-    def observe(self) -> CompiledFunction:
+    def observe(self) -> MemberFunction:
         """Simulate an observation of every member."""
         z = _normals(self.r)
         noise = {"e": self._coloured("observation_noise", z)}
         seen = call(self.model.equations.observation, self.model, self._given("xut") | noise)
         arguments = "c, inputs, k, t, Z, X, D"
-        return self._member_function("observe", arguments, seen, "D[{i}, member]", "xut", z=z)
+        return self._member_function("observe", arguments, seen, "out", "xut", z=z)
 
     @cached_property
-    def expect(self) -> CompiledFunction:
+    def expect(self) -> MemberFunction:
         """The observation of every member without noise."""
         seen = expected_observation(self.model, self._given("xut"))
         arguments = "c, inputs, k, t, X, D"
-        return self._member_function("expect", arguments, seen, "D[{i}, member]", "xut")
+        return self._member_function("expect", arguments, seen, "out", "xut")
 
     @cached_property
-    def log_density(self) -> CompiledFunction:
+    def log_density(self) -> MemberFunction:
         """log p(d | x) of every member."""
         density = pt.atleast_1d(observation_log_density(self.model, self._given("xutd")))
         arguments = "c, inputs, k, t, d, X, out"
-        return self._member_function("log_density", arguments, density, "out[member]", "xutd")
+        return self._member_function("log_density", arguments, density, "out", "xutd")
 
     @cached_property
-    def step_moments(self) -> CompiledFunction:
+    def step_moments(self) -> MemberFunction:
         """Mean and variance of the next state, for one state and additive noise."""
         arguments = "c, inputs, k, t, X, M"
         moments = structure.step_moments(self.model, self._given("xut"))
-        return self._member_function("step_moments", arguments, moments, "M[{i}, member]", "xut")
+        return self._member_function("step_moments", arguments, moments, "out", "xut")
 
     def _step(self, x: TensorVariable, z: TensorVariable) -> TensorVariable:
         """The next state, from standard normals."""
@@ -267,7 +251,7 @@ class CompiledSystem:
 
     def _member_function(
         self, name: str, arguments: str, output: TensorVariable, target: str, inputs: str = "", **z
-    ) -> CompiledFunction:
+    ) -> MemberFunction:
         graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 
@@ -330,10 +314,6 @@ class CompiledSystem:
     def has_exact_observation_density(self) -> bool:
         """Whether `log_density` is exact; noise that is not additive enters by linearization."""
         return self.additive_noise or not self.gaussian_observation
-
-
-def _vector_function(name: str, arguments: str, graph: Graph) -> CompiledFunction:
-    return vector_functions({name: VectorFunction(arguments, graph)})[name]
 
 
 def _normals(size: int) -> TensorVariable:

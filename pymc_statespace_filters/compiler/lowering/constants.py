@@ -23,7 +23,11 @@ from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.math import Dot
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    CompiledFunction,
+    ParameterFunction,
+    jit,
+)
 from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, staged
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.system.model import StateSpaceModel
@@ -123,22 +127,23 @@ def _size(variable: TensorVariable) -> int:
     return int(np.prod(variable.type.shape, dtype=int))
 
 
-def extend(extension: FrozenFunctionGraph) -> CompiledFunction:
+def extend(extension: FrozenFunctionGraph) -> ParameterFunction:
     """theta -> (theta, constants), an array."""
     theta, extended = _symbols(extension)
-    return staged([theta], extended)
+    return staged("extend", [theta], extended)
 
 
-def pull_back(extension: FrozenFunctionGraph) -> CompiledFunction:
+def pull_back(extension: FrozenFunctionGraph) -> ParameterFunction:
     """Cotangent of theta from an array: theta, then the cotangent of (theta, constants)."""
     theta, extended = _symbols(extension)
     cotangent = extended.type("c_bar")
     (bar,) = pytensor.grad(None, [theta], known_grads={extended: cotangent})
-    return staged([theta, cotangent], pt.specify_shape(bar, theta.type.shape))
+    theta_bar = pt.specify_shape(bar, theta.type.shape)
+    return staged("pull_back", [theta, cotangent], theta_bar)
 
 
 def after_extension(
-    extension: CompiledFunction, compiled: CompiledFunction, *, of_many: bool
+    extension: ParameterFunction, compiled: CompiledFunction, *, of_many: bool
 ) -> CompiledFunction:
     """A function whose first argument is (theta, constants), as a function of theta."""
     extended, function = extension.function, compiled.function
@@ -158,8 +163,8 @@ def after_extension(
 
 
 def between_extensions(
-    extension: CompiledFunction,
-    pullback: CompiledFunction,
+    extension: ParameterFunction,
+    pullback: ParameterFunction,
     compiled: CompiledFunction,
     *,
     of_many: bool,
@@ -187,7 +192,7 @@ def between_extensions(
     return CompiledFunction(made, key, compiled.large)
 
 
-def _zero_of_zeros(pullback: CompiledFunction) -> Any:
+def _zero_of_zeros(pullback: ParameterFunction) -> Any:
     """`pull_back`, but zeros where there is nothing to pull back, as after a failure.
 
     The constant of a failure may be NaN, which times zero is NaN.

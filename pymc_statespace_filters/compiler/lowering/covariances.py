@@ -10,11 +10,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
     CompiledFunction,
-    Graph,
-    VectorFunction,
+    ParameterFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
+from pymc_statespace_filters.compiler.lowering.staged import staged
 from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
@@ -37,32 +36,18 @@ def covariances(
 def followed_by_square_roots(
     outputs: Sequence[TensorVariable],
     system: StateSpaceModel,
+    given: TensorVariable,
     theta: TensorVariable,
     graphs: Mapping[str, FrozenFunctionGraph],
-) -> CompiledFunction:
-    """theta -> these vectors, then the lower square root of every covariance, in one array."""
+) -> ParameterFunction:
+    """These vectors, then the lower square root of every covariance, as a function of ``given``.
+
+    The parameters theta are a function of it too.
+    """
     covs = [call(graph, system, {"theta": theta}) for graph in graphs.values()]
-    graph = Graph({"theta": theta}, [pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])])
-    flat = vector_functions({"moments": VectorFunction("c", graph)})["moments"]
-    length, sizes = graph.outputs[0].type.shape[0], tuple(cov.type.shape[0] for cov in covs)
-    moments, first = flat.function, length - sum(size**2 for size in sizes)
-    copy = copy_elements("values, c", "c[{i}]", "values", length)
-    roots = np.array(sizes, dtype=np.int64)  # numba cannot loop over an empty tuple
-    SQUARE_ROOT.compile()
-    take_root = SQUARE_ROOT.external
-
-    def prepare(theta):
-        c = np.empty(length)
-        copy(moments(theta), c)
-        start = first
-        for size in roots:
-            take_root(c[start:].ctypes.data, size)
-            start += size * size
-        return c
-
-    return CompiledFunction(
-        jit(prepare), key_of(__name__, repr((length, sizes)), flat.key, SQUARE_ROOT.key)
-    )
+    flat = pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])
+    sizes = [cov.type.shape[0] for cov in covs]
+    return staged("prepare", [given], flat, SQUARE_ROOT, sizes)
 
 
 def covariance_check(system: StateSpaceModel) -> CompiledFunction:
@@ -78,7 +63,7 @@ def covariance_check(system: StateSpaceModel) -> CompiledFunction:
     if not graphs:
         return CompiledFunction(jit(lambda theta: True), key_of(__name__, "nothing to check"))
     theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    prepare = followed_by_square_roots([], system, theta, graphs)
+    prepare = followed_by_square_roots([], system, theta, theta, graphs)
     roots = prepare.function
 
     def check(theta):

@@ -11,14 +11,22 @@ from typing import Any
 import numpy as np
 from numba import carray, types
 
+from pymc_statespace_filters.compiler.codegen.function_types import MemberArguments
 from pymc_statespace_filters.compiler.lowering.guidance import n_gains, step_size
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, arguments_class
+from pymc_statespace_filters.compiler.native.entry_point import (
+    F64_PTR,
+    arguments_class,
+    call_address,
+)
 from pymc_statespace_filters.compiler.native.jit import inline_always
 
 FOLLOW_ARGUMENTS = {
     "c": F64_PTR, "inputs": F64_PTR, "first": types.intp, "last": types.intp, "t0": types.float64,
     "dt": types.float64, "path": F64_PTR, "gains": F64_PTR, "steps": F64_PTR, "cov": F64_PTR,
 }  # fmt: skip
+
+# Of the loop, which is told what it calls at every step.
+LOOP_ARGUMENTS = {**FOLLOW_ARGUMENTS, "linearize": types.intp}
 
 FollowArguments = arguments_class("FollowArguments", FOLLOW_ARGUMENTS, __name__)
 
@@ -30,10 +38,11 @@ LOOK_BACK_ARGUMENTS = {
 LookBackArguments = arguments_class("LookBackArguments", LOOK_BACK_ARGUMENTS, __name__)
 
 
-def follow_loop(
-    linearize: Any, smooth: Any, n: int, m: int, n_inputs: int, n_constants: int
-) -> Callable:
+def follow_loop(smooth: Any, n: int, m: int) -> Callable:
     """Follow the gains from step ``first`` to ``last`` and linearise every step on the way.
+
+    ``linearize`` is the address of the system's function, so that the loop is compiled once for all
+    systems of these sizes.
 
     The linearised step is a mean over the points x and x +- sqrt(scale) L e_a, L L^T the covariance
     around the path. With a scale of 3 means of polynomials of the fifth degree in one state are
@@ -45,8 +54,7 @@ def follow_loop(
     take_root, residual_cov = _lower_root(n), _residual_cov(n, m, scale)
     reach, weight, at_centre = math.sqrt(scale), 0.5 / scale, 1.0 - n / scale
 
-    def follow(c, inputs, first, last, t0, dt, path, gains, steps, cov):
-        constants, rows = carray(c, (n_constants,)), carray(inputs, (last, n_inputs))
+    def follow(c, inputs, first, last, t0, dt, path, gains, steps, cov, linearize):
         E, P = carray(path, (last + 1, n)), carray(cov, (n_cov,))
         all_gains, all_steps = carray(gains, (last, n_row)), carray(steps, (last, n_step))
         root, X, results = np.zeros((n, n)), np.empty((n, n_points)), np.empty((n_means, n_points))
@@ -63,7 +71,11 @@ def follow_loop(
                 for b in range(n):
                     X[a, 1 + b] = E[k, a] + reach * root[a, b]
                     X[a, 1 + n + b] = E[k, a] - reach * root[a, b]
-            linearize(constants, rows, k, t0 + k * dt, step[n_means:], X, results)
+            arguments = MemberArguments(
+                c=c, inputs=inputs, k=k, t=t0 + k * dt, z=step[n_means:], width=np.int64(0), X=X,
+                out=results, n_members=np.int64(n_points),
+            )  # fmt: skip
+            call_address(linearize, arguments)
             for i in range(n_means):
                 total = 0.0
                 for point in range(1, n_points):

@@ -13,11 +13,11 @@ import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor as pt
 
+from pymc_statespace_filters.compiler.codegen.emitter import depends_on
 from pymc_statespace_filters.compiler.codegen.expressions import Expression, Value
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import unrolled
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.codegen.source import depends_on
 from pymc_statespace_filters.compiler.lowering.symbols import (
     observation_moments,
     symbols_of,

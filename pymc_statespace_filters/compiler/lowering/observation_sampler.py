@@ -1,4 +1,4 @@
-"""Drawing one observation of one state, with a numpy generator."""
+"""Drawing one observation of one state from the user's distributions."""
 
 import numpy as np
 import pytensor
@@ -7,39 +7,18 @@ from pytensor.graph.fg import FrozenFunctionGraph
 
 from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
 from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.jit import copy_into
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
-def observation_sampler(system: StateSpaceModel) -> CompiledFunction:
-    """``observe(rng, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1) to out (p,)."""
-    if (draw := system.equations.observation_draw) is not None:
-        return _distribution_sampler(system, draw)
-    simulated, p, r = compile_system(system).observe, system.p, system.r
-    observe_members = simulated.function
+def distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
+    """``observe(rng, functions, c, inputs, k, t, x, out)`` writes a draw of d given x (n, 1).
 
-    def observe(rng, c, inputs, k, t, x, out):
-        observe_members(c, inputs, k, t, rng.standard_normal((r, 1)), x, out.reshape(p, 1))
-
-    return CompiledFunction(jit(observe), key_of(__name__, "draw", simulated.key))
-
-
-def observation_mean(system: StateSpaceModel) -> CompiledFunction:
-    """``observe`` with the arguments of `observation_sampler`, which writes d without noise."""
-    expected, p = compile_system(system).expect, system.p
-    expect_members = expected.function
-
-    def observe(rng, c, inputs, k, t, x, out):
-        expect_members(c, inputs, k, t, x, out.reshape(p, 1))
-
-    return CompiledFunction(jit(observe), key_of(__name__, "mean", expected.key))
-
-
-def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:
-    """The user's distributions, drawn by PyTensor's code."""
+    It is that of the user's distributions by PyTensor's code, to out (p,). ``functions`` are not
+    used.
+    """
     no_noise = {"q": pt.zeros((system.m,)), "e": pt.zeros((system.r,))}
     symbols = symbols_of(system) | no_noise
     core = [symbols[name] for name in SYMBOLS]
@@ -53,7 +32,7 @@ def _distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -
     no_inputs = np.zeros(0)
     copies = "rng, " * len(generators)
     source = (
-        "def observe(rng, c, inputs, k, t, x, out):\n"
+        "def observe(rng, functions, c, inputs, k, t, x, out):\n"
         f"    u = {'inputs[k]' if n_inputs else 'no_inputs'}\n"
         "    (drawn,) = draw_code(c[:n_theta].copy(), x[:, 0].copy(), u, np.asarray(t), "
         f"{copies})\n"

@@ -1,29 +1,39 @@
-"""Functions of vectors with operations that have entry points, evaluated in stages.
+"""Functions of parameters with operations that have entry points, evaluated in stages.
 
 An operation such as the exact step of a linear equation is machine code compiled once for all
-systems. What it takes is computed by generated code, and so is what is made of its results. One
-array holds all of these: the inputs, then arguments and result of each operation, then the output.
+systems. What it takes is computed by generated code, and so is what is made of its results. An
+array holds arguments and result of each operation.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from llvmlite import ir
 from numba import carray, types
-from pytensor.graph.basic import Apply
-from pytensor.graph.replace import graph_replace
+from numba.core import cgutils
 from pytensor.graph.traversal import io_toposort
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
+from pymc_statespace_filters.compiler.codegen.emitter import Emitter
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
+    PARAMETER_ARGUMENTS,
     Graph,
-    VectorFunction,
+    ParameterFunction,
     jit,
 )
-from pymc_statespace_filters.compiler.codegen.functions import copy_elements, vector_functions
-from pymc_statespace_filters.compiler.native.cache_key import key_of
+from pymc_statespace_filters.compiler.codegen.functions import unrolled
+from pymc_statespace_filters.compiler.codegen.machine_code import (
+    DOUBLE,
+    INT,
+    POINTER,
+    Module,
+    ModuleEntryPoint,
+    constant,
+)
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.system.linear_step import LinearStep, LinearStepBack, make_functions
 
@@ -49,82 +59,97 @@ ENTRY_POINTS = {
 """The entry point of each operation: it reads its arguments and writes its result."""
 
 
-def staged(inputs: Sequence[TensorVariable], output: TensorVariable) -> CompiledFunction:
-    """The function of the inputs (vectors), in one array, that returns the output, an array."""
-    places, size = {}, 0
-    for variable in inputs:
-        places[variable] = slice(size, size + variable.type.shape[0])
-        size += variable.type.shape[0]
-    nodes = [n for n in io_toposort(inputs, [output]) if type(n.op) in ENTRY_POINTS]
-    starts = []
-    for node in nodes:
-        starts.append(size)
-        size += sum(v.type.shape[0] for v in node.inputs)
-        places[node.outputs[0]] = slice(size, size + node.outputs[0].type.shape[0])
-        size += node.outputs[0].type.shape[0]
-    given, first, length = sum(v.type.shape[0] for v in inputs), size, output.type.shape[0]
-    stages = [_nothing()]
-    for node, start in zip(nodes, starts, strict=True):
-        values = pt.concatenate(node.inputs)
-        stages.append(_written(stages[-1], values, start, places, first))
-        stages.append(_called(stages[-1], node, start))
-    last = _written(stages[-1], output, first, places, first)
-    fill, whole = last.function, first + length
+def staged(
+    name: str,
+    inputs: Sequence[TensorVariable],
+    output: TensorVariable,
+    take_root: EntryPoint | None = None,
+    roots: Sequence[int] = (),
+) -> ParameterFunction:
+    """The function of the inputs (vectors), in one array, that writes the output, a vector.
 
-    def evaluate(values):
-        work = np.empty(whole)
-        work[:given] = values
-        fill(work)
-        return work[first:].copy()
+    The output ends with matrices of sizes ``roots``, which ``take_root(matrix, size)`` replaces.
+    """
+    code = _Staged(inputs)
+    for node in io_toposort(inputs, [output]):
+        if type(node.op) in ENTRY_POINTS:
+            code.call(node)
+    length, build = output.type.shape[0], code.builder
+    code.write(output, code.out)
+    start = length - sum(size**2 for size in roots)
+    for size in roots:
+        assert take_root is not None
+        place = build.gep(code.out, [constant(start)])
+        code.module.call(build, take_root, [place, constant(size)])
+        start += size**2
+    build.ret_void()
+    entry = ModuleEntryPoint(code.module.finished(), PARAMETER_ARGUMENTS, name)
+    return ParameterFunction(entry, length)
 
-    return CompiledFunction(
-        jit(evaluate), key_of(__name__, f"staged {given} {first} {length}", last.key)
+
+class _Staged:
+    """The function under construction, and the addresses of the vectors that are known so far."""
+
+    def __init__(self, inputs: Sequence[TensorVariable]) -> None:
+        self.module = Module()
+        main = self.module.function("main", [POINTER, INT, POINTER])
+        given, _, self.out = main.args
+        self.builder = ir.IRBuilder(main.append_basic_block())
+        self._places: dict[TensorVariable, ir.Value] = {}
+        start = 0
+        for variable in inputs:
+            self._places[variable] = self.builder.gep(given, [constant(start)])
+            start += variable.type.shape[0]
+
+    def call(self, node: Any) -> None:
+        """An operation on vectors, which follow each other."""
+        n_given = sum(v.type.shape[0] for v in node.inputs)
+        (result,) = node.outputs
+        room = cgutils.alloca_once(
+            self.builder, DOUBLE, size=constant(n_given + result.type.shape[0])
+        )
+        self.write(pt.concatenate(node.inputs), room)
+        place = self.builder.gep(room, [constant(n_given)])
+        values = [room, place, constant(node.op.n)]
+        self.module.call(self.builder, ENTRY_POINTS[type(node.op)], values)
+        self._places[result] = place
+
+    def write(self, vector: TensorVariable, place: ir.Value) -> None:
+        """Write a vector that is a function of those known so far."""
+        build, places = self.builder, list(self._places.values())
+        known = {f"v{i}": variable for i, variable in enumerate(self._places)}
+        try:
+            (values,) = unrolled(Graph(known, [vector]))
+        except NotUnrollableError:
+            self.module.call(build, _on_arrays(list(self._places), vector), [*places, place])
+            return
+
+        def read(name: str) -> ir.Value:
+            variable, i = name[1:].split(".")
+            return build.load(build.gep(places[int(variable)], [constant(int(i))]))
+
+        emitter = Emitter(self.module, build, read, vector=False)
+        for i, value in enumerate(emitter.floats(values)):
+            build.store(value, build.gep(place, [constant(i)]))
+
+
+def _on_arrays(known: Sequence[TensorVariable], vector: TensorVariable) -> EntryPoint:
+    """The entry point that writes a vector by array code, NaN where that raises."""
+    code, length = array_code(list(known), [vector]), vector.type.shape[0]
+    names = [f"v{i}" for i in range(len(known))]
+    given = [f"carray({n}, ({v.type.shape[0]},)).copy()" for n, v in zip(names, known, strict=True)]
+    source = (
+        f"def values({', '.join(names)}, out):\n"
+        f"    found = carray(out, ({length},))\n"
+        "    try:\n"
+        f"        result = code({', '.join(given)})[0]\n"
+        "    except Exception:\n"  # a singular matrix, say
+        "        found[:] = np.nan\n"
+        "    else:\n"
+        f"        for i in range({length}):\n"
+        "            found[i] = result[i]\n"
     )
-
-
-def _nothing() -> CompiledFunction:
-    return CompiledFunction(jit(lambda work: None), key_of(__name__, "nothing"))
-
-
-def _written(
-    before: CompiledFunction,
-    values: TensorVariable,
-    start: int,
-    places: dict[TensorVariable, slice],
-    size: int,
-) -> CompiledFunction:
-    """The stages before, then these values written to their place."""
-    work = pt.tensor("theta", shape=(size,), dtype="float64")
-    known = {variable: work[place] for variable, place in places.items()}
-    (at_work,) = graph_replace([values], known, strict=False)
-    at_work = pt.specify_shape(at_work, values.type.shape)
-    function = VectorFunction("c", Graph({"theta": work}, [at_work]))
-    compiled = vector_functions({"values": function})["values"]
-    length = values.type.shape[0]
-    copy = copy_elements("found, work", f"work[{start} + {{i}}]", "found", length)
-    earlier, evaluate = before.function, compiled.function
-
-    def stage(work):
-        earlier(work)
-        copy(evaluate(work[:size]), work)  # array code takes the whole of its argument
-
-    return CompiledFunction(
-        jit(stage), key_of(__name__, f"written {start} {length} {size}", before.key, compiled.key)
-    )
-
-
-def _called(before: CompiledFunction, node: Apply, start: int) -> CompiledFunction:
-    """The stages before, then an operation on what they wrote."""
-    entry_point, n = ENTRY_POINTS[type(node.op)], node.op.n
-    entry_point.compile()
-    call: Callable = entry_point.external
-    result = start + sum(v.type.shape[0] for v in node.inputs)
-    earlier = before.function
-
-    def stage(work):
-        earlier(work)
-        call(work[start:].ctypes.data, work[result:].ctypes.data, n)
-
-    return CompiledFunction(
-        jit(stage), key_of(__name__, f"called {start} {n}", before.key, entry_point.key)
-    )
+    scope = {"np": np, "carray": carray, "code": code.function, "__name__": __name__}
+    exec(compile(source, "<values of a state-space system>", "exec"), scope)
+    arguments = dict.fromkeys([*names, "out"], F64_PTR)
+    return EntryPoint(scope["values"], arguments, "values", (source, code.key))

@@ -11,11 +11,11 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
+from pymc_statespace_filters.compiler.codegen.emitter import depends_on
 from pymc_statespace_filters.compiler.codegen.expressions import is_constant
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import unrolled
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.codegen.source import depends_on
 from pymc_statespace_filters.compiler.lowering.symbols import (
     SYMBOLS,
     call,

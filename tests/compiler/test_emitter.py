@@ -1,31 +1,36 @@
-"""The text of generated code is canonical: it is part of the key of machine code on disk."""
+"""The text of generated modules is canonical: it is the key of machine code on disk."""
 
 import os
 import subprocess
 import sys
+from ctypes import CFUNCTYPE, c_void_p
 
+import numpy as np
 import pytensor.scalar as ps
 
+from pymc_statespace_filters.compiler.codegen.emitter import depends_on
 from pymc_statespace_filters.compiler.codegen.expressions import Arena
-from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
+from pymc_statespace_filters.compiler.codegen.functions import vector_code
+from pymc_statespace_filters.compiler.codegen.machine_code import ModuleEntryPoint
+from pymc_statespace_filters.compiler.native.entry_point import F64_PTR
 
 PRINT_IDENTITY = """
 import pymc as pm
 import pytensor.tensor as pt
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.codegen import functions as lowering
+from pymc_statespace_filters.compiler.codegen.machine_code import Module, ModuleEntryPoint
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 
 EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
+ModuleEntryPoint.compile = lambda entry: None
 sources = []
-build = lowering.build
-def noted(name, arguments, body, writer, large=False, /, **blocks):
-    sources.extend([name, arguments, *body])
-    for block, (given, lines) in blocks.items():
-        sources.extend([block, given, *lines])
-    return build(name, arguments, body, writer, large, **blocks)
-lowering.build = noted
+finished = Module.finished
+def noted(module):
+    code = finished(module)
+    sources.extend([code.text, *code.inlined, *(entry.symbol for entry in code.needs)])
+    return code
+Module.finished = noted
 
 def drift(x, t, u, a, b=1.5):
     x0, x1, x2 = x
@@ -68,38 +73,45 @@ def test_a_second_process_writes_the_same_text():
     assert len(texts) == 1
 
 
-def test_a_statement_is_written_once():
+def operations(*values):
+    """The instructions that compute these values of x, and nothing else."""
+    code, used = vector_code(values)
+    lines = code.text.partition("define")[2].splitlines()
+    made = [line.partition(" = ")[2] for line in lines if " = " in line]
+    return used, [line for line in made if not line.startswith("getelementptr")]
+
+
+def test_an_instruction_is_emitted_once():
     arena = Arena()
     x = arena.input("x.0")
     square = arena.apply(ps.mul, x, x)
-    writer = Writer({"x.0": "x[0]"})
-    assert writer.statements([arena.apply(ps.add, square, 1.0)]) == [
-        "v0 = x[0]", "v1 = v0 * v0", "v2 = v1 + 1.0",
-    ]  # fmt: skip
-    assert writer.statements([square]) == []
-    assert writer.name(square) == "v1"
+    used, made = operations(arena.apply(ps.add, square, 1.0), square)
+    assert used == ["x.0"]
+    assert [line.split()[0] for line in made] == ["load", "fmul", "fadd"]
 
 
-def test_negative_and_infinite_constants_are_valid_source():
+def test_negative_infinite_and_whole_constants():
     arena = Arena()
     x = arena.input("x.0")
-    writer = Writer({"x.0": "x[0]"})
-    lower = arena.apply(ps.sub, x, -2.0)
-    line = writer.statements(
-        [arena.apply(ps.switch, arena.apply(ps.isnan, x), -float("inf"), lower)]
-    )
-    assert line[-1].endswith("((-inf) if v1 else v2)")
-    assert "v0 - (-2.0)" in line[2]
-    assert writer.as_float(float("nan")) == "nan"
-    assert writer.as_float(3) == "3.0"
+    lower = arena.apply(ps.sub, x, -2.5)
+    value = arena.apply(ps.switch, arena.apply(ps.isnan, x), -float("inf"), lower)
+    code, _ = vector_code([value, float("nan"), 3])
+    entry, out = ModuleEntryPoint(code, {"given": F64_PTR, "out": F64_PTR}, "f"), np.empty(3)
+    entry.compile()
+    call = CFUNCTYPE(None, c_void_p, c_void_p)(entry.address)
+    for given, expected in ((0.5, 3.0), (np.nan, -np.inf)):
+        at = np.array([given])
+        call(at.ctypes.data, out.ctypes.data)
+        np.testing.assert_array_equal(out, [expected, np.nan, 3.0])
 
 
-def test_a_deep_expression_is_written_without_recursion():
+def test_a_deep_expression_is_emitted_without_recursion():
     arena = Arena()
     value = arena.input("x.0")
     for _ in range(5000):
         value = arena.apply(ps.sin, value)
-    assert len(Writer({"x.0": "x[0]"}).statements([value])) == 5001
+    _, made = operations(value)
+    assert len(made) == 5001
 
 
 def test_what_depends_on_a_member_is_found():
