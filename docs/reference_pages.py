@@ -59,7 +59,10 @@ def _grouped() -> dict[str, list[str]]:
 
 def _index(groups: dict[str, list[str]]) -> str:
     """All names on one page; in the sidebar, a page for each group."""
-    sections = [_heading("API reference", "="), f".. currentmodule:: {PACKAGE}\n"]
+    sections = [
+        _heading("API reference", "="),
+        f".. currentmodule:: {PACKAGE}\n",
+    ]
     for title, names in groups.items():
         sections += [_heading(title, "-"), _table(names)]
     return "\n".join([*sections, _toctree([_slug(title) for title in groups])])
