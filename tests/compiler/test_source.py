@@ -8,6 +8,7 @@ import pytensor.scalar as ps
 
 from pymc_statespace_filters.compiler.codegen.expressions import Arena
 from pymc_statespace_filters.compiler.codegen.source import Writer, depends_on
+from tests.waiting import LIMIT
 
 PRINT_IDENTITY = """
 import pymc as pm
@@ -60,7 +61,11 @@ def test_a_second_process_writes_the_same_text():
     for seed in ("1", "2024"):
         environment = os.environ | {"PYTHONHASHSEED": seed}
         result = subprocess.run(
-            [sys.executable, "-c", PRINT_IDENTITY], env=environment, capture_output=True, text=True
+            [sys.executable, "-c", PRINT_IDENTITY],
+            env=environment,
+            capture_output=True,
+            timeout=LIMIT,
+            text=True,
         )
         assert result.returncode == 0, result.stderr
         assert "None" not in result.stdout.splitlines()[:6]  # every key exists
