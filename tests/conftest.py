@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.costs import Costs
+
 # One BLAS thread: the matrices are small, and the test processes already fill the cores.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
@@ -48,9 +50,17 @@ LONGEST = (
 )
 
 
+def pytest_addoption(parser):
+    parser.addoption("--costs", help="file to which a line of JSON is added for each test file")
+
+
 def pytest_configure(config):
-    """Give files to the processes in our order, not by their numbers of tests."""
+    """Say how pytest-xdist goes about it, and count compilations."""
+    # Files are given to the processes in our order, not by their numbers of tests.
     config.option.loadscopereorder = False
+    # A process that dies ends the run, which might wait for ever for the one in its place.
+    config.option.maxworkerrestart = "0"
+    config.pluginmanager.register(Costs(config.option.costs))
 
 
 def pytest_collection_modifyitems(items):

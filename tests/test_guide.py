@@ -9,6 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests.waiting import LIMIT
+
 pytest.importorskip("myst_nb")  # the newest releases are tested without those of the guide
 
 ROOT = Path(__file__).parents[1]
@@ -68,7 +70,10 @@ def build(guide):
         "html",
     ]
     return subprocess.run(
-        [*command, str(guide), str(guide.parent / "html")], capture_output=True, text=True
+        [*command, str(guide), str(guide.parent / "html")],
+        capture_output=True,
+        timeout=LIMIT,
+        text=True,
     )
 
 

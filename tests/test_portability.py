@@ -15,6 +15,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from tests.elsewhere import PLAIN
+from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
 # A run with a checkpoint that is resumed, leases and journals, cores, and interrupts.
@@ -38,6 +39,7 @@ def test_without_what_linux_has():
         cwd=ROOT,
         env=os.environ | PLAIN,
         capture_output=True,
+        timeout=LIMIT,
         encoding="utf-8",
         check=False,
     )
@@ -71,6 +73,7 @@ def test_machine_code_of_another_processor():
         cwd=ROOT,
         env=os.environ | {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""},
         stdout=subprocess.PIPE,
+        timeout=LIMIT,
         check=True,
     )
     here = numbers()

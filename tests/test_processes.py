@@ -18,6 +18,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import cache_key
 from tests.systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
+from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
 POINT = {"a": np.array(0.6)}
@@ -65,6 +66,7 @@ def test_a_pickled_model_is_whole_where_nothing_was_imported():
         [sys.executable, "-c", UNPICKLE],
         input=cloudpickle.dumps(model),
         capture_output=True,
+        timeout=LIMIT,
         check=True,
     )
     assert float(done.stdout) == float(model.compile_logp()(POINT))
@@ -108,6 +110,7 @@ def run(tmp_path):
             cwd=ROOT,
             env=os.environ | {"PYTENSOR_FLAGS": flags, "PYTHONHASHSEED": "random"},
             capture_output=True,
+            timeout=LIMIT,
             text=True,
             check=False,
         )

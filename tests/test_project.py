@@ -12,10 +12,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from numba.core.registry import cpu_target
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import pymc_statespace_filters as psf
+from tests.costs import Costs, resident_mb
+from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -126,7 +129,9 @@ def test_importing_is_silent_and_leaves_mpi_and_jax_alone():
         "import sys, pymc_statespace_filters; sys.exit(bool({'mpi4py', 'jax'} & set(sys.modules)))"
     )
     command = [sys.executable, "-W", "error", "-c", script]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
@@ -159,6 +164,7 @@ def make(tmp_path):
             env=environment | {"PATH": str(tmp_path), "MAKEFLAGS": "n" if fitting else ""},
             capture_output=True,
             text=True,
+            timeout=LIMIT,
             check=False,
         )
 
@@ -178,3 +184,59 @@ def test_make_says_what_is_missing_if_no_python_fits(make):
     assert done.returncode != 0
     assert "Python 3.12, 3.13 or 3.14" in done.stdout
     assert "venv" in done.stdout
+
+
+DYING = """
+import os, time
+import pytest
+
+@pytest.mark.parametrize("i", range(3))
+def test_one(i):
+    time.sleep(0.1)
+    if {dies} and i == 1:
+        os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_worker_that_dies_ends_the_run(tmp_path):
+    """By the options of the Makefile: pytest-xdist would wait for ever for another in its place."""
+    for number in range(4):
+        file = tmp_path / f"test_{number}.py"
+        file.write_text(DYING.format(dies=number == 1), encoding="utf-8")
+    (options,) = re.findall(r"^PYTEST = (.*)$", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    settings = ("-p", "tests.conftest", "-c", ROOT / "pyproject.toml")
+    done = subprocess.run(
+        [sys.executable, *options.split(), *settings, tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "crashed while running" in done.stdout
+    assert "worker restarting disabled" in done.stdout
+
+
+def test_a_file_that_compiles_more_than_it_is_known_to_fails():
+    costs = Costs(None)
+    costs.stored = {"known.py": 100}
+    for name, n in (("known.py", 115), ("unknown.py", 1000)):
+        costs.before, costs.n_compiled = (0.0, 0), n
+        costs.end_file(name)
+    costs.before, costs.n_compiled = (0.0, 0), 116
+    with pytest.raises(pytest.fail.Exception, match=r"known.py compiles 116 functions, 100 in"):
+        costs.end_file("known.py")
+
+
+@pytest.mark.skipif(
+    resident_mb() is None, reason="the system does not tell how much memory is used"
+)
+def test_compilation_gives_the_memory_of_pass_managers_back():
+    codegen = cpu_target.target_context.codegen()
+    codegen._module_pass_manager()
+    before = resident_mb()
+    for _ in range(300):
+        codegen._module_pass_manager()
+    assert resident_mb() - before < 4  # of 9

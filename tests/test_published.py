@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from tests.waiting import LIMIT
 
 FOLDER = Path(__file__).parents[1] / "examples" / "published"
 
@@ -85,7 +86,9 @@ def test_a_script_that_was_copied_prints_its_comparison(tmp_path):
         (tmp_path / part).parent.mkdir(exist_ok=True)
         copy(FOLDER / part, tmp_path / part)
     command = [sys.executable, tmp_path / "kitagawa.py"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run(
+        command, capture_output=True, timeout=LIMIT, text=True, check=True
+    ).stdout
     assert "-250.62" in printed
     assert "errors by chance" not in printed  # too few numbers for a statement
 

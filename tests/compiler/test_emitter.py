@@ -13,6 +13,7 @@ from pymc_statespace_filters.compiler.codegen.expressions import Arena
 from pymc_statespace_filters.compiler.codegen.functions import vector_code
 from pymc_statespace_filters.compiler.codegen.machine_code import ModuleEntryPoint
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR
+from tests.waiting import LIMIT
 
 PRINT_IDENTITY = """
 import pymc as pm
@@ -65,7 +66,11 @@ def test_a_second_process_writes_the_same_text():
     for seed in ("1", "2024"):
         environment = os.environ | {"PYTHONHASHSEED": seed}
         result = subprocess.run(
-            [sys.executable, "-c", PRINT_IDENTITY], env=environment, capture_output=True, text=True
+            [sys.executable, "-c", PRINT_IDENTITY],
+            env=environment,
+            capture_output=True,
+            timeout=LIMIT,
+            text=True,
         )
         assert result.returncode == 0, result.stderr
         assert "None" not in result.stdout.splitlines()[:6]  # every key exists

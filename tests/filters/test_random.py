@@ -32,6 +32,7 @@ from pymc_statespace_filters.compiler.numerics.philox import (
     PROCESS,
     RESAMPLING,
 )
+from tests.waiting import LIMIT
 
 
 def normals(seed=1, purpose=PROCESS, step=0, components=1, members=BLOCK):
@@ -171,7 +172,12 @@ def test_normals_do_not_depend_on_the_width_of_vectors():
     plain = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     program = "from tests.filters.test_random import digest_of_normals as d; print(d())"
     run = subprocess.run(
-        [sys.executable, "-c", program], env=plain, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program],
+        env=plain,
+        capture_output=True,
+        timeout=LIMIT,
+        text=True,
+        check=True,
     )
     assert run.stdout.strip() == digest_of_normals()
 

@@ -1,11 +1,11 @@
 """The harness itself: ranks are real, and a job always ends."""
 
 import signal
-import time
 
 import pytest
 
 from tests.mpi.launch import Job, mpiexec, on_ranks
+from tests.waiting import wait_until
 
 
 def meet(comm, number):
@@ -47,8 +47,7 @@ def test_a_job_that_hangs_is_ended_and_none_of_it_is_left():
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_mpiexec_ends_all_ranks(number):
     job = Job(2, "-c", WAIT)
-    while len(job.ranks()) < 2:
-        time.sleep(0.05)
+    wait_until(lambda: len(job.ranks()) >= 2)
     job.process.send_signal(number)
     done = job.wait(timeout=10)
     assert done.status != 0

@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from tests.mpi.launch import ROOT, on_ranks
+from tests.waiting import LIMIT
 
 SIZE = """
 import sys
@@ -26,6 +27,7 @@ def alone(*arguments, **environment):
         cwd=ROOT,
         env=os.environ | {"OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"} | environment,
         capture_output=True,
+        timeout=LIMIT,
         text=True,
         check=False,
     )

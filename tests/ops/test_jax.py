@@ -13,6 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from tests.systems import FORCE, FORCED, FORCED_DATA, FREE, PAIR, PAIR_DATA, STEPS, pair_terms
+from tests.waiting import LIMIT
 
 jax = pytest.importorskip("jax")
 # Not before the line above. PyMC sets the number of JAX's devices here, before JAX counts them.
@@ -331,6 +332,11 @@ assert "jax" in sys.modules
 assert abs(value - in_jax) < 1e-12
 """
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        timeout=LIMIT,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr

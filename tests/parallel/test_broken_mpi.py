@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import LIMIT
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import os, sys
@@ -42,6 +44,7 @@ def test_only_comm_needs_mpi(tmp_path, broken):
         [sys.executable, "-W", "error", "-c", SCRIPT],
         env=environment | NO_LIBRARY | {"PYTHONPATH": os.pathsep.join(path)},
         capture_output=True,
+        timeout=LIMIT,
         encoding="utf-8",
         check=False,
     )

@@ -18,6 +18,7 @@ from pymc_statespace_filters.errors import (
 from pymc_statespace_filters.sampling.checkpoint import journal
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.checkpoint.journal import ChainJournal
+from tests.waiting import LIMIT
 
 # Windows has no words of its own for these.
 IS_FOLDER = "Permission denied" if os.name == "nt" else "Is a directory"
@@ -535,6 +536,6 @@ print(n_calls)
 @pytest.mark.parametrize("fan_in", [16, 2], ids=["growing", "merged"])
 def test_a_run_killed_at_any_call_ends_as_if_it_had_not_been(tmp_path, fan_in):
     with in_another_process(KILLED_RUNS, str(tmp_path), str(fan_in)) as process:
-        output, errors = process.communicate()
+        output, errors = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, errors
     assert int(output) > 60  # so many places to die

@@ -4,7 +4,6 @@ import itertools
 import os
 import subprocess
 import sys
-import time
 import warnings
 
 import numpy as np
@@ -16,6 +15,7 @@ from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
 from pymc_statespace_filters.sampling.run import chain_task
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
+from tests.waiting import wait_until
 
 KINDS = {
     "deterministic": (psf.EKF(), {}),
@@ -192,8 +192,7 @@ def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
     finished, looks = ChainPool.finished, itertools.count()
 
     def interrupted(pool, *others):
-        while min(task.n_done for task in pool.running.values()) < 1:
-            time.sleep(0.001)
+        wait_until(lambda: min(task.n_done for task in pool.running.values()) >= 1)
         next(looks)
         raise KeyboardInterrupt
 

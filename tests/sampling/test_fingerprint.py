@@ -21,6 +21,7 @@ from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
 )
 from pymc_statespace_filters.system.graph_digest import describe
 from tests.systems import PAIR_DATA, STEPS, pair
+from tests.waiting import LIMIT
 
 X, Y = np.array([0.5, 1.0, -0.3]), np.array([1.0, 2.5, -0.5])
 
@@ -198,6 +199,7 @@ def test_fingerprints_agree_for_two_builds_and_in_another_process():
         cwd=Path(__file__).parents[2],
         env=os.environ | {"PYTHONHASHSEED": hash_seed},
         capture_output=True,
+        timeout=LIMIT,
         text=True,
         check=False,
     )

@@ -17,6 +17,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint import lease
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease, check_held
 from tests.sampling.lease_clock import lease_file, lease_of_elsewhere
+from tests.waiting import wait_until
 
 with tempfile.TemporaryDirectory() as folder, SoftFileLease(Path(folder, "lease")) as held:
     HOST = held.owner.hostname
@@ -241,8 +242,8 @@ def test_of_two_newcomers_the_first_gets_the_folder(tmp_path, monkeypatch):
     for name, thread in zip(("first", "second"), threads, strict=True):
         monkeypatch.setattr(lease, "_process_table", lambda name=name: name)
         thread.start()
-        while thread.is_alive() and not step.n_waiting:
-            time.sleep(0.001)  # until it has looked at the others
+        # Until it has looked at the others.
+        wait_until(lambda thread=thread: step.n_waiting or not thread.is_alive())
         for path in tmp_path.glob(f"lease.{name}-*"):
             path.write_text(re.sub("host=.*", f"host=node-{name}", path.read_text()))
             living.append(path)
@@ -257,7 +258,10 @@ def test_a_heartbeat_touches_the_lease_while_python_waits(tmp_path, monkeypatch)
     monkeypatch.setattr(lease, "_HEARTBEAT_SECONDS", 0.02)
     held = FolderLease(tmp_path)
     touched = set()
-    while len(touched) < 4:
+
+    def touched_again():
         touched.add(held.path.stat().st_mtime_ns)
-        time.sleep(0.01)
+        return len(touched) >= 4
+
+    wait_until(touched_again)
     held.release()

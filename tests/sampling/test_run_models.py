@@ -2,7 +2,6 @@
 
 import gc
 import re
-import time
 import tracemalloc
 import weakref
 
@@ -21,6 +20,7 @@ from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from pymc_statespace_filters.sampling.target import target
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
+from tests.waiting import wait_until
 
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
 
@@ -91,8 +91,7 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
     settings |= {"checkpoint": tmp_path, "cores": 2}
 
     def interrupted(pool, *others):
-        while min(task.n_done for task in pool.running.values()) < 10:
-            time.sleep(0.001)
+        wait_until(lambda: min(task.n_done for task in pool.running.values()) >= 10)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

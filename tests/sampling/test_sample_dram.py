@@ -26,6 +26,7 @@ from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
 from tests.systems import autoregression
+from tests.waiting import wait_until
 
 LOGGER = "pymc.stats.convergence"
 
@@ -389,8 +390,7 @@ def test_chains_left_out_are_named(lengths, skipped, said):
 
 def test_an_interrupt_names_the_chains_that_had_not_begun(monkeypatch, caplog):
     def interrupted(pool, *others):
-        while min(task.n_done for task in pool.running.values()) < 3:
-            time.sleep(0.001)
+        wait_until(lambda: min(task.n_done for task in pool.running.values()) >= 3)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ChainPool, "finished", interrupted)

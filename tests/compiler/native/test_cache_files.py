@@ -15,6 +15,7 @@ from pytensor import config
 from pymc_statespace_filters.compiler.codegen.machine_code import kept
 from pymc_statespace_filters.compiler.native import entry_point
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from tests.waiting import LIMIT
 
 
 def _nothing(n):
@@ -74,7 +75,9 @@ else:
 def _run_sum(folder, *arguments):
     flags = {"PYTENSOR_FLAGS": f"base_compiledir={folder.as_posix()},blas__ldflags=,cxx="}
     command = [sys.executable, "-c", SUM, *arguments]
-    return subprocess.run(command, env=os.environ | flags, capture_output=True, text=True)
+    return subprocess.run(
+        command, env=os.environ | flags, capture_output=True, text=True, timeout=LIMIT
+    )
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
@@ -112,6 +115,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
         [sys.executable, "-c", "import pymc_statespace_filters as psf; psf.EKF()"],
         env=os.environ | {"PYTENSOR_FLAGS": flags},
         capture_output=True,
+        timeout=LIMIT,
         text=True,
     )
     assert run.returncode == 1
