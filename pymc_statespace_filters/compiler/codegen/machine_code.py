@@ -12,6 +12,7 @@ from uuid import uuid4
 
 import llvmlite.binding as llvm
 from llvmlite import ir
+from llvmlite.binding.newpassmanagers import NewPassManager
 from numba import types
 from numba.core import cgutils
 from numba.core.codegen import JITCodeLibrary
@@ -226,6 +227,9 @@ def optimise(module: Any) -> None:
     """Optimise as numba does."""
     passes, builder = _codegen()._module_pass_manager()
     passes.run(module, builder)
+    # In llvmlite 0.50 nothing else frees its half a megabyte.
+    NewPassManager._dispose(passes)
+    passes.detach()
 
 
 def _codegen() -> Any:
