@@ -189,7 +189,10 @@ def kept(key: str | None, make: Callable[[], bytes]) -> bytes:
     found = make()
     part = path.with_suffix(f".{uuid4().hex}")
     part.write_bytes(hashlib.sha256(found).digest() + found)
-    part.replace(path)  # at once: other processes read it
+    try:
+        part.replace(path)  # at once: other processes read it
+    except PermissionError:  # on Windows, while one does
+        part.unlink()
     return found
 
 
