@@ -71,13 +71,11 @@ def _call(address, c, inputs, k, t, z, X, out):
 
 
 @jit
-def _normals(rng, functions, size):
-    """Standard normals for one member; zeros without noise."""
-    z = np.zeros(size)
+def _draw(rng, functions, z):
+    """Set z to standard normals for one member; it stays as it is without noise."""
     if functions.initialise != 0:
-        for i in range(size):
+        for i in range(z.size):
             z[i] = rng.standard_normal()
-    return z
 
 
 @jit
@@ -89,7 +87,9 @@ def _constants(functions, theta):
 
 @jit
 def _observe_by_address(rng, functions, c, inputs, k, t, x, out):
-    _call(functions.observe, c, inputs, k, t, _normals(rng, functions, functions.r), x, out)
+    z = np.zeros(functions.r)
+    _draw(rng, functions, z)
+    _call(functions.observe, c, inputs, k, t, z, x, out)
 
 
 def _simulation(observe: Any) -> Callable:
@@ -98,10 +98,11 @@ def _simulation(observe: Any) -> Callable:
         n_steps = steps[-1] if steps.size else 0
         states = np.empty((n_steps + 1, functions.n))
         observations = np.empty((steps.size, functions.p))
-        x = np.empty((functions.n, 1))
+        x, z = np.empty((functions.n, 1)), np.zeros(functions.m)
         if functions.initialise != 0:
-            z = _normals(rng, functions, functions.n_start)
-            _call(functions.initialise, c, inputs, 0, t0, z, x, x)
+            start = np.zeros(functions.n_start)
+            _draw(rng, functions, start)
+            _call(functions.initialise, c, inputs, 0, t0, start, x, x)
         else:  # by the mean itself: the covariance may be infinite
             copy_into(x[:, 0], c[functions.n_theta : functions.n_theta + functions.n])
         j = 0
@@ -112,7 +113,7 @@ def _simulation(observe: Any) -> Callable:
                 observe(rng, functions, c, inputs, k, t, x, observations[j])
                 j += 1
             if k < n_steps:
-                z = _normals(rng, functions, functions.m)
+                _draw(rng, functions, z)
                 _call(functions.propagate, c, inputs, k, t, z, x, x)
         return states, observations
 
@@ -123,10 +124,10 @@ def _continuation(observe: Any) -> Callable:
     def run(rng, functions, dt, theta, x, first, steps, inputs, t0):
         c, n, p = _constants(functions, theta), functions.n, functions.p
         states, observations = np.empty((steps.size, n)), np.empty((steps.size, p))
-        now, k = x.copy().reshape(n, 1), first
+        now, z, k = x.copy().reshape(n, 1), np.zeros(functions.m), first
         for j in range(steps.size):
             while k < steps[j]:
-                z = _normals(rng, functions, functions.m)
+                _draw(rng, functions, z)
                 _call(functions.propagate, c, inputs, k, t0 + k * dt, z, now, now)
                 k += 1
             copy_into(states[j], now[:, 0])

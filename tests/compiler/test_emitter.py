@@ -78,6 +78,29 @@ def test_a_second_process_writes_the_same_text():
     assert len(texts) == 1
 
 
+CALLED_BY_SYMBOL = """
+import numpy as np, pytensor.tensor as pt, pymc_statespace_filters as psf
+system = psf.StateSpaceModel(
+    transition=lambda x, q, a: [a * pt.erf(x[0]) + q[0]], process_noise=[[0.3]],
+    observation=lambda x: [x[0]], observation_noise=[[0.4]],
+    initial_mean=[1.0], initial_cov=[[0.1]],
+)
+record = {"a": 1.0}, np.zeros((3, 1))
+for filter in (psf.EKF(), psf.BootstrapPF(20)):
+    print(psf.log_likelihood(system, filter, *record, steps=[0, 1, 2]).tolist())
+"""
+
+
+def test_machine_code_from_disk_finds_what_it_calls_by_symbol():
+    """In a second process no code is generated, so nothing asks for the function by itself."""
+    results = [
+        subprocess.run([sys.executable, "-c", CALLED_BY_SYMBOL], capture_output=True, text=True)
+        for _ in range(2)
+    ]
+    assert [result.returncode for result in results] == [0, 0], results[1].stderr
+    assert results[0].stdout == results[1].stdout
+
+
 def operations(*values):
     """The instructions that compute these values of x, and nothing else."""
     code, used = vector_code(values)

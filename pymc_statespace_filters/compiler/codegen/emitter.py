@@ -177,7 +177,7 @@ class Emitter:
         if isinstance(op, ps.Invert):
             return self.builder.not_(self._as(args[0], e.kind))
         if type(op) in (ps.IntDiv, ps.Mod) and e.kind != FLOAT:
-            return self._whole_division(_CALLS[type(op)], [self._as(a, INTEGER) for a in args])
+            return self._divided(_CALLS[type(op)], [self._as(a, INTEGER) for a in args])
         if isinstance(op, ps.IsNan | ps.IsInf):
             return self._is_special(op, self._as(args[0], FLOAT))
         return self._converted(self._of_floats(op, args), FLOAT, e.kind)
@@ -246,18 +246,19 @@ class Emitter:
         if self._vector and name in INLINED:
             return self._inlined(name, numbers)
         if name in _DIVISIONS:
-            return self._inlined(f"scalar_{name}", numbers, _division(name))
+            return self._divided(name, numbers)
         symbol = f"llvm.{_LLVM[name]}.f64" if name in _LLVM else _LIBM[name]
         function = self._module.declared(symbol, [n.type for n in numbers], DOUBLE)
         return self.builder.call(function, numbers, fastmath=_FAST)
 
-    def _inlined(self, name: str, numbers: list[ir.Value], function: Any = None) -> ir.Value:
-        function = INLINED[name] if function is None else function
-        declared = self._module.inlined(name, function, [types.float64] * len(numbers))
-        return self.builder.call(declared, numbers)
+    def _inlined(self, name: str, numbers: list[ir.Value]) -> ir.Value:
+        function = self._module.inlined(name, INLINED[name], [types.float64] * len(numbers))
+        return self.builder.call(function, numbers)
 
-    def _whole_division(self, name: str, numbers: list[ir.Value]) -> ir.Value:
-        function = self._module.inlined(f"whole_{name}", _division(name), [types.int64] * 2)
+    def _divided(self, name: str, numbers: list[ir.Value]) -> ir.Value:
+        """A division with remainder, as numba has it."""
+        kind = types.float64 if numbers[0].type == DOUBLE else types.int64
+        function = self._module.inlined(f"{name}.{kind}", _division(name), [kind] * 2)
         return self.builder.call(function, numbers)
 
     def _called(self, entry: EntryPoint, numbers: list[ir.Value]) -> ir.Value:
@@ -338,7 +339,6 @@ _WRITTEN_OUT: dict[type, Callable[..., ir.Value]] = {
 
 @lru_cache
 def _division(name: str) -> Any:
-    """A division of scalars, as numba has it."""
     divide = _DIVISIONS[name]
     return jit(lambda a, b: divide(a, b), large=True)
 

@@ -125,6 +125,8 @@ def _log_choice(names: str, reason: Exception | None = None) -> None:
 def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
     flat = [v for group in values for v in group]
     code, used = vector_code(flat)
+    for entry in code.needs:
+        entry.compile()  # now: machine code of the caller may come from disk
     places = [_place(function.graph, element) for element in used]
     sizes = [None if one else len(v) for v, one in zip(values, function.scalar, strict=True)]
     arguments = function.arguments

@@ -73,16 +73,16 @@ class Module:
         builder.call(self.entry(entry, [value.type for value in values]), values)
 
     def distinct(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """Metadata of accesses to places that do not overlap, for `marked`."""
-        domain = self._ir.add_metadata(["places"])
-        scopes = {name: self._ir.add_metadata([name, domain]) for name in names}
-        lists = self._ir.add_metadata
+        """Metadata of loads and stores at places that do not overlap."""
+        add = self._ir.add_metadata
+        domain = add(["places"])
+        scopes = {name: add([name, domain]) for name in names}
         return {
             name: {
-                "alias.scope": lists([scope]),
-                "noalias": lists([other for other in scopes.values() if other is not scope]),
+                "alias.scope": add([own]),
+                "noalias": add([s for s in scopes.values() if s is not own]),
             }
-            for name, scope in scopes.items()
+            for name, own in scopes.items()
         }
 
     def finished(self) -> "Code":
@@ -117,8 +117,6 @@ class Code(NamedTuple):
 
     def call(self, context: Any, builder: ir.IRBuilder, values: Sequence[ir.Value]) -> None:
         """Call ``main`` in code that numba compiles, and have it inlined there."""
-        for entry in self.needs:
-            entry.compile()
         module = self.linked()
         main = module.get_function("main")
         main.name = f"psf_main_{self.key or uuid4().hex}"
@@ -190,7 +188,10 @@ def kept(key: str | None, make: Callable[[], bytes]) -> bytes:
     found = make()
     part = path.with_suffix(f".{uuid4().hex}")
     part.write_bytes(hashlib.sha256(found).digest() + found)
-    part.replace(path)  # at once: other processes read it
+    try:
+        part.replace(path)  # at once: other processes read it
+    except PermissionError:  # on Windows, while one does
+        part.unlink()
     return found
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
 from pymc_statespace_filters.compiler.native import cache_key, sources
 from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.sources import Sources
@@ -56,6 +56,12 @@ class Copy:
         graph = Graph({"theta": theta}, [2.0 * theta])
         return vector_functions({"f": VectorFunction("c", graph)})["f"].key
 
+    def module(self):
+        """The key of a module, into which an exponential is linked."""
+        self.start()
+        x = pt.tensor("x", shape=(2,), dtype="float64")
+        return member_function("f", "X", Graph({"x": x}, [pt.exp(x)]), "X").key
+
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
@@ -95,8 +101,8 @@ def test_docstrings_comments_and_layout_change_no_key(copy, path, old, new):
 @pytest.mark.parametrize(
     "path",
     [
-        "compiler/codegen/source.py",
-        "compiler/codegen/straight_line.py",
+        "compiler/codegen/emitter.py",
+        "compiler/codegen/machine_code.py",
         "compiler/numerics/exponential.py",
         "compiler/native/jit.py",
     ],
@@ -107,10 +113,19 @@ def test_generated_code_follows_its_generator(copy, path):
     assert copy.generated() != before
 
 
+@pytest.mark.parametrize(
+    "path", ["compiler/codegen/machine_code.py", "compiler/numerics/exponential.py"]
+)
+def test_a_module_follows_how_it_is_compiled_and_what_is_linked_into_it(copy, path):
+    before = copy.module()
+    copy.append(path, "\nNUMBER = 1\n")
+    assert copy.module() != before
+
+
 def test_generated_code_does_not_follow_filters(copy):
-    before = copy.generated()
+    before = copy.generated(), copy.module()
     copy.append("filters/ensemble/weights.py", "\nNUMBER = 1\n")
-    assert copy.generated() == before
+    assert (copy.generated(), copy.module()) == before
 
 
 @pytest.mark.parametrize(
