@@ -59,6 +59,26 @@ class PlanSlots(NamedTuple):
     updates: int = N_HEADER + 28
     lag: int = N_HEADER + 29
     state_size: int = N_HEADER + 30  # of the state of a filter between two rows, as a vector
+    # of Gaussian filters, see `gaussian.machine`
+    n_lanes: int = N_HEADER + 31  # records side by side; 1 is one after the other
+    n_rows: int = N_HEADER + 32
+    n_covariances: int = N_HEADER + 33
+    n_noises: int = N_HEADER + 34
+    initial_cov: int = N_HEADER + 35
+    noise_cov: int = N_HEADER + 36
+    leaves_tape: int = N_HEADER + 37
+    start: int = N_HEADER + 38
+    predict: int = N_HEADER + 39
+    update: int = N_HEADER + 40
+    prepare_back: int = N_HEADER + 41
+    predict_back: int = N_HEADER + 42
+    update_back: int = N_HEADER + 43
+    finish_back: int = N_HEADER + 44
+    smooth: int = N_HEADER + 45
+    along: int = N_HEADER + 46  # in place of predict and update, for one record
+    along_back: int = N_HEADER + 47
+    extend: int = N_HEADER + 48
+    extend_back: int = N_HEADER + 49
 
 
 PLAN = PlanSlots()
@@ -89,13 +109,13 @@ def make_plan(
     run : EntryPoint
         The function that the plan is for.
     functions : sequence of str
-        Names of `SYSTEM_FUNCTIONS`; `prepare` is always there.
+        Names of `SYSTEM_FUNCTIONS`; the others need `prepare`, which is there with any of them.
     settings : sequence of float
         What the function reads by `settings_of`.
     **others : int or EntryPoint
         Values of further slots.
     """
-    used = {name: entry_point(system, name) for name in ("prepare", *functions)}
+    used = {n: entry_point(system, n) for n in (("prepare", *functions) if functions else ())}
     numbers = {name: value for name, value in others.items() if isinstance(value, int)}
     entries = {name: value for name, value in others.items() if isinstance(value, EntryPoint)}
     words = np.zeros(N_WORDS + system.free.size + len(settings), np.int64)

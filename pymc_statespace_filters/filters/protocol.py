@@ -66,15 +66,16 @@ class System(Protocol):
 
     def __hash__(self) -> int: ...
 
-    def at_parameters(self, compiled: CompiledFunction, *, of_many: bool = False) -> Any:
-        """A function made from the graphs of ``model``, as one of the user's parameters.
+    @property
+    def extend(self) -> Any:
+        """Entry point from the user's parameters to the ``n_theta`` that ``model`` reads, or None.
 
-        Linear algebra of parameters alone is done once per evaluation: ``model`` reads its values
-        from ``n_theta`` parameters, the user's and these values.
+        Those behind the user's are linear algebra of parameters alone, done once per evaluation.
         """
 
-    def derivative_at_parameters(self, compiled: CompiledFunction, *, of_many: bool = False) -> Any:
-        """The same for a function that returns the cotangent of its parameters."""
+    @property
+    def extend_back(self) -> Any:
+        """Entry point of its pullback."""
 
     @property
     def prepare(self) -> ParameterFunction:
@@ -288,7 +289,7 @@ class PredictionFilter(Filter, Protocol):
 class BatchFilter(Filter, Protocol):
     """A filter that evaluates many parameter points side by side."""
 
-    def compile_batch(self, system: System) -> CompiledFunction:
+    def compile_batch(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood of theta (B, k): terms (B, J), health (B, 3)."""
 
 
@@ -306,10 +307,10 @@ class DifferentiableFilter(Filter, Protocol):
     def compile_gradient(self, system: System) -> Compiled[GradientFunction]:
         """Compile both passes as one function."""
 
-    def compile_taped(self, system: System) -> CompiledFunction:
+    def compile_taped(self, system: System) -> Compiled:
         """Compile the forward pass: terms, health and the tape."""
 
-    def compile_pullback(self, system: System) -> CompiledFunction:
+    def compile_pullback(self, system: System) -> Compiled:
         """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar."""
 
 
@@ -322,16 +323,16 @@ class PanelFilter(DifferentiableFilter, Protocol):
     inf, the code of the first failing record, and the index of its failing row.
     """
 
-    def compile_panel(self, system: System) -> CompiledFunction:
+    def compile_panel(self, system: System) -> PlannedFunction:
         """Compile terms and health: (theta, rows, observed, inputs, t0, seed)."""
 
-    def compile_panel_gradient(self, system: System) -> CompiledFunction:
+    def compile_panel_gradient(self, system: System) -> PlannedFunction:
         """Compile both passes as one function: (theta .. seed, terms_bar) -> theta_bar (G, k)."""
 
-    def compile_panel_taped(self, system: System) -> CompiledFunction:
+    def compile_panel_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass: terms, health and a tape of two dimensions."""
 
-    def compile_panel_pullback(self, system: System) -> CompiledFunction:
+    def compile_panel_pullback(self, system: System) -> PlannedFunction:
         """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar (G, k)."""
 
 

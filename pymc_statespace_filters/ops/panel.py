@@ -52,7 +52,7 @@ class PanelLogLikelihood(LogLikelihood):
     def compile(self, system: CompiledSystem) -> Compiled:
         """All records side by side if the filter has that, else one after the other."""
         if isinstance(self.filter, PanelFilter):
-            return _without_stored_noise(self.filter.compile_panel(system))
+            return self.filter.compile_panel(system)
         compiled = self.filter.compile(system)
         return compiled if isinstance(compiled, PlannedFunction) else _one_by_one(compiled)
 
@@ -162,15 +162,3 @@ def _gradients_one_by_one(gradient: CompiledFunction) -> CompiledFunction:
 
     key = key_of(__name__, "gradient of a panel", gradient.key)
     return CompiledFunction(jit(panel, gradient.large), key, gradient.large)
-
-
-def _without_stored_noise(value: CompiledFunction) -> CompiledFunction:
-    """A deterministic filter's function, with the noise of a call that it does not read."""
-    run = value.function
-
-    def panel(theta, rows, observed, inputs, t0, noise):
-        return run(theta, rows, observed, inputs, t0, noise[0])
-
-    return CompiledFunction(
-        jit(panel, value.large), key_of(__name__, "no noise", value.key), value.large
-    )

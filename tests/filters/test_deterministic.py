@@ -297,10 +297,11 @@ COUNTS = np.array([[4.0, 2.0], [1.0, 3.0], [np.nan, np.nan], [0.0, 1.0]])
 def test_counts_have_their_own_density_and_its_gradient():
     value = compiled("compile", COUNTED)
     record = (10 * np.arange(4), COUNTS, np.zeros((31, 0)), 0.0, 0)
+    noise = (0, np.empty(0))
     theta = np.array([2.0, 3.0])  # k, x0
 
     def total(k, x0):
-        return value(np.array([k, x0]), *record)[0]
+        return value(np.array([k, x0]), *record[:-1], noise)[0]
 
     mean = 3.0 * np.exp(-0.2 * np.arange(4))
     truth = stats.poisson.logpmf(COUNTS[:, 0], mean)

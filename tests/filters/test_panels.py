@@ -12,8 +12,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
 from pymc_statespace_filters.compiler.codegen.simd import LANES
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.gaussian import panel as panel_functions
-from pymc_statespace_filters.filters.gaussian.lanes.group import STRETCH
+from pymc_statespace_filters.filters.gaussian import functions as gaussian_functions
+from pymc_statespace_filters.filters.gaussian.machine import STRETCH
 from pymc_statespace_filters.filters.outcomes import (
     COVARIANCE_NOT_POSITIVE,
     NO_FINITE_MEMBER,
@@ -233,11 +233,10 @@ def test_the_tape_grows_with_the_rows_and_not_with_the_steps_between_them():
 
 
 def test_systems_too_large_for_lanes_have_the_bits_of_single_records(monkeypatch):
-    def too_large(recursion):
+    def too_large(*arguments):
         raise NotUnrollableError
 
-    for name in ("forward_pass", "backward_pass"):
-        monkeypatch.setattr(panel_functions, name, too_large)
+    monkeypatch.setattr(gaussian_functions, "lane_functions", too_large)
     system = psf.StateSpaceModel(
         transition=lambda x, q, u, a: [a * x[0] * (1.0 - x[0] ** 2) + u[0] + q[0]],
         process_noise=[[0.1]],

@@ -42,7 +42,7 @@ _AT_ADDRESS = {
 def array_vector_function(name: str, function: VectorFunction) -> CompiledFunction:
     """A vector function that passes arrays; NaN where the array code raises."""
     graph = function.graph
-    used = _used(graph.inputs, graph.outputs)
+    used = used_inputs(graph.inputs, graph.outputs)
     compiled = array_code(list(used.values()), graph.outputs)
     results = [
         f"out[{i}].item()" if scalar else f"out[{i}].copy()"
@@ -67,7 +67,7 @@ def array_member_function(name: str, graph: Graph, target: str) -> EntryPoint:
     members = {n: v for n, v in graph.inputs.items() if n in MEMBER_INPUTS}
     others = {n: v for n, v in graph.inputs.items() if n not in MEMBER_INPUTS}
     common = _frontier(list(graph.inputs.values()), list(members.values()), graph.outputs)
-    others, members = _used(others, common), _used(members, graph.outputs)
+    others, members = used_inputs(others, common), used_inputs(members, graph.outputs)
     before = array_code(list(others.values()), common)
     inside = array_code([*members.values(), *common], graph.outputs)
     calls = [_at_address(members)] * bool(members) + [f"common[{i}]" for i in range(len(common))]
@@ -118,7 +118,8 @@ def _whole(inputs: Mapping[str, Variable]) -> str:
     return ", ".join(_WHOLE.get(name, name) for name in inputs)
 
 
-def _used(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[str, Variable]:
+def used_inputs(inputs: Mapping[str, Variable], outputs: Sequence[Variable]) -> dict[str, Variable]:
+    """The inputs that outputs depend on."""
     found = {i for node in io_toposort(list(inputs.values()), outputs) for i in node.inputs}
     found |= set(outputs)
     return {name: variable for name, variable in inputs.items() if variable in found}

@@ -94,9 +94,9 @@ def member_function(
     try:
         (values,) = unrolled(graph)
     except NotUnrollableError as reason:
-        _log_choice(name, reason)
+        log_choice(name, reason)
         return MemberFunction(array_member_function(name, graph, target), arguments)
-    _log_choice(name)
+    log_choice(name)
     entry = member_entry_point(name, graph, values, target, vector=vector)
     return MemberFunction(entry, arguments)
 
@@ -109,13 +109,14 @@ def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, Compi
     try:
         written = {name: unrolled(f.graph) for name, f in functions.items()}
     except NotUnrollableError as reason:
-        _log_choice(", ".join(functions), reason)
+        log_choice(", ".join(functions), reason)
         return {name: array_vector_function(name, f) for name, f in functions.items()}
-    _log_choice(", ".join(functions))
+    log_choice(", ".join(functions))
     return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
 
 
-def _log_choice(names: str, reason: Exception | None = None) -> None:
+def log_choice(names: str, reason: Exception | None = None) -> None:
+    """Log in which form functions are compiled, and why not in scalars."""
     if reason is None:
         _LOG.debug("%s: written out in scalars", names)
     else:

@@ -7,7 +7,6 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
     Graph,
     MemberFunction,
     ParameterFunction,
@@ -15,8 +14,6 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
 from pymc_statespace_filters.compiler.codegen.functions import member_function
 from pymc_statespace_filters.compiler.lowering import quantiles, structure
 from pymc_statespace_filters.compiler.lowering.constants import (
-    after_extension,
-    between_extensions,
     extend,
     lowered,
     pull_back,
@@ -35,6 +32,7 @@ from pymc_statespace_filters.compiler.lowering.guidance import (
 )
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
 from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 quantiles.register()
@@ -78,7 +76,7 @@ class CompiledSystem:
     ----------
     model : StateSpaceModel
         What the user wrote, for filters that work on its graphs. Linear algebra of parameters alone
-        is left out of them: its values are read from more parameters, see `at_parameters`.
+        is left out of them: its values are read from more parameters, see `extend`.
     n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
         Numbers of states, of normals that a member takes at the start and in one step (see
         `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
@@ -119,28 +117,14 @@ class CompiledSystem:
     # Constants of an evaluation
 
     @cached_property
-    def _extend(self) -> ParameterFunction | None:
-        return None if self._extension is None else extend(self._extension)
+    def extend(self) -> EntryPoint | None:
+        """Theta -> (theta, constants), which the functions of ``model`` take; None if the same."""
+        return None if self._extension is None else extend(self._extension).entry
 
-    def at_parameters(
-        self, compiled: CompiledFunction, *, of_many: bool = False
-    ) -> CompiledFunction:
-        """A function of parameters and constants as one of parameters, its first argument.
-
-        That argument has a row for each point if ``of_many``.
-        """
-        if self._extend is None:
-            return compiled
-        return after_extension(self._extend, compiled, of_many=of_many)
-
-    def derivative_at_parameters(
-        self, compiled: CompiledFunction, *, of_many: bool = False
-    ) -> CompiledFunction:
-        """The same for a function that returns the cotangent of its first argument."""
-        if self._extend is None or self._extension is None:
-            return compiled
-        pullback = pull_back(self._extension)
-        return between_extensions(self._extend, pullback, compiled, of_many=of_many)
+    @cached_property
+    def extend_back(self) -> EntryPoint | None:
+        """Theta and the cotangent of (theta, constants), one vector, -> the cotangent of theta."""
+        return None if self._extension is None else pull_back(self._extension).entry
 
     # Functions
 

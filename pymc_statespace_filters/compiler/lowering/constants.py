@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pytensor
@@ -24,12 +23,9 @@ from pytensor.tensor.math import Dot
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
     ParameterFunction,
-    jit,
 )
 from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, staged
-from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 # Functions that are called at every step; the others, once per evaluation.
@@ -140,72 +136,6 @@ def pull_back(extension: FrozenFunctionGraph) -> ParameterFunction:
     (bar,) = pytensor.grad(None, [theta], known_grads={extended: cotangent})
     theta_bar = pt.specify_shape(bar, theta.type.shape)
     return staged("pull_back", [theta, cotangent], theta_bar)
-
-
-def after_extension(
-    extension: ParameterFunction, compiled: CompiledFunction, *, of_many: bool
-) -> CompiledFunction:
-    """A function whose first argument is (theta, constants), as a function of theta."""
-    extended, function = extension.function, compiled.function
-
-    def at_one(theta, *others):
-        return function(extended(theta), *others)
-
-    def at_many(theta, *others):
-        points = np.empty((theta.shape[0], extended(theta[0].copy()).size))
-        for i in range(theta.shape[0]):
-            points[i] = extended(theta[i].copy())
-        return function(points, *others)
-
-    key = key_of(__name__, f"after extension {of_many}", extension.key, compiled.key)
-    made = jit(at_many if of_many else at_one, compiled.large)
-    return CompiledFunction(made, key, compiled.large)
-
-
-def between_extensions(
-    extension: ParameterFunction,
-    pullback: ParameterFunction,
-    compiled: CompiledFunction,
-    *,
-    of_many: bool,
-) -> CompiledFunction:
-    """A function that returns the cotangent of its first argument, as a function of theta."""
-    extended, function = extension.function, compiled.function
-    pulled_back = _zero_of_zeros(pullback)
-
-    def at_one(theta, *others):
-        return pulled_back(theta, function(extended(theta), *others))
-
-    def at_many(theta, *others):
-        points = np.empty((theta.shape[0], extended(theta[0].copy()).size))
-        for i in range(theta.shape[0]):
-            points[i] = extended(theta[i].copy())
-        bars, theta_bars = function(points, *others), np.empty(theta.shape)
-        for i in range(theta.shape[0]):
-            theta_bars[i] = pulled_back(theta[i], bars[i])
-        return theta_bars
-
-    key = key_of(
-        __name__, f"between extensions {of_many}", extension.key, pullback.key, compiled.key
-    )
-    made = jit(at_many if of_many else at_one, compiled.large)
-    return CompiledFunction(made, key, compiled.large)
-
-
-def _zero_of_zeros(pullback: ParameterFunction) -> Any:
-    """`pull_back`, but zeros where there is nothing to pull back, as after a failure.
-
-    The constant of a failure may be NaN, which times zero is NaN.
-    """
-    pulled_back = pullback.function
-
-    @jit
-    def function(theta, bar):
-        if not bar.any():
-            return np.zeros(theta.size)
-        return pulled_back(np.concatenate((theta, bar)))
-
-    return function
 
 
 def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVariable]:

@@ -9,13 +9,11 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
 from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
     ParameterFunction,
     jit,
 )
 from pymc_statespace_filters.compiler.lowering.staged import staged
 from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
 from pymc_statespace_filters.system.model import StateSpaceModel
 
@@ -48,31 +46,6 @@ def followed_by_square_roots(
     flat = pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])
     sizes = [cov.type.shape[0] for cov in covs]
     return staged("prepare", [given], flat, SQUARE_ROOT, sizes)
-
-
-def covariance_check(system: StateSpaceModel) -> CompiledFunction:
-    """``check(theta)``: whether every covariance is symmetric and non-negative at theta.
-
-    A filter of moments would go on with a negative variance and give it a likelihood.
-    """
-    graphs = {
-        name: graph
-        for name, graph in covariances(system).items()
-        if any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
-    }
-    if not graphs:
-        return CompiledFunction(jit(lambda theta: True), key_of(__name__, "nothing to check"))
-    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    prepare = followed_by_square_roots([], system, theta, theta, graphs)
-    roots = prepare.function
-
-    def check(theta):
-        for value in roots(theta):
-            if np.isnan(value):
-                return False
-        return True
-
-    return CompiledFunction(jit(check), key_of(__name__, "check", prepare.key))
 
 
 @jit

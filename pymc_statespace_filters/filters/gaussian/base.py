@@ -4,17 +4,19 @@ from functools import lru_cache
 from typing import ClassVar
 
 import pytensor.tensor as pt
+from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    Graph,
-    VectorFunction,
-)
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.plan import Plan
+from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters import functions
 from pymc_statespace_filters.filters.gaussian import deterministic
-from pymc_statespace_filters.filters.gaussian.adjoint import compile_gradient, compile_pullback
-from pymc_statespace_filters.filters.gaussian.batch import compile_batch
+from pymc_statespace_filters.filters.gaussian.backward import BACKWARD
+from pymc_statespace_filters.filters.gaussian.forward import FORWARD
+from pymc_statespace_filters.filters.gaussian.functions import filter_plan
 from pymc_statespace_filters.filters.gaussian.linearization import (
     Linearization,
     predict,
@@ -22,30 +24,9 @@ from pymc_statespace_filters.filters.gaussian.linearization import (
     state_size,
     update,
 )
-from pymc_statespace_filters.filters.gaussian.panel import (
-    compile_panel,
-    compile_panel_gradient,
-    compile_panel_pullback,
-    compile_panel_taped,
-)
-from pymc_statespace_filters.filters.gaussian.recursion import (
-    GaussianFilterFunctions,
-    compile_taped,
-    compile_value,
-)
-from pymc_statespace_filters.filters.gaussian.states import (
-    ForwardPass,
-    compile_run,
-    compile_states,
-    forward_pass,
-)
-from pymc_statespace_filters.filters.protocol import (
-    GradientFunction,
-    LogLikelihoodFunction,
-    RunFunction,
-    StatesFunction,
-    System,
-)
+from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
+from pymc_statespace_filters.filters.gaussian.states import RUN, states_plan
+from pymc_statespace_filters.filters.protocol import System
 from pymc_statespace_filters.system.model import StateSpaceModel
 
 
@@ -66,57 +47,62 @@ class GaussianFilterBase:
             system.is_deterministic and system.has_exact_observation_density
         )
 
-    def compile(self, system: System) -> CompiledFunction[LogLikelihoodFunction]:
+    def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return system.at_parameters(compile_value(self._functions(system)))
+        return functions.likelihood(self._plan(system, FORWARD))
 
-    def compile_batch(self, system: System) -> CompiledFunction:
+    def compile_batch(self, system: System) -> PlannedFunction:
         """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
-        return system.at_parameters(compile_batch(self._functions(system)), of_many=True)
+        return functions.of_points(self._plan(system, FORWARD, of_many=True))
 
-    def compile_taped(self, system: System) -> CompiledFunction:
+    def compile_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass, with a third result: the tape."""
-        return system.at_parameters(compile_taped(self._functions(system)))
+        return functions.taped(self._plan(system, FORWARD, leaves_tape=True))
 
-    def compile_pullback(self, system: System) -> CompiledFunction:
+    def compile_pullback(self, system: System) -> PlannedFunction:
         """Compile the backward pass along the tape."""
-        return system.derivative_at_parameters(compile_pullback(self._functions(system)))
+        return functions.pullback(self._plan(system, BACKWARD))
 
-    def compile_gradient(self, system: System) -> CompiledFunction[GradientFunction]:
+    def compile_gradient(self, system: System) -> PlannedFunction:
         """Compile both passes as one function."""
-        return system.derivative_at_parameters(compile_gradient(self._functions(system)))
+        return functions.gradient(self._plan(system, BACKWARD, leaves_tape=True))
 
-    def compile_panel(self, system: System) -> CompiledFunction:
+    def compile_panel(self, system: System) -> PlannedFunction:
         """Compile the likelihood of a panel: theta (G, k), rows (J, 3) -> terms (J,), health."""
-        return system.at_parameters(compile_panel(self._functions(system)), of_many=True)
+        return functions.of_panel(self._plan(system, FORWARD, of_many=True))
 
-    def compile_panel_taped(self, system: System) -> CompiledFunction:
+    def compile_panel_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass of a panel, with a third result: the tape."""
-        return system.at_parameters(compile_panel_taped(self._functions(system)), of_many=True)
+        plan = self._plan(system, FORWARD, of_many=True, leaves_tape=True)
+        return functions.taped(plan, of_panel=True)
 
-    def compile_panel_pullback(self, system: System) -> CompiledFunction:
+    def compile_panel_pullback(self, system: System) -> PlannedFunction:
         """Compile the backward pass of a panel along the tape."""
-        reverse = compile_panel_pullback(self._functions(system))
-        return system.derivative_at_parameters(reverse, of_many=True)
+        return functions.pullback(self._plan(system, BACKWARD, of_many=True), of_panel=True)
 
-    def compile_panel_gradient(self, system: System) -> CompiledFunction:
+    def compile_panel_gradient(self, system: System) -> PlannedFunction:
         """Compile both passes of a panel as one function."""
-        gradient = compile_panel_gradient(self._functions(system))
-        return system.derivative_at_parameters(gradient, of_many=True)
+        plan = self._plan(system, BACKWARD, of_many=True, leaves_tape=True)
+        return functions.gradient(plan, of_panel=True)
 
-    def compile_states(self, system: System, moment: str) -> CompiledFunction[StatesFunction]:
+    def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
-            states = deterministic.compile_states(self._functions(system))
-        else:
-            forward = _forward_pass(self.linearization, system.model.gaussian)
-            states = compile_states(forward, moment)
-        return system.at_parameters(states)
+            return functions.states(self._plan(system, RUN))
+        recursion = self._functions(system)
+        return functions.states(states_plan(system, recursion, self.linearization, moment))
 
-    def compile_run(self, system: System) -> CompiledFunction[RunFunction]:
+    def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        compile = deterministic.compile_run if system.is_deterministic else compile_run
-        return system.at_parameters(compile(self._functions(system)))
+        return functions.run(self._plan(system, RUN))
+
+    def _plan(
+        self, system: System, run: EntryPoint, *, of_many: bool = False, leaves_tape: bool = False
+    ) -> Plan:
+        return filter_plan(
+            system, self._functions(system), run, of_many=of_many, leaves_tape=leaves_tape,
+            goes_back=run is BACKWARD,
+        )  # fmt: skip
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
@@ -153,27 +139,15 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
     s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
     values = symbols_of(system) | {"s": s}
 
-    def function(arguments: str, inputs: str, outputs: list, *scalar: bool):
-        graph = Graph({i: values[i] for i in inputs.split()}, outputs)
-        return VectorFunction(arguments, graph, scalar)
+    def function(inputs: str, *outputs: TensorVariable) -> Graph:
+        return Graph({name: values[name] for name in inputs.split()}, outputs)
 
     analysis, term = update(linearization, system, values)
     forecast = predict(linearization, system, values)
     return GaussianFilterFunctions(
         system,
         linearization.has_short_rows,
-        function("c", "theta", [start(system, values)], False),
-        function("c, inputs, k, t, s", "theta u t s", [forecast], False),
-        function(
-            "c, inputs, k, t, d, s",
-            "theta u t d s",
-            [analysis, pt.atleast_1d(term)],
-            False,
-            True,
-        ),
+        function("theta", start(system, values)),
+        function("theta u t s", forecast),
+        function("theta u t d s", analysis, pt.atleast_1d(term)),
     )
-
-
-@lru_cache(maxsize=256)
-def _forward_pass(linearization: Linearization, system: StateSpaceModel) -> ForwardPass:
-    return forward_pass(_functions(linearization, system), linearization)

@@ -29,15 +29,17 @@ For linear systems the result is exact; otherwise it is the extended smoother or
 points, and the path is a draw from the linearised system.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import pytensor.tensor as pt
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
+from pymc_statespace_filters.compiler.codegen.simd import LaneFunction
+from pymc_statespace_filters.filters.gaussian.functions import covariances_at
 from pymc_statespace_filters.filters.gaussian.linearization import (
     Linearization,
     Symbols,
@@ -52,14 +54,15 @@ class BrysonFrazier:
     """The functions of the smoother of a Gaussian filter.
 
     The vector ``s`` is the filter's, followed by the simulated error (n,); the adjoint ``s_bar`` is
-    l, the lower triangle of L, and l*. A column of ``Z`` holds the noise of one step: q if
-    ``draws_q``, standard normals for each state otherwise, then standard normals for v.
+    l, the lower triangle of L, and l*. ``z`` is the noise of one step: q if ``draws_q``, standard
+    normals for each state otherwise, then standard normals for v. ``covariances`` are those to
+    check, and those of the initial state and of q, if it is drawn.
     """
 
     def __init__(self, recursion: GaussianFilterFunctions, linearization: Linearization) -> None:
         self.recursion = recursion
         system, size = recursion.system, recursion.size
-        graphs = (recursion.start.graph, recursion.predict.graph, recursion.update.graph)
+        graphs = (recursion.start, recursion.predict, recursion.update)
         self._symbols: Symbols = {name: v for g in graphs for name, v in g.inputs.items()}
         self.size = size + system.n
         vector = {"dtype": "float64", "shape": (self.size,)}
@@ -75,73 +78,48 @@ class BrysonFrazier:
         self._update_jac = pt.eye(system.n) - self._innovation.gain @ self._observation_jac
         self.draws_q = self._step.noise_jac is not None
         self.n_noises = system.m if self.draws_q else system.n
+        drawn = ("initial_cov", "process_noise") if self.draws_q else ("initial_cov",)
+        self.covariances = covariances_at(system, self._symbols["theta"], drawn)
         self._z = pt.tensor("z", dtype="float64", shape=(self.n_noises + system.p,))
 
-    def forwards(self) -> dict[str, VectorFunction]:
-        """The filter together with a simulated error of it.
+    def functions(self) -> dict[str, LaneFunction]:
+        """The filter with a simulated error of it, the adjoint recursion, and smoothed moments.
 
-        * ``start(c, X, member) -> s``; the columns of ``X`` are errors of the initial state.
-        * ``predict(c, inputs, k, t, s, Z, member) -> s``.
-        * ``update(c, inputs, k, t, d, s, Z, member) -> (s, term)``.
+        * ``start``: theta, x -> s; x is an error of the initial state.
+        * ``predict``: theta, u, t, s, z -> s.
+        * ``update``: theta, u, t, d, s, z -> s, term.
+        * ``predict_back``: theta, u, t, s, s_bar -> s_bar, with s before the step.
+        * ``update_back``: theta, u, t, d, s, z, s_bar -> s_bar, with s before the observation.
+        * ``smooth``: theta, s, s_bar -> mean, variances and drawn state, one vector.
         """
         recursion, n = self.recursion, self.recursion.system.n
         start_error = pt.tensor("x", dtype="float64", shape=(n,))
-        (start,) = recursion.start.graph.outputs
-        (forecast,) = recursion.predict.graph.outputs
-        analysis, term = recursion.update.graph.outputs
+        (start,) = recursion.start.outputs
+        (forecast,) = recursion.predict.outputs
+        analysis, term = recursion.update.outputs
         given = {"theta": self._symbols["theta"], "x": start_error}
-        started = Graph(given, [pt.concatenate([start, start_error])])
-        predicted = [pt.concatenate([forecast, self._predicted_error()])]
-        updated = [pt.concatenate([analysis, self._updated_error()]), term]
+        started = Graph(given, [pt.concatenate([start, start_error]), self.covariances.values])
+        predicted = pt.concatenate([forecast, self._predicted_error()])
+        updated = pt.concatenate([analysis, self._updated_error()])
+        smoothed = pt.concatenate(self._smoothed())
+        of = self._function
         return {
-            "parameters": recursion.parts()["parameters"],
-            "start": VectorFunction("c, X, member", started),
-            "predict": self._function("c, inputs, k, t, s, Z, member", "theta u t s z", predicted),
-            "update": self._function(
-                "c, inputs, k, t, d, s, Z, member", "theta u t d s z", updated, False, True
-            ),
+            "start": LaneFunction(started, ["s", "cov"]),
+            "predict": of("theta u t s z", {"s": predicted}),
+            "update": of("theta u t d s z", {"s": updated, "term": term}),
+            "predict_back": of("theta u t s s_bar", {"s_bar": self._predict_adjoint()}),
+            "update_back": of("theta u t d s z s_bar", {"s_bar": self._update_adjoint()}),
+            "smooth": of("theta s s_bar", {"moments": smoothed}),
         }
 
-    def backwards(self) -> dict[str, VectorFunction]:
-        """The adjoint recursion and the smoothed moments; states are read from rows of a tape.
-
-        * ``end(c) -> s_bar``.
-        * ``predict_adjoint(c, inputs, k, t, tape, row, s_bar) -> s_bar``; the row is the state
-          before the step.
-        * ``update_adjoint(c, inputs, k, t, d, tape, row, Z, member, s_bar) -> s_bar``; the row is
-          the state before the observation.
-        * ``smooth(c, tape, row, s_bar) -> (mean, variances, drawn)``.
-        """
-        theta = self._symbols["theta"]
-        zeros = Graph({"theta": theta}, [pt.zeros((self.size,))])
-        return {
-            "parameters": self.recursion.parts()["parameters"],
-            "end": VectorFunction("c", zeros),
-            "predict_adjoint": self._function(
-                "c, inputs, k, t, tape, row, s_bar",
-                "theta u t tape s_bar",
-                [self._predict_adjoint()],
-            ),
-            "update_adjoint": self._function(
-                "c, inputs, k, t, d, tape, row, Z, member, s_bar",
-                "theta u t d tape z s_bar",
-                [self._update_adjoint()],
-            ),
-            "smooth": self._function(
-                "c, tape, row, s_bar", "theta tape s_bar", self._smoothed(), False, False, False
-            ),
-        }
-
-    def _function(
-        self, arguments: str, names: str, outputs: Sequence[TensorVariable], *scalar: bool
-    ) -> VectorFunction:
+    def _function(self, names: str, outputs: Mapping[str, TensorVariable]) -> LaneFunction:
         """A function of the extended ``s``; the outputs are in terms of the filter's and error."""
         size, s = self.recursion.size, self._symbols["s"]
         parts = {s: self._whole[:size], self._error: self._whole[size:]}
-        local = {"s": self._whole, "tape": self._whole, "s_bar": self._adjoint, "z": self._z}
+        local = {"s": self._whole, "s_bar": self._adjoint, "z": self._z}
         inputs = {name: local.get(name, self._symbols.get(name)) for name in names.split()}
-        whole = graph_replace(list(outputs), parts, strict=False)
-        return VectorFunction(arguments, Graph(inputs, whole), scalar or (False,))
+        whole = graph_replace(list(outputs.values()), parts, strict=False)
+        return LaneFunction(Graph(inputs, whole), list(outputs))
 
     def _moments(self) -> tuple[TensorVariable, TensorVariable]:
         return unpack(self._symbols["s"], self.recursion.system.n)

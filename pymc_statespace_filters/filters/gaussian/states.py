@@ -1,280 +1,226 @@
-"""Compiled state estimates of a Gaussian filter: predicted, filtered, smoothed, and the run.
+"""States of a Gaussian filter: predicted, filtered, smoothed, and the run.
 
 Predicted and filtered states take one forward pass, smoothed states a backward pass too. The
-forward pass leaves two tapes with a state per row: ``before`` each observation, and ``after`` each
-step with its observation, if there is one.
+forward pass leaves a tape with all states: before each step and before each observation.
 """
 
-from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    Graph,
-    VectorFunction,
-    jit,
+from pymc_statespace_filters.compiler.codegen.function_types import jit
+from pymc_statespace_filters.compiler.lowering.covariances import semidefinite_cholesky
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+from pymc_statespace_filters.compiler.native.plan import (
+    HEALTH_SIZE,
+    RECORD,
+    REQUEST,
+    RESULTS,
+    Plan,
+    plan_entry,
 )
-from pymc_statespace_filters.compiler.codegen.functions import (
-    copy_elements,
-    vector_functions,
-)
-from pymc_statespace_filters.compiler.lowering.covariances import (
-    covariance_check,
-    semidefinite_cholesky,
-)
-from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.compiler.native.cache_key import key_of
 from pymc_statespace_filters.compiler.numerics.normals import BLOCK, FILL_NORMALS
 from pymc_statespace_filters.compiler.numerics.philox import STATES
+from pymc_statespace_filters.filters.calls import OK, opened, reals_at, wanted_rows
 from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
+from pymc_statespace_filters.filters.gaussian.forward import forward_pass
+from pymc_statespace_filters.filters.gaussian.functions import (
+    ALONG,
+    Functions,
+    checked,
+    compiled,
+    extensions,
+    places_of,
+)
+from pymc_statespace_filters.filters.gaussian.group import (
+    N_OF_RECORD,
+    copy,
+    load_parameters,
+    n_states_on_tape,
+    parameters_of,
+    records_of,
+    set_all,
+    table_of,
+)
 from pymc_statespace_filters.filters.gaussian.linearization import Linearization
-from pymc_statespace_filters.filters.gaussian.recursion import (
-    GaussianFilterFunctions,
-    compile_taped_to_the_end,
-    compiled_of,
-)
-from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NO_FINITE_MEMBER,
-    NONE,
-    is_missing,
-)
+from pymc_statespace_filters.filters.gaussian.machine import call, read_machine, workspace
+from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
+from pymc_statespace_filters.filters.outcomes import NONE, OUT_OF_MEMORY, is_missing
+from pymc_statespace_filters.filters.plan import PLAN, make_plan, settings_of
+from pymc_statespace_filters.filters.protocol import System
+
+MOMENTS = {"predicted": 0, "filtered": 1, "smoothed": 2}
+_PREDICTED, _, _SMOOTHED = MOMENTS.values()
 
 # Counters of the random stream `STATES`: the steps of the record (one column each), the start.
 _ALONG, _AT_START = 0, 1
 
-
-@dataclass(frozen=True, eq=False)
-class ForwardPass:
-    """The forward pass, compiled once for a system and used for all moments."""
-
-    smoother: BrysonFrazier
-    noise: CompiledFunction
-    forwards: CompiledFunction
+_NO_COVARIANCE = -1
 
 
-def forward_pass(recursion: GaussianFilterFunctions, linearization: Linearization) -> ForwardPass:
-    """The forward pass of a filter with a simulated error of it."""
+@lru_cache(maxsize=256)
+def _smoother(
+    recursion: GaussianFilterFunctions, linearization: Linearization
+) -> tuple[BrysonFrazier, Functions]:
+    """The smoother of a filter, and its functions, used for all moments."""
     smoother = BrysonFrazier(recursion, linearization)
-    return ForwardPass(smoother, _noise(smoother), _forwards(smoother))
+    n_cov, n_noises = smoother.covariances.values.type.shape[0], smoother.n_noises
+    places = places_of(recursion, smoother.size, n_cov, n_noises + recursion.system.p)
+    return smoother, compiled(smoother.functions(), places, ALONG, in_lanes=False)
 
 
-def compile_states(forward: ForwardPass, moment: str) -> CompiledFunction:
-    """The function (.., rows, draw_seed) -> (mean, sd, drawn, n_effective, health)."""
-    recursion = forward.smoother.recursion
-    if moment == "smoothed":
-        read_states = _read_backwards(forward.smoother)
+def states_plan(
+    system: System, recursion: GaussianFilterFunctions, linearization: Linearization, moment: str
+) -> Plan:
+    """The plan of "predicted", "filtered" or "smoothed" states."""
+    smoother, functions = _smoother(recursion, linearization)
+    back = ("predict_back", "update_back", "smooth")
+    used = [n for n in functions.entries if n not in back or moment == "smoothed"]
+    covs, n_theta = smoother.covariances, recursion.start.inputs["theta"].type.shape[0]
+    rows = {name: n_theta + first for name, (first, _) in covs.places.items()}
+    noise_cov = rows.get("process_noise", _NO_COVARIANCE) if smoother.draws_q else _NO_COVARIANCE
+    return make_plan(
+        system, _STATES, (), checked(recursion.system, covs, n_theta),
+        **{name: functions.entries[name] for name in used}, **extensions(system),
+        state_size=smoother.size, n_lanes=1, n_rows=functions.n_rows,
+        n_covariances=covs.values.type.shape[0], n_noises=smoother.n_noises + recursion.system.p,
+        initial_cov=rows["initial_cov"], noise_cov=noise_cov, last_event=MOMENTS[moment],
+    )  # fmt: skip
+
+
+@njit_internal
+def _n_steps(table):
+    return table.rows[-1, 0] if table.rows.shape[0] else np.int64(0)
+
+
+@njit_internal
+def _pass(opening, machine, table, health):
+    """Terms, a tape of all states, and the first step without one."""
+    records, to = records_of(opening, machine), opening.results
+    n_rows, size = opening.record[RECORD.n_rows], machine.size
+    terms = reals_at(to[RESULTS.terms], (n_rows,)) if to[RESULTS.terms] else np.empty(n_rows)
+    tape = np.empty(n_states_on_tape(opening, machine, records) * size)
+    n_taped = forward_pass(machine, settings_of(opening.plan), table, records, tape, terms, health)
+    end = _n_steps(table) + 1
+    if health[0, 1] != NONE:
+        # Without valid covariances, not even the start is known.
+        end = table.rows[int(health[0, 2]), 0] if n_taped else np.int64(0)
+    return tape.reshape((tape.size // size, size)), end
+
+
+@njit_internal
+def _new_health(to):
+    """The health of the record, with what stays if memory ends."""
+    health = reals_at(to[RESULTS.health], (1, HEALTH_SIZE))
+    health[0, 0], health[0, 1], health[0, 2] = np.inf, OUT_OF_MEMORY, 0.0
+    return health
+
+
+def _states(plan, record, request, results):
+    status, opening = opened(plan, record, request, results)
+    if status != OK or opening.request[REQUEST.sizes_only]:
+        return status
+    rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
+    n_wanted, n = rows.size, machine.n
+    mean, sd = _room(to[RESULTS.mean], n_wanted, n), _room(to[RESULTS.sd], n_wanted, n)
+    drawn = _room(to[RESULTS.drawn], n_wanted, n)
+    n_effective = _room(to[RESULTS.n_effective_wanted], n_wanted, 1)
+    health = _new_health(to)
+    without_noise = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
+    X, Z = _noise(opening, machine, without_noise)
+    table = table_of(opening, without_noise.theta, Z, X)
+    tape, end = _pass(opening, machine, table, health)
+    if opening.plan[PLAN.last_event] == _SMOOTHED:
+        n_known = _read_backwards(machine, table, tape, end, rows, mean, sd, drawn)
     else:
-        read_states = _read_forwards(recursion.system.n, predicted=moment == "predicted")
-    parts = {"noise": forward.noise, "forwards": forward.forwards, "read": read_states}
-    noise, forwards, read = (part.function for part in parts.values())
-    n = recursion.system.n
-
-    def states(theta, steps, observed, inputs, t0, seed, rows, draw_seed):
-        mean = np.full((rows.size, n), np.nan)
-        sd, drawn = mean.copy(), mean.copy()
-        n_effective = np.full(rows.size, np.nan)
-        n_steps = steps[-1] if steps.size else np.int64(0)
-        X, Z = noise(theta, n_steps, draw_seed)
-        before, after, end, health = forwards(theta, steps, observed, inputs, t0, X, Z)
-        record = (theta, steps, observed, inputs, t0, Z)
-        n_rows = read(record, before, after, end, rows, mean, sd, drawn)
-        n_effective[:n_rows] = np.inf
-        return mean, sd, drawn, n_effective, health
-
-    return compiled_of(states, f"states {moment}", parts, recursion)
+        is_predicted = opening.plan[PLAN.last_event] == _PREDICTED
+        n_known = _read_forwards(n, is_predicted, table, tape, end, rows, mean, sd, drawn)
+    set_all(n_effective[:n_known, 0], np.inf)
+    return OK
 
 
-def compile_run(recursion: GaussianFilterFunctions) -> CompiledFunction:
-    """The function (theta, steps, observed, inputs, t0, seed, rows) -> a run.
-
-    Means and covariances are read from the tape of the forward pass; a run without members.
-    """
-    forward = compile_taped_to_the_end(recursion)
-    run_forward, n = forward.function, recursion.system.n
-
-    def run(theta, steps, observed, inputs, t0, seed, rows):
-        terms, health, tape = run_forward(theta, steps, observed, inputs, t0, seed)
-        R, j = rows.size, 0
-        mean, cov = np.empty((R, n)), np.empty((R, n, n))
-        for r in range(R):
-            while j < steps.size and steps[j] <= rows[r]:
-                j += 1
-            s = tape[rows[r] + j]  # the tape has a row for each step and each observation so far
-            at = n
-            for a in range(n):
-                mean[r, a] = s[a]
-                for b in range(a + 1):
-                    cov[r, a, b] = cov[r, b, a] = s[at]
-                    at += 1
-        return terms, health, mean, cov, np.empty((R, 0, n)), np.empty((R, 0))
-
-    return compiled_of(run, "run", {"forward": forward}, recursion)
-
-
-def _forwards(smoother: BrysonFrazier) -> CompiledFunction:
-    """The filter and a simulated error of it along a record.
-
-    ``end``, the third result, is the first step without a state.
-    """
-    system, size = smoother.recursion.system, smoother.size
-    parts = vector_functions(smoother.forwards())
-    parameters, start, predict, update = (part.function for part in parts.values())
-    valid = covariance_check(system)
-    has_valid_covariances, dt, n = valid.function, system.dt, system.n
-
-    def forwards(theta, steps, observed, inputs, t0, X, Z):
-        n_steps = steps[-1] if steps.size else np.int64(0)
-        before, after = np.empty((steps.size, size)), np.empty((n_steps + 1, size))
-        health = np.array([np.inf, float(NONE), -1.0])
-        if not has_valid_covariances(theta):
-            health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
-            return before, after, 0, health
-        c = parameters(theta)
-        s = start(c, X, 0)
-        k = 0
-        for j in range(steps.size):
-            while k < steps[j]:
-                for i in range(size):
-                    after[k, i] = s[i]
-                s = predict(c, inputs, k, t0 + k * dt, s, Z, k)
-                k += 1
-            has_mean = finite = True
-            for i in range(size):
-                before[j, i] = s[i]
-                finite &= np.isfinite(s[i])
-                has_mean &= i >= n or np.isfinite(s[i])
-            if is_missing(observed, j):
-                continue
-            s, term = update(c, inputs, k, t0 + k * dt, observed[j], s, Z, k)
-            if not (finite and np.isfinite(term)):
-                health[1] = COVARIANCE_NOT_POSITIVE if has_mean else NO_FINITE_MEMBER
-                health[2] = j
-                return before, after, k, health
-        for i in range(size):
-            after[k, i] = s[i]
-        return before, after, n_steps + 1, health
-
-    key = key_of(
-        __name__,
-        __name__,
-        f"forwards {dt!r} {n}",
-        valid.key,
-        *(part.key for part in parts.values()),
-    )
-    return CompiledFunction(jit(forwards), key)
-
-
-def _read_forwards(n: int, *, predicted: bool) -> CompiledFunction:
+@njit_internal
+def _read_forwards(n, is_predicted, table, tape, end, rows, mean, sd, drawn):
     """Write predicted or filtered states at the rows; return how many rows have a state."""
+    steps, j = table.rows[:, 0], 0
     size = n + n * (n + 1) // 2
-
-    def read(record, before, after, end, rows, mean, sd, drawn):
-        steps = record[1]
-        j = 0
-        for r in range(rows.size):
-            k = rows[r]
-            if k >= end:
-                return r
-            s = after[k]
-            while j < steps.size and steps[j] < k:
-                j += 1
-            if predicted and j < steps.size and steps[j] == k:
-                s = before[j]
-            for i in range(n):
-                mean[r, i] = s[i]
-                sd[r, i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
-                drawn[r, i] = s[i] + s[size + i]
-        return rows.size
-
-    return CompiledFunction(jit(read), key_of(__name__, f"read forwards {n} {predicted}"))
+    for r in range(rows.size):
+        k = rows[r]
+        if k >= end:
+            return r
+        while j < steps.size and steps[j] < k:
+            j += 1
+        is_seen = j < steps.size and steps[j] == k
+        s = tape[k + j + (is_seen and not is_predicted)]
+        for i in range(n):
+            mean[r, i] = s[i]
+            sd[r, i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
+            drawn[r, i] = s[i] + s[size + i]
+    return rows.size
 
 
-def _read_backwards(smoother: BrysonFrazier) -> CompiledFunction:
+@njit_internal
+def _read_backwards(machine, table, tape, end, rows, mean, sd, drawn):
     """Write smoothed states at the rows; none if the filter failed."""
-    system = smoother.recursion.system
-    parts = vector_functions(smoother.backwards())
-    parameters, end_of, predict_adjoint, update_adjoint, smooth = (
-        part.function for part in parts.values()
-    )
-    dt, n = system.dt, system.n
-
-    def read(record, before, after, end, rows, mean, sd, drawn):
-        theta, steps, observed, inputs, t0, Z = record
-        n_steps = after.shape[0] - 1
-        if end <= n_steps:
-            return 0
-        c = parameters(theta)
-        s_bar = end_of(c)
-        j, r = steps.size - 1, rows.size - 1
-        informed = False  # until an observation the adjoint is zero, even if Jacobians are infinite
-        for k in range(n_steps, -1, -1):
-            if r < 0:
-                break
-            if informed:
-                s_bar = predict_adjoint(c, inputs, k, t0 + k * dt, after, k, s_bar)
-            if rows[r] == k:
-                m, variances, x = smooth(c, after, k, s_bar)
-                for i in range(n):
-                    mean[r, i], drawn[r, i] = m[i], x[i]
-                    sd[r, i] = np.sqrt(max(variances[i], 0.0))
-                r -= 1
-            if j >= 0 and steps[j] == k:
-                if not is_missing(observed, j):
-                    s_bar = update_adjoint(
-                        c, inputs, k, t0 + k * dt, observed[j], before, j, Z, k, s_bar
-                    )
-                    informed = True
-                j -= 1
-        return rows.size
-
-    key = key_of(__name__, f"read backwards {dt!r} {n}", *(part.key for part in parts.values()))
-    return CompiledFunction(jit(read), key)
+    m, steps, n, t0 = machine, table.rows[:, 0], machine.n, table.t0
+    n_steps = _n_steps(table)
+    if end <= n_steps:
+        return 0
+    work, records = workspace(m), np.zeros((1, N_OF_RECORD), np.int64)
+    W, inputs = work.W, table.inputs
+    load_parameters(m, table, records, W)
+    call(m.start, m, 1, work, work.states, work.forces, t0, 0, 1)
+    moments = W[m.rows.moments :]
+    j, r = steps.size - 1, rows.size - 1
+    informed = False  # until an observation the adjoint is zero, even if Jacobians are infinite
+    for k in range(n_steps, -1, -1):
+        if r < 0:
+            break
+        if k < inputs.shape[0]:
+            copy(inputs[k], work.forces[: m.n_inputs])
+        copy(table.noises[k], work.forces[m.n_inputs :])
+        is_seen = j >= 0 and steps[j] == k
+        after = tape[k + j + 1]
+        if informed:
+            call(m.predict_back, m, 1, work, after, work.forces, t0, k, 1)
+        if rows[r] == k:
+            call(m.smooth, m, 1, work, after, work.forces, t0, k, 1)
+            for i in range(n):
+                mean[r, i], drawn[r, i] = moments[i], moments[2 * n + i]
+                sd[r, i] = np.sqrt(max(moments[n + i], 0.0))
+            r -= 1
+        if is_seen:
+            if not is_missing(table.observed, j):
+                copy(table.observed[j], W[m.rows.d : m.rows.d + m.p])
+                call(m.update_back, m, 1, work, tape[k + j], work.forces, t0, k, 1)
+                informed = True
+            j -= 1
+    return rows.size
 
 
-def _noise(smoother: BrysonFrazier) -> CompiledFunction:
-    """``noise(theta, n_steps, draw_seed)``: X (n, 1) ~ N(0, P_0), and Z (noises + p, steps).
+_fill = FILL_NORMALS.external
+_purpose = np.int64(STATES)
 
-    If the smoother draws q, the first m rows of Z have its covariance. The covariances may be
-    singular; that they are covariances at theta has been checked.
+
+@njit_internal
+def _noise(opening, machine, table):
+    """X (n,) ~ N(0, P_0), and Z (steps, noises).
+
+    If the smoother draws q, the first columns of Z have its covariance. The covariances may be
+    singular; where they are none, all is NaN.
     """
-    system, m = smoother.recursion.system, smoother.n_noises
-    equations, n = system.equations, system.n
-    is_white = equations.process_noise is None or not smoother.draws_q
-    theta = pt.tensor("theta", shape=(system.n_theta,), dtype="float64")
-    covs = [call(equations.initial_cov, system, {"theta": theta})]
-    if not is_white:
-        covs.append(call(equations.process_noise, system, {"theta": theta}))
-    graph = Graph({"theta": theta}, [pt.concatenate([cov.ravel() for cov in covs])])
-    flat = vector_functions({"covariances": VectorFunction("c", graph)})["covariances"]
-    covariances, n_rows = flat.function, m + system.p
-    n_values = graph.outputs[0].type.shape[0]
-    copy = copy_elements("found, values", "values[{i}]", "found", n_values)
-    FILL_NORMALS.compile()
-    fill, purpose = FILL_NORMALS.external, np.int64(STATES)
-
-    def noise(theta, n_steps, draw_seed):
-        width = BLOCK * (n_steps // BLOCK + 1)  # a column for each step, padded to whole blocks
-        X, Z = np.empty((n, BLOCK)), np.empty((n_rows, width))
-        fill(draw_seed, purpose, _AT_START, 0, X.ctypes.data, n, BLOCK)
-        fill(draw_seed, purpose, _ALONG, 0, Z.ctypes.data, n_rows, width)
-        values = np.empty(n_values)
-        copy(covariances(theta), values)
-        apply_covariance(values, 0, n, X)
-        if not is_white:
-            apply_covariance(values, n * n, m, Z)
-        return X, Z
-
-    key = key_of(
-        __name__,
-        __name__,
-        f"noise of states {n} {m} {n_rows} {is_white}",
-        flat.key,
-        FILL_NORMALS.key,
-    )
-    return CompiledFunction(jit(noise), key)
+    m, plan, seed = machine, opening.plan, opening.request[REQUEST.draw_seed]
+    work, records = workspace(m), np.zeros((1, N_OF_RECORD), np.int64)
+    load_parameters(m, table, records, work.W)
+    call(m.start, m, 1, work, work.states, work.forces, table.t0, 0, 1)
+    width = BLOCK * (_n_steps(table) // BLOCK + 1)  # a column for each step, in whole blocks
+    X, Z = np.empty((m.n, BLOCK)), np.empty((m.n_noises, width))
+    _fill(seed, _purpose, _AT_START, 0, X.ctypes.data, m.n, BLOCK)
+    _fill(seed, _purpose, _ALONG, 0, Z.ctypes.data, m.n_noises, width)
+    apply_covariance(work.W, plan[PLAN.initial_cov], m.n, X)
+    if plan[PLAN.noise_cov] != _NO_COVARIANCE:
+        apply_covariance(work.W, plan[PLAN.noise_cov], m.n_noises - m.p, Z)
+    return X[:, 0].copy(), Z.T.copy()
 
 
 @jit
@@ -291,3 +237,49 @@ def apply_covariance(values, first, size, Z):
             for j in range(i + 1):
                 total += root[i, j] * Z[j, member]
             Z[i, member] = total
+
+
+_STATES = plan_entry(_states, "gaussian_states", needs=[FILL_NORMALS])
+
+
+def _run(plan, record, request, results):
+    """Write mean and covariance from the tape; without spread, the states of a path as well."""
+    status, opening = opened(plan, record, request, results)
+    if status != OK or opening.request[REQUEST.sizes_only]:
+        return status
+    rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
+    n, n_wanted = machine.n, rows.size
+    mean, cov = _room(to[RESULTS.mean], n_wanted, n), _room(to[RESULTS.cov], n_wanted, n * n)
+    sd, drawn = _room(to[RESULTS.sd], n_wanted, n), _room(to[RESULTS.drawn], n_wanted, n)
+    n_effective = _room(to[RESULTS.n_effective_wanted], n_wanted, 1)
+    health = _new_health(to)
+    table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
+    tape, end = _pass(opening, machine, table, health)
+    steps, j = table.rows[:, 0], 0
+    for r in range(n_wanted):
+        if rows[r] >= end:
+            break
+        while j < steps.size and steps[j] <= rows[r]:
+            j += 1
+        s, at = tape[rows[r] + j], n
+        for a in range(n):
+            mean[r, a] = drawn[r, a] = s[a]
+            sd[r, a] = 0.0
+            for b in range(a + 1):
+                covariance = 0.0
+                if machine.size > n:
+                    covariance, at = s[at], at + 1
+                cov[r, a * n + b] = cov[r, b * n + a] = covariance
+        n_effective[r, 0] = np.inf
+    return OK
+
+
+@njit_internal
+def _room(address, n_rows, width):
+    """A matrix of NaN: at an address, or elsewhere where it is not wanted."""
+    room = reals_at(address, (n_rows, width)) if address else np.empty((n_rows, width))
+    set_all(room.reshape(room.size), np.nan)
+    return room
+
+
+RUN = plan_entry(_run, "gaussian_run")

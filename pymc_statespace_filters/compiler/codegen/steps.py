@@ -1,0 +1,338 @@
+"""Functions of a filter for one record: its steps and rows along a record, or each on its own.
+
+Along a record the state is in registers, see `record_loops`. The others are called as the functions
+of many records are, see `simd`, with one lane. Those that cannot be written out in scalars call
+array code.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import carray
+
+from pymc_statespace_filters.compiler.codegen.array_fallback import array_code, used_inputs
+from pymc_statespace_filters.compiler.codegen.emitter import Emitter, depends_on
+from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Value
+from pymc_statespace_filters.compiler.codegen.function_types import Graph, function_of
+from pymc_statespace_filters.compiler.codegen.functions import log_choice, unrolled
+from pymc_statespace_filters.compiler.codegen.machine_code import (
+    Module,
+    ModuleEntryPoint,
+    constant,
+)
+from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES, sorted_by_number
+from pymc_statespace_filters.compiler.codegen.record_loops import (
+    ALONG_ARGUMENTS,
+    Part,
+    Sizes,
+    backward_loop,
+    forward_loop,
+)
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
+from pymc_statespace_filters.compiler.codegen.simd import (
+    INPUTS,
+    LANE_ARGUMENTS,
+    PARAMETERS,
+    STATE,
+    TIME,
+    LaneFunction,
+)
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.jit import njit_internal
+
+NOISE = "z"
+
+
+class Places(NamedTuple):
+    """The first row in ``W`` of each vector, the first free row, and lengths of other vectors.
+
+    To a step belong its inputs and, behind them, its noises.
+    """
+
+    rows: Mapping[str, int]
+    n_rows: int
+    state_size: int
+    n_inputs: int
+    n_observables: int
+    n_noises: int = 0
+
+    def of(self, name: str) -> tuple[str, int]:
+        """The array that a function of one step reads a vector from, and its first element."""
+        of_step = {STATE: ("states", 0), INPUTS: ("forces", 0), NOISE: ("forces", self.n_inputs)}
+        return of_step.get(name) or ("W", self.rows[name])
+
+
+def step_functions(
+    functions: Mapping[str, LaneFunction], places: Places, along: tuple[str, str, str]
+) -> tuple[dict[str, EntryPoint], int]:
+    """Entry points, and the number of rows of ``W``.
+
+    Those with `LANE_ARGUMENTS` make one step in one lane. The first function also computes what the
+    others need of parameters alone, see `simd`. ``along`` names the functions of a step and of a
+    row, and the entry point with `ALONG_ARGUMENTS` that takes their place.
+    """
+    first, *others = functions
+    written = {name: _unrolled(name, function) for name, function in functions.items()}
+    known: dict[str, dict[Value, int]] = {name: {} for name in functions}
+    n_rows = places.n_rows
+    if written[first] is not None:
+        for name in others:
+            for value in _constants(written[name] or [], functions[name].graph):
+                known[name][value] = n_rows
+                n_rows += 1
+    entries: dict[str, EntryPoint] = {}
+    *pair, name_along = along
+    for name, function in functions.items():
+        values = written[name]
+        if name in pair:
+            continue
+        if values is None:
+            entries[name] = _on_arrays(name, function, places)
+            continue
+        targets = _targets(function, places)
+        if name == first:
+            for other in others:
+                values = [*values, *known[other]]
+                targets += [("W", row) for row in known[other].values()]
+        entries[name] = _in_scalars(name, places, values, targets, known[name])
+    step, row = (functions[name] for name in pair)
+    parts = [Part(written[name] or [], known[name]) for name in pair]
+    if any(written[name] is None for name in pair):
+        entries[name_along] = _along_on_arrays(name_along, step, row, places)
+    else:
+        carried = [f"{name}.{i}" for name, n in _sizes(step) for i in range(n)]
+        loop = backward_loop if step.backwards else forward_loop
+        code = loop(parts[0], parts[1], carried, _sizes_along(step, places))
+        entries[name_along] = ModuleEntryPoint(code, ALONG_ARGUMENTS, name_along)
+    return entries, n_rows
+
+
+def _sizes_along(step: LaneFunction, places: Places) -> Sizes:
+    result = places.rows["s_bar" if step.backwards else "term"]
+    return Sizes(places.state_size, places.n_inputs, places.n_noises, places.n_observables, result)
+
+
+def _unrolled(name: str, function: LaneFunction) -> list[Value] | None:
+    try:
+        values = [v for group in unrolled(function.graph) for v in group]
+    except NotUnrollableError as reason:
+        log_choice(name, reason)
+        return None
+    log_choice(name)
+    return values
+
+
+def _length(variable: Any) -> int:
+    return variable.type.shape[0] if variable.type.ndim else 1
+
+
+def _elements(graph: Graph) -> list[str]:
+    return [f"{name}.{i}" for name, v in graph.inputs.items() for i in range(_length(v))]
+
+
+def _sizes(function: LaneFunction) -> list[tuple[str, int]]:
+    """Names and lengths of the outputs."""
+    outputs = function.graph.outputs
+    return [(name, _length(v)) for name, v in zip(function.targets, outputs, strict=True)]
+
+
+def _targets(function: LaneFunction, places: Places) -> list[tuple[str, int]]:
+    """The array and the element of it that each output is written to."""
+    found = []
+    for name, length in _sizes(function):
+        array, first = places.of(name)
+        first += places.state_size if name == STATE else 0  # the next state
+        found += [(array, first + i) for i in range(length)]
+    return found
+
+
+def _constants(values: Sequence[Value], graph: Graph) -> Sequence[Value]:
+    """Expressions of theta alone that are results, or are used by others."""
+    elements = _elements(graph)
+    of_theta = frozenset(name for name in elements if name.partition(".")[0] == PARAMETERS)
+    varying = depends_on(values, frozenset(elements) - of_theta)
+    constant = depends_on(values, of_theta) - varying
+    used = [*values, *(a for e in varying for a in e.args)]
+    kept = {v for v in used if v in constant and v.op is not None and v.kind == FLOAT}
+    return sorted_by_number(kept)
+
+
+def _in_scalars(
+    name: str,
+    places: Places,
+    values: Sequence[Value],
+    targets: Sequence[tuple[str, int]],
+    known: Mapping[Value, int],
+) -> EntryPoint:
+    """A function of one step, written out in scalars."""
+    module = Module()
+    main = module.function("main", [LLVM_TYPES[kind] for kind in LANE_ARGUMENTS.values()])
+    given = dict(zip(LANE_ARGUMENTS, main.args, strict=True))
+    build = ir.IRBuilder(main.append_basic_block())
+
+    def read(element: str) -> ir.Value:
+        vector, _, i = element.partition(".")
+        if vector == TIME:
+            step = build.sitofp(given["k"], given["t0"].type)
+            elapsed = emitter.arithmetic("fmul", step, given["dt"])
+            return emitter.arithmetic("fadd", given["t0"], elapsed)
+        array, first = places.of(vector)
+        return build.load(build.gep(given[array], [constant(first + int(i))]))
+
+    emitter = Emitter(module, build, read, vector=False)
+    for value, row in known.items():
+        emitter.set(value, build.load(build.gep(given["W"], [constant(row)])))
+    for (array, i), result in zip(targets, emitter.floats(values), strict=True):
+        build.store(result, build.gep(given[array], [constant(i)]))
+    build.ret_void()
+    return ModuleEntryPoint(module.finished(), LANE_ARGUMENTS, name)
+
+
+@njit_internal
+def vector_at(address, first, size):
+    """A copy of some numbers at an address."""
+    return carray(address, (first + size,))[first:].copy()
+
+
+@njit_internal
+def write(address, first, values):
+    """Write a vector of numbers behind an address."""
+    out = carray(address, (first + values.size,))
+    for i in range(values.size):
+        out[first + i] = values[i]
+
+
+_ARRAY_ARGUMENTS = "W, states, forces, observed, inputs, noises, terms, at, k, j, t"
+
+
+def _array_step(
+    function: LaneFunction, places: Places, *, along: bool = False
+) -> tuple[Any, str, str | None]:
+    """A function that calls array code, its source, and the key of this; NaN where that raises.
+
+    The state is read at the place ``at``, and the next one is written behind it.
+    """
+    graph = function.graph
+    used = used_inputs(graph.inputs, graph.outputs)
+    compiled = array_code(list(used.values()), graph.outputs)
+    elsewhere = {STATE: ("states", "at")}
+    if along:
+        elsewhere |= {
+            INPUTS: ("inputs", f"k * {places.n_inputs}"),
+            NOISE: ("noises", f"k * {places.n_noises}"),
+            "d": ("observed", f"j * {places.n_observables}"),
+            "term_bar": ("terms", "j"), "term": ("terms", "j"),
+        }  # fmt: skip
+    given = []
+    for name, variable in used.items():
+        array, first = elsewhere.get(name) or places.of(name) if name != TIME else ("", "")
+        value = f"vector_at({array}, {first}, {_length(variable)})"
+        value = value if variable.type.ndim else f"np.asarray({value}[0])"
+        given.append("np.asarray(t)" if name == TIME else value)
+    writes, failed = ["    pass"], ["    pass"]
+    for n, (name, length) in enumerate(_sizes(function)):
+        array, first = elsewhere.get(name) or places.of(name)
+        first = f"{first} + {places.state_size}" if name == STATE else first
+        writes.append(f"    write({array}, {first}, out[{n}])")
+        failed.append(f"    write({array}, {first}, np.full({length}, nan))")
+    body = [
+        "try:",
+        f"    out = array_code({', '.join(given)})",
+        *writes,
+        "except Exception:",  # a singular matrix, say
+        *failed,
+    ]
+    scope = {
+        "np": np, "nan": np.nan, "array_code": compiled.function, "vector_at": vector_at,
+        "write": write,
+    }  # fmt: skip
+    step, source = function_of("step", _ARRAY_ARGUMENTS, body, scope)
+    return step, source, compiled.key
+
+
+def _on_arrays(name: str, function: LaneFunction, places: Places) -> EntryPoint:
+    """A function of one step that calls array code."""
+    step, *parts = _array_step(function, places)
+
+    def run(W, n_lanes, states, forces, t0, dt, k, n_steps):
+        step(W, states, forces, W, W, W, W, 0, k, 0, t0 + k * dt)
+
+    return EntryPoint(run, LANE_ARGUMENTS, name, parts)
+
+
+def _along_on_arrays(
+    name: str, step: LaneFunction, row: LaneFunction, places: Places
+) -> EntryPoint:
+    """The loops along a record, with array code for a step and a row."""
+    at_step, *of_step = _array_step(step, places, along=True)
+    at_row, *of_row = _array_step(row, places, along=True)
+    size, p = places.state_size, places.n_observables
+
+    def forward(
+        W, steps, row_width, n_rows, observed, inputs, noises, states, stride, t0, dt, terms
+    ):  # fmt: skip
+        k = at = 0
+        for j in range(n_rows):
+            while k < steps[j * row_width]:
+                at_step(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
+                at = _next(states, at, size, stride)
+                k += 1
+            if _is_missing(observed, j, p):
+                terms[j] = 0.0
+                write(states, at + size, vector_at(states, at, size))
+            else:
+                at_row(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
+                # A state that no observation depends on may be NaN where the term is finite.
+                if not (np.isfinite(terms[j]) and _is_finite(states, at, size)):
+                    terms[j] = -np.inf
+                    W[result] = j
+                    return
+            at = _next(states, at, size, stride)
+        W[result] = n_rows
+
+    result, n_bars = _sizes_along(step, places).result, sum(n for _, n in _sizes(step))
+
+    def backward(
+        W, steps, row_width, n_rows, observed, inputs, noises, states, stride, t0, dt, terms
+    ):  # fmt: skip
+        write(W, result, np.zeros(n_bars))
+        k = steps[(n_rows - 1) * row_width]
+        at = (k + n_rows) * size
+        for j in range(n_rows - 1, -1, -1):
+            at -= size
+            if not _is_missing(observed, j, p):
+                at_row(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
+            origin = steps[(j - 1) * row_width] if j else 0
+            while k > origin:
+                k -= 1
+                at -= size
+                at_step(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
+
+    run = backward if step.backwards else forward
+    return EntryPoint(run, ALONG_ARGUMENTS, name, (repr(places), *of_step, *of_row))
+
+
+@njit_internal
+def _is_missing(observed, j, p):
+    for value in vector_at(observed, j * p, p):
+        if not np.isnan(value):
+            return False
+    return True
+
+
+@njit_internal
+def _next(states, at, size, stride):
+    """The place of the next state, to which it is moved if it is on the same place."""
+    if stride == 0:
+        write(states, at, vector_at(states, at + size, size))
+    return at + stride
+
+
+@njit_internal
+def _is_finite(states, at, size):
+    for value in vector_at(states, at, size):
+        if not np.isfinite(value):
+            return False
+    return True

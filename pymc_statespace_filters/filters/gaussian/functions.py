@@ -1,0 +1,211 @@
+"""The machine code of a deterministic filter for one system: entry points in one of three forms.
+
+At a single record each step waits for the one before. Further records fill that latency, so several
+cost little more than one. The functions therefore have a form for one record, with its state in
+registers, and one for several side by side, a SIMD lane each, which takes longer for one. Those
+that are too large to be written out in scalars call array code, for one record.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.tensor.variable import TensorVariable
+
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
+from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
+from pymc_statespace_filters.compiler.codegen.simd import LANES, LaneFunction, lane_functions
+from pymc_statespace_filters.compiler.codegen.steps import Places, step_functions
+from pymc_statespace_filters.compiler.lowering.covariances import covariances
+from pymc_statespace_filters.compiler.lowering.symbols import call
+from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.compiler.native.plan import Plan
+from pymc_statespace_filters.filters.gaussian.machine import rows_of_vectors
+from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions, vjps
+from pymc_statespace_filters.filters.plan import make_plan
+from pymc_statespace_filters.filters.protocol import System
+from pymc_statespace_filters.system.model import StateSpaceModel
+
+ALONG = ("predict", "update", "along")
+ALONG_BACK = ("predict_back", "update_back", "along_back")
+
+
+class Functions(NamedTuple):
+    """Compiled functions by their slots in a plan, the rows of ``W``, and the number of lanes."""
+
+    entries: Mapping[str, EntryPoint]
+    n_rows: int
+    n_lanes: int
+
+
+def places_of(
+    recursion: GaussianFilterFunctions, size: int, n_cov: int, n_noises: int = 0
+) -> Places:
+    """Where the functions of a filter with states of this size find vectors."""
+    inputs, n = recursion.update.inputs, recursion.system.n
+    n_theta, n_inputs, p = (inputs[name].type.shape[0] for name in ("theta", "u", "d"))
+    rows = rows_of_vectors.py_func(n_theta, n_cov, p, size, n)
+    names = rows._asdict() | {"term_bar": rows.term}
+    return Places(names, rows.free, size, n_inputs, p, n_noises)
+
+
+class Covariances(NamedTuple):
+    """Covariances at theta, one behind the other; the place and size of each by its name."""
+
+    values: TensorVariable
+    places: Mapping[str, tuple[int, int]]
+
+
+def covariances_at(
+    system: StateSpaceModel, theta: TensorVariable, others: Sequence[str] = ()
+) -> Covariances:
+    """The covariances that depend on theta, and others by name."""
+    found = {
+        name: graph
+        for name, graph in covariances(system).items()
+        if name in others or depends_on_theta(graph)
+    }
+    covs = [call(graph, system, {"theta": theta}) for graph in found.values()]
+    sizes = [cov.type.shape[0] for cov in covs]
+    firsts = np.cumsum([0, *(size**2 for size in sizes)]).tolist()
+    values = pt.concatenate([np.zeros(0), *(cov.ravel() for cov in covs)])
+    values = pt.specify_shape(values, (firsts[-1],))
+    return Covariances(values, dict(zip(found, zip(firsts, sizes, strict=False), strict=True)))
+
+
+def depends_on_theta(graph: FrozenFunctionGraph) -> bool:
+    """Whether a covariance has to be checked at every theta."""
+    return any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
+
+
+def checked(system: StateSpaceModel, covs: Covariances, n_theta: int) -> tuple[int, ...]:
+    """The settings of a plan: row in ``W`` and size of the covariances to check."""
+    graphs = covariances(system)
+    return tuple(
+        number
+        for name, (first, size) in covs.places.items()
+        if depends_on_theta(graphs[name])
+        for number in (n_theta + first, size)
+    )
+
+
+@lru_cache(maxsize=256)
+def forward_functions(recursion: GaussianFilterFunctions, *, in_lanes: bool) -> Functions:
+    """The forward pass; raises NotUnrollableError where it cannot be written out for lanes."""
+    start, predict, update = recursion.start, recursion.predict, recursion.update
+    covs = covariances_at(recursion.system, start.inputs["theta"])
+    start = Graph(start.inputs, [*start.outputs, covs.values])
+    functions = {
+        "start": LaneFunction(start, ["s", "cov"]),
+        "predict": LaneFunction(predict, ["s"]),
+        "update": LaneFunction(_where_it_succeeds(update) if in_lanes else update, ["s", "term"]),
+    }
+    places = places_of(recursion, recursion.size, covs.values.type.shape[0])
+    return compiled(functions, places, ALONG, in_lanes=in_lanes)
+
+
+@lru_cache(maxsize=256)
+def backward_functions(recursion: GaussianFilterFunctions, *, in_lanes: bool) -> Functions:
+    """The backward pass, whose rows are behind those of the forward pass."""
+    explicit = recursion.has_short_rows and not in_lanes
+    start, predict, update = vjps(recursion, explicit=explicit)
+    functions = {
+        "prepare_back": LaneFunction(Graph({"theta": predict.inputs["theta"]}, []), []),
+        "predict_back": LaneFunction(predict, ["s_bar", "c_bar"], backwards=True),
+        "update_back": LaneFunction(
+            _where_seen(update) if in_lanes else update, ["s_bar", "c_bar"]
+        ),
+        "finish_back": LaneFunction(start, ["c_bar"]),
+    }
+    forward = forward_functions(recursion, in_lanes=in_lanes)
+    covs = covariances_at(recursion.system, recursion.start.inputs["theta"])
+    places = places_of(recursion, recursion.size, covs.values.type.shape[0])
+    places = places._replace(n_rows=forward.n_rows)
+    return compiled(functions, places, ALONG_BACK, in_lanes=in_lanes)
+
+
+def compiled(
+    functions: Mapping[str, LaneFunction],
+    places: Places,
+    along: tuple[str, str, str],
+    *,
+    in_lanes: bool,
+) -> Functions:
+    """The entry points of functions; see `step_functions` for those along a record."""
+    if not in_lanes:
+        return Functions(*step_functions(functions, places, along), 1)
+    lanes = lane_functions(
+        functions, places.rows, places.n_rows, places.state_size, places.n_inputs
+    )
+    return Functions(lanes.entries, lanes.n_rows, LANES)
+
+
+def filter_plan(
+    system: System,
+    recursion: GaussianFilterFunctions,
+    run: EntryPoint,
+    *,
+    of_many: bool,
+    leaves_tape: bool,
+    goes_back: bool,
+) -> Plan:
+    """The plan of a pass along one record, or along many, in lanes if these fit.
+
+    For a pass that leaves a tape or goes back along it, the functions of a gradient must fit too.
+    """
+    in_lanes = of_many and _fits_lanes(recursion, has_gradient=leaves_tape or goes_back)
+    used = functions = forward_functions(recursion, in_lanes=in_lanes)
+    entries = {**functions.entries, **extensions(system, goes_back=goes_back)}
+    if goes_back:
+        used = backward_functions(recursion, in_lanes=in_lanes)
+        entries |= used.entries
+    theta = recursion.start.inputs["theta"]
+    covs = covariances_at(recursion.system, theta)
+    return make_plan(
+        system, run, (), checked(recursion.system, covs, theta.type.shape[0]), **entries,
+        state_size=recursion.size, n_lanes=used.n_lanes, n_rows=used.n_rows,
+        n_covariances=covs.values.type.shape[0], leaves_tape=leaves_tape,
+    )  # fmt: skip
+
+
+def extensions(system: System, *, goes_back: bool = False) -> dict[str, EntryPoint]:
+    """The functions from the user's parameters to those of the filter, if these are more."""
+    if system.extend is None:
+        return {}
+    return {"extend": system.extend} | ({"extend_back": system.extend_back} if goes_back else {})
+
+
+@lru_cache(maxsize=256)
+def _fits_lanes(recursion: GaussianFilterFunctions, *, has_gradient: bool) -> bool:
+    try:
+        forward_functions(recursion, in_lanes=True)
+        if has_gradient:
+            backward_functions(recursion, in_lanes=True)
+    except NotUnrollableError:
+        return False
+    return True
+
+
+def _where_it_succeeds(update: Graph) -> Graph:
+    """An update in the lanes that observe; it leaves a state without a finite term as it is."""
+    seen, (analysis, term) = _seen(), update.outputs
+    succeeds = pt.neq(seen, 0.0) & pt.lt(pt.abs(term[0]), np.inf)
+    analysis = pt.switch(succeeds, analysis, update.inputs["s"])
+    return Graph({**update.inputs, "seen": seen}, [analysis, term])
+
+
+def _where_seen(update_vjp: Graph) -> Graph:
+    """The cotangents of an update in the lanes that observe; the others keep theirs."""
+    seen, inputs = _seen(), update_vjp.inputs
+    outputs = [
+        pt.switch(pt.neq(seen, 0.0), new, inputs[name])
+        for name, new in zip(("s_bar", "c_bar"), update_vjp.outputs, strict=True)
+    ]
+    return Graph({**inputs, "seen": seen}, outputs)
+
+
+def _seen() -> TensorVariable:
+    return pt.tensor("seen", shape=(), dtype="float64")

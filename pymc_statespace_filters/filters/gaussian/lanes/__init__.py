@@ -1,1 +1,0 @@
-"""A deterministic filter on several records side by side, one SIMD lane each."""
