@@ -27,8 +27,7 @@ from pymc_statespace_filters.errors import LoweringError
 
 # The code that reads a whole input, if not its name.
 _WHOLE = {
-    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)", "term_bar": "np.asarray(term_bar)",
-    "tape": "tape[row]",
+    "theta": "c", "u": "inputs[k]", "t": "np.asarray(t)",
 }  # fmt: skip
 
 # The same where arguments are addresses; others are vectors at z.

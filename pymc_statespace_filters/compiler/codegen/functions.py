@@ -157,7 +157,7 @@ def vector_code(values: Sequence[Value]) -> tuple[Code, list[str]]:
 
 
 # What inputs are elements of, if not of a vector of their name.
-_ARGUMENT = {"theta": ("c",), "u": ("inputs", "k"), "tape": ("tape", "row")}
+_ARGUMENT = {"theta": ("c",), "u": ("inputs", "k")}
 
 
 def _place(graph: Graph, element: str) -> tuple:
@@ -266,18 +266,3 @@ def copy_elements(arguments: str, target: str, source: str, size: int) -> Any:
             frame.write(frame.read(source, i), name, *before, first + i)
 
     return _intrinsic(arguments, types.void, generate)
-
-
-def all_finite(size: int) -> Any:
-    """``all_finite(vector)``: whether the first elements are finite, without a loop as above."""
-
-    def generate(frame: _Frame) -> ir.Value:
-        build, result = frame.builder, cgutils.true_bit
-        infinity = ir.Constant(DOUBLE, float("inf"))
-        for i in range(size):
-            size_of = build.module.declare_intrinsic("llvm.fabs", [DOUBLE])
-            magnitude = build.call(size_of, [frame.read("s", i)])
-            result = build.and_(result, build.fcmp_ordered("<", magnitude, infinity))
-        return result
-
-    return _intrinsic("s", types.boolean, generate)
