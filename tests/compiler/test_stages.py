@@ -95,7 +95,7 @@ def test_an_invalid_parameter_is_a_failure_that_is_counted():
 
 
 def test_a_filter_that_needs_a_derivative_is_refused():
-    with pytest.raises(LoweringError, match="the derivative of BinomialQuantile by its argument"):
+    with pytest.raises(LoweringError, match="the derivative of PoissonQuantile by its argument"):
         psf.log_likelihood(system(epidemic), psf.EKF(), {"b": 0.8}, np.zeros((2, 1)), steps=[1, 2])
 
 

@@ -124,7 +124,8 @@ def test_twenty_coupled_states_are_written_out(caplog, monkeypatch):
     monkeypatch.setattr(lowering, "array_vector_function", None)
     with caplog.at_level(logging.DEBUG, "pymc_statespace_filters"):
         psf.EKF().compile(compile_system(ring(20)))
-    assert "parameters, start, predict, update: written out in scalars" in caplog.messages
+    for part in ("start", "predict", "update"):
+        assert f"{part}: written out in scalars" in caplog.messages
 
 
 @pytest.mark.parametrize(

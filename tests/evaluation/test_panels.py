@@ -37,8 +37,11 @@ def test_a_run_of_a_panel_is_the_run_of_each_record(filter, at):
             PAIR, filter, alone(label), DATA[rows], steps=STEPS[rows], seed=seed, at=at, t0=1
         )
         states, terms = of_record(run, label), of_record(run, label, "obs_")
-        for name in set(single.data_vars) - {"log_likelihood"}:
+        for name in set(single.data_vars) - {"log_likelihood", "filter_state"}:
             np.testing.assert_array_equal(states[name], single[name], name)
+        if "filter_state" in single:
+            state = run["filter_state"].sel(filter_state_record=label)
+            np.testing.assert_array_equal(state, single["filter_state"])
         np.testing.assert_array_equal(states["time"], single["time"])
         np.testing.assert_array_equal(states["step"] + 1, single["time"])
         np.testing.assert_array_equal(terms["log_likelihood"], single["log_likelihood"])

@@ -108,7 +108,8 @@ class PlannedFunction:
         record, _ = words.buffer_info()
         request, results = record + _BYTES * N_RECORD, record + _BYTES * _RESULTS
         run, plan = self.plan.run, self.plan.address
-        if self._asks_for_sizes:
+        replacement = words[_REPLACEMENT]
+        if self._asks_for_sizes or replacement:  # which is given only arguments that were checked
             words[_SIZES_ONLY] = 1
             self._check(run(plan, record, request, results))
             words[_SIZES_ONLY] = 0
@@ -117,8 +118,8 @@ class PlannedFunction:
             result = np.empty([self._size(words, s) if is_slot else s for s, is_slot in sizes])
             words[_RESULTS + place] = _address(result)
             made.append(result)
-        if words[_REPLACEMENT]:
-            run = PlanFunction(words[_REPLACEMENT])
+        if replacement:
+            run = PlanFunction(replacement)
         self._check(run(plan, record, request, results))
         if self._tape is not None:
             made[self._tape] = made[self._tape][: words[_RESULTS + RESULTS.n_tape]]

@@ -143,7 +143,7 @@ def no_resampling(resampler, noise, j, k, n_weighted, members, local):
 
 @njit_internal
 def dump(k, members, state):
-    """Write the step, NaN after a failure, the members and their log weights to a vector."""
+    """Write the step, the members and their log weights to a vector."""
     n, N = members.X.shape
     state[0] = k
     for a in range(n):
@@ -243,7 +243,9 @@ def ensemble_filter(
         if health[1] == NONE:
             emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
         if to.state.size:
-            dump(np.float64(k) if health[1] == NONE else np.nan, members, to.state)
+            dump(k, members, to.state)
+            if health[1] != NONE:
+                to.state[:] = np.nan
         return OK
 
     parts = (str(n_settings), workspace, update, resampler, resample)
