@@ -24,6 +24,8 @@ PANEL = np.array(["a", "a", "a", "a", "b", "b", "b"])
 PANEL_STEPS = np.array([0, 2, 3, 7, 1, 4, 6])
 
 FILTERS = [
+    psf.EKF(),
+    psf.UKF(),
     psf.EnKF(40),
     psf.BootstrapPF(50),
     psf.BootstrapPF(50, resampling="sorted"),
@@ -31,6 +33,7 @@ FILTERS = [
     psf.BootstrapPF(33, resample_below=0.0),
     psf.PFEnKF(70),
 ]
+PF = psf.BootstrapPF(50)
 pytestmark = pytest.mark.filterwarnings("ignore:.*fewer than 3 particles")
 
 
@@ -62,9 +65,9 @@ def test_two_parts_are_one_run_wherever_it_is_cut(filter):
 
 
 def test_three_parts_at_the_observations_and_through_a_file(tmp_path):
-    whole, parts, state = run(FILTERS[1], at="observations"), [], None
+    whole, parts, state = run(PF, at="observations"), [], None
     for number, rows in enumerate((slice(0, 2), slice(2, 5), slice(5, 7))):
-        parts.append(run(FILTERS[1], rows, at="observations", state=state))
+        parts.append(run(PF, rows, at="observations", state=state))
         parts[-1].to_netcdf(tmp_path / f"{number}.nc")
         with xr.open_dataset(tmp_path / f"{number}.nc") as stored:
             state = stored.load()
@@ -72,7 +75,7 @@ def test_three_parts_at_the_observations_and_through_a_file(tmp_path):
 
 
 def test_every_record_of_a_panel_goes_on():
-    filter = FILTERS[1]
+    filter = PF
     whole = run(filter, panel=PANEL, steps=PANEL_STEPS)
     early = np.array([True, True, False, False, True, False, False])
     first, second = early, ~early
@@ -100,36 +103,37 @@ def other_system():
 
 
 REFUSED = [
+    (psf.EnKF(50), {}, r"got one with filter BootstrapPF"),
     (psf.GuidedPF(20), {}, r"^GuidedPF cannot go on from an earlier run: its guide needs the"),
     (psf.BootstrapPF(50, resample_below=0.5), {}, r"got one with filter BootstrapPF\(n_particles="),
-    (FILTERS[1], {"seed": 4}, r"got one with seed 3 instead of 4$"),
-    (FILTERS[1], {"t0": 1.0}, r"got one with t0 0.0 instead of 1.0$"),
-    (FILTERS[1], {"steps": STEPS[3:] - 4}, r"which is at step 3, got 3$"),
-    (FILTERS[1], {"state": DATA}, r"^state must be what run_filter returned, got ndarray$"),
-    (FILTERS[1], {"panel": PANEL[3:]}, r"^state must have the records .*, got those of None$"),
+    (PF, {"seed": 4}, r"got one with seed 3 instead of 4$"),
+    (PF, {"t0": 1.0}, r"got one with t0 0.0 instead of 1.0$"),
+    (PF, {"steps": STEPS[3:] - 4}, r"which is at step 3, got 3$"),
+    (PF, {"state": DATA}, r"^state must be what run_filter returned, got ndarray$"),
+    (PF, {"panel": PANEL[3:]}, r"^state must have the records .*, got those of None$"),
 ]
 
 
 @pytest.mark.parametrize(("filter", "changes", "message"), REFUSED)
 def test_what_is_not_the_same_run_is_refused_by_name(filter, changes, message):
-    first = run(FILTERS[1], slice(3))
+    first = run(PF, slice(3))
     with pytest.raises(psf.ModelError, match=message):
         run(filter, slice(3, None), **{"state": first} | changes)
 
 
 def test_other_parameters_systems_and_failed_runs_are_refused():
-    first = run(FILTERS[1], slice(3))
+    first = run(PF, slice(3))
     rows = {"steps": STEPS[3:], "seed": 3, "state": first}
     with pytest.raises(psf.ModelError, match=r"parameters \[0.5\] instead of \[0.6\]$"):
-        psf.run_filter(SYSTEM, FILTERS[1], {"a": 0.6}, DATA[3:], inputs=FORCE, **rows)
+        psf.run_filter(SYSTEM, PF, {"a": 0.6}, DATA[3:], inputs=FORCE, **rows)
     with pytest.raises(psf.ModelError, match=r"got one with another system$"):
-        psf.run_filter(other_system(), FILTERS[1], {"a": 0.5}, DATA[3:], **rows)
+        psf.run_filter(other_system(), PF, {"a": 0.5}, DATA[3:], **rows)
     with pytest.warns(psf.FilterWarning, match="gave -inf"):
         failed = psf.run_filter(
-            SYSTEM, FILTERS[1], {"a": 1e300}, DATA[:4], inputs=FORCE, seed=3, steps=STEPS[:4]
+            SYSTEM, PF, {"a": 1e300}, DATA[:4], inputs=FORCE, seed=3, steps=STEPS[:4]
         )
     with pytest.raises(psf.ModelError, match=r"^state must be of a run that did not fail"):
         psf.run_filter(
-            SYSTEM, FILTERS[1], {"a": 1e300}, DATA[4:], inputs=FORCE, seed=3, steps=STEPS[4:],
+            SYSTEM, PF, {"a": 1e300}, DATA[4:], inputs=FORCE, seed=3, steps=STEPS[4:],
             state=failed,
         )  # fmt: skip

@@ -29,10 +29,11 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 
 ALONG_ARGUMENTS = {
     "W": F64_PTR, "steps": I64_PTR, "row_width": types.intp, "n_rows": types.intp,
-    "observed": F64_PTR, "inputs": F64_PTR, "noises": F64_PTR, "states": F64_PTR,
-    "stride": types.intp, "t0": types.float64, "dt": types.float64, "terms": F64_PTR,
+    "first": types.intp, "observed": F64_PTR, "inputs": F64_PTR, "noises": F64_PTR,
+    "states": F64_PTR, "stride": types.intp, "t0": types.float64, "dt": types.float64, "terms": F64_PTR,
 }  # fmt: skip
-"""The step of row j is ``steps[j * row_width]``. Successive states are ``stride`` numbers apart on
+"""The step of row j is ``steps[j * row_width]``, and ``first`` that of the state at the start of a
+forward pass; a way back ends at step 0. Successive states are ``stride`` numbers apart on
 the tape ``states``, or on one place if this is 0."""
 
 AlongArguments = arguments_class("AlongArguments", ALONG_ARGUMENTS, __name__)
@@ -109,7 +110,7 @@ class _Builder:
         build.branch(rows)
 
         build.position_at_end(rows)
-        j, k, place = (self._phi(zero, entered) for _ in range(3))
+        j, k, place = (self._phi(x, entered) for x in (zero, given["first"], zero))
         state = [self._phi(x, entered) for x in begun]
         build.cbranch(build.icmp_signed("<", j, given["n_rows"]), row, finish)
 

@@ -271,9 +271,9 @@ def _along_on_arrays(
     size, p = places.state_size, places.n_observables
 
     def forward(
-        W, steps, row_width, n_rows, observed, inputs, noises, states, stride, t0, dt, terms
+        W, steps, row_width, n_rows, first, observed, inputs, noises, states, stride, t0, dt, terms
     ):  # fmt: skip
-        k = at = 0
+        k, at = first, 0
         for j in range(n_rows):
             while k < steps[j * row_width]:
                 at_step(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
@@ -295,7 +295,7 @@ def _along_on_arrays(
     result, n_bars = _sizes_along(step, places).result, sum(n for _, n in _sizes(step))
 
     def backward(
-        W, steps, row_width, n_rows, observed, inputs, noises, states, stride, t0, dt, terms
+        W, steps, row_width, n_rows, first, observed, inputs, noises, states, stride, t0, dt, terms
     ):  # fmt: skip
         write(W, result, np.zeros(n_bars))
         k = steps[(n_rows - 1) * row_width]

@@ -35,6 +35,7 @@ class GaussianFilterBase:
 
     noisy: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = True
+    resumes: ClassVar[bool] = True
 
     @property
     def linearization(self) -> Linearization:

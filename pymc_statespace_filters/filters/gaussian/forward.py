@@ -73,6 +73,8 @@ def forward_pass(machine, covariances, table, records, tape, terms, health):
         begin(lanes, group, table.rows)
         call(m.start, m, n_lanes_of(m, group), work, work.states, work.forces, table.t0, 0, 1)
         copy(work.states[size:], work.states[:size])
+        if table.before.size:  # of a record alone
+            copy(table.before, work.states[:size])
         n_alive = _set_out(m, covariances, work.W, lanes, group, terms, health)
         if n_alive == 0:
             continue
@@ -128,7 +130,8 @@ def _along(machine, work, table, record, tape, terms, health):
     j = call_along(m.along, m, work.W, table, record, states, stride, terms)
     n_rows, point = record[N_ROWS], record[POINT]
     last = min(j, n_rows - 1)
-    place = stride * (j + (step_at(table.rows, record[BEGIN] + last) if n_rows else 0))
+    k = step_at(table.rows, record[BEGIN] + last) if n_rows else table.first
+    place = stride * (j + k - table.first)
     if j == n_rows:
         return place
     health[point, 1] = _failure(m.n, states[place:], 1)

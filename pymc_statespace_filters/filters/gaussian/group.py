@@ -14,7 +14,7 @@ from pymc_statespace_filters.compiler.codegen.record_loops import AlongArguments
 from pymc_statespace_filters.compiler.native.entry_point import call_address
 from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
 from pymc_statespace_filters.compiler.native.plan import RECORD
-from pymc_statespace_filters.filters.calls import integers_at, reals_at
+from pymc_statespace_filters.filters.calls import integers_at, reals_at, state_given
 from pymc_statespace_filters.filters.gaussian.machine import STRETCH
 from pymc_statespace_filters.filters.plan import PLAN
 from pymc_statespace_filters.system import panel
@@ -38,7 +38,8 @@ class Table(NamedTuple):
     """The rows of all records, which are steps or as in `system.panel`; data, inputs, noises.
 
     ``theta`` are the parameters that the functions take. ``noises`` has a row for each step, and
-    ``x`` is an error of the start, where states are drawn.
+    ``x`` is an error of the start, where states are drawn. A record that goes on from earlier rows
+    begins at the step ``first`` with the state ``before``, which is empty otherwise.
     """
 
     rows: np.ndarray
@@ -48,12 +49,14 @@ class Table(NamedTuple):
     noises: np.ndarray
     x: np.ndarray
     t0: float
+    first: int
+    before: np.ndarray
 
 
 @njit_internal
 def table_of(call, theta, noises, x):
     """The table of a call."""
-    given = call.record
+    given, state = call.record, state_given(call.request)
     n_rows, width = given[RECORD.n_rows], given[RECORD.row_width]
     n_inputs = given[RECORD.n_inputs]
     return Table(
@@ -64,6 +67,8 @@ def table_of(call, theta, noises, x):
         noises=noises,
         x=x,
         t0=reals_at(given[RECORD.starts], (given[RECORD.n_starts],))[0],
+        first=int(state[0]) if state.size else 0,
+        before=state[1:],
     )
 
 
@@ -152,7 +157,8 @@ def call_along(function, machine, W, table, record, states, stride, terms):
     first_input = first_input_at(table.rows, first) if n_rows else 0
     arguments = AlongArguments(
         W=W, steps=steps[first * width + step_column :], row_width=np.int64(width),
-        n_rows=n_rows, observed=observed.reshape(observed.size)[first * p :],
+        n_rows=n_rows, first=np.int64(table.first),
+        observed=observed.reshape(observed.size)[first * p :],
         inputs=inputs.reshape(inputs.size)[first_input * m.n_inputs :],
         noises=table.noises.reshape(table.noises.size), states=states, stride=stride, t0=table.t0,
         dt=m.dt, terms=terms[record[SHIFT] + first :],

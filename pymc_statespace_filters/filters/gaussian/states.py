@@ -16,6 +16,7 @@ from pymc_statespace_filters.compiler.native.plan import (
     RECORD,
     REQUEST,
     RESULTS,
+    STATE,
     Plan,
     plan_entry,
 )
@@ -245,9 +246,15 @@ _STATES = plan_entry(_states, "gaussian_states", needs=[FILL_NORMALS])
 def _run(plan, record, request, results):
     """Write mean and covariance from the tape; without spread, the states of a path as well."""
     status, opening = opened(plan, record, request, results)
-    if status != OK or opening.request[REQUEST.sizes_only]:
+    if status != OK:
         return status
     rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
+    to[RESULTS.n_state] = 1 + machine.size  # a step, and the state
+    before = opening.request[REQUEST.n_state]
+    if before != 0 and before != to[RESULTS.n_state]:
+        return np.int64(STATE)
+    if opening.request[REQUEST.sizes_only]:
+        return status
     n, n_wanted = machine.n, rows.size
     mean, cov = _room(to[RESULTS.mean], n_wanted, n), _room(to[RESULTS.cov], n_wanted, n * n)
     sd, drawn = _room(to[RESULTS.sd], n_wanted, n), _room(to[RESULTS.drawn], n_wanted, n)
@@ -261,7 +268,7 @@ def _run(plan, record, request, results):
             break
         while j < steps.size and steps[j] <= rows[r]:
             j += 1
-        s, at = tape[rows[r] + j], n
+        s, at = tape[rows[r] - table.first + j], n
         for a in range(n):
             mean[r, a] = drawn[r, a] = s[a]
             sd[r, a] = 0.0
@@ -271,6 +278,12 @@ def _run(plan, record, request, results):
                     covariance, at = s[at], at + 1
                 cov[r, a * n + b] = cov[r, b * n + a] = covariance
         n_effective[r, 0] = np.inf
+    if to[RESULTS.state] != 0:
+        state, k = reals_at(to[RESULTS.state], (1 + machine.size,)), _n_steps(table)
+        set_all(state, np.nan)
+        if health[0, 1] == NONE:
+            state[0] = k
+            copy(tape[k - table.first + steps.size], state[1:])
     return OK
 
 
