@@ -30,7 +30,8 @@ from pymc_statespace_filters.compiler.native.entry_point import (
 ALONG_ARGUMENTS = {
     "W": F64_PTR, "steps": I64_PTR, "row_width": types.intp, "n_rows": types.intp,
     "first": types.intp, "observed": F64_PTR, "inputs": F64_PTR, "noises": F64_PTR,
-    "states": F64_PTR, "stride": types.intp, "t0": types.float64, "dt": types.float64, "terms": F64_PTR,
+    "states": F64_PTR, "stride": types.intp, "t0": types.float64, "dt": types.float64,
+    "terms": F64_PTR,
 }  # fmt: skip
 """The step of row j is ``steps[j * row_width]``, and ``first`` that of the state at the start of a
 forward pass; a way back ends at step 0. Successive states are ``stride`` numbers apart on
