@@ -8,7 +8,7 @@ of the package's compiled code.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pymc_statespace_filters.errors import ModelError
+from .errors import ModelError
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Diagnostics of filter and model by one-step-ahead prediction of the observations."""
 
-from pymc_statespace_filters.diagnostics.cross_validation import leave_future_out
-from pymc_statespace_filters.diagnostics.filter_health import filter_diagnostics
-from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import compute_log_likelihood
+from .cross_validation import leave_future_out
+from .filter_health import filter_diagnostics
+from .pointwise_log_likelihood import compute_log_likelihood
 
 __all__ = ["compute_log_likelihood", "filter_diagnostics", "leave_future_out"]

@@ -11,16 +11,13 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.diagnostics.pointwise_log_likelihood import (
-    SEQUENTIAL,
-    sequential_terms,
-)
-from pymc_statespace_filters.diagnostics.truncated_data import observed_values, truncate_data
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.variable import select_variables
-from pymc_statespace_filters.system.checks import is_integer
+from ..errors import EvidenceWarning, ModelError
+from ..pymc_model.state_graphs import StateSpaceVariable
+from ..states.draws import select_draws
+from ..states.variable import select_variables
+from ..system.checks import is_integer
+from .pointwise_log_likelihood import SEQUENTIAL, sequential_terms
+from .truncated_data import observed_values, truncate_data
 
 Refit = Callable[[pm.Model], xr.DataTree]
 

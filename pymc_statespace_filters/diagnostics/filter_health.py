@@ -6,39 +6,24 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.diagnostics.calibration import (
-    coverage_of,
-    uniformity_of,
-    whiteness_of,
-)
-from pymc_statespace_filters.diagnostics.innovations import (
+from ..filters.outcomes import COLLAPSED
+from ..filters.protocol import HealthFilter
+from ..pymc_model.state_graphs import StateSpaceVariable
+from ..states.draws import select_draws
+from ..states.groups import add_group, by_record, join_rows, row_coords
+from ..states.record import Array, RecordAtDraws, States, TermHealthAtDraws, simulate_observations
+from ..states.variable import VariableAtDraws, select_variables
+from ..system.accumulators import inputs_of_user
+from ..system.checks import check_random_seed
+from .calibration import coverage_of, uniformity_of, whiteness_of
+from .innovations import (
     autocorrelation_of,
     input_correlation_of,
     inputs_before,
     lags_of,
     standardised,
 )
-from pymc_statespace_filters.diagnostics.predictions import (
-    Calibration,
-    calibration_by_rank,
-    calibration_of,
-    laws_of,
-)
-from pymc_statespace_filters.filters.outcomes import COLLAPSED
-from pymc_statespace_filters.filters.protocol import HealthFilter
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import add_group, by_record, join_rows, row_coords
-from pymc_statespace_filters.states.record import (
-    Array,
-    RecordAtDraws,
-    States,
-    TermHealthAtDraws,
-    simulate_observations,
-)
-from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
-from pymc_statespace_filters.system.accumulators import inputs_of_user
-from pymc_statespace_filters.system.checks import check_random_seed
+from .predictions import Calibration, calibration_by_rank, calibration_of, laws_of
 
 PROBS = (0.5, 0.9)  # of the prediction intervals
 PREDICTION_NOTE = (

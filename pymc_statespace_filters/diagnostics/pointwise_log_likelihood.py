@@ -4,12 +4,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, terms_of
-from pymc_statespace_filters.states.draws import PosteriorDraws, select_draws
-from pymc_statespace_filters.states.groups import add_group, row_coords
-from pymc_statespace_filters.states.record import Array, Graphs
-from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
+from ..errors import ModelError
+from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
+from ..states.draws import PosteriorDraws, select_draws
+from ..states.groups import add_group, row_coords
+from ..states.record import Array, Graphs
+from ..states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
     "log p(d_j | d_1 .. d_{j-1}, theta): each term is conditional on all earlier observations. "

@@ -7,14 +7,14 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
-from pymc_statespace_filters.diagnostics.calibration import pit_of, residual_limit
-from pymc_statespace_filters.pymc_model.prediction_graphs import (
+from ..pymc_model.prediction_graphs import (
     exact_predictions,
     gaussian_predictions,
     observations_given,
 )
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws, States
+from ..pymc_model.state_graphs import StateSpaceVariable
+from ..states.record import Array, Graphs, RecordAtDraws, States
+from .calibration import pit_of, residual_limit
 
 # Fewer draws than this behind the probability of a tail, and one of them decides it.
 _LEAST_DRAWS = 3.0

@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import FilterWarning
-from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES, NO_FINITE_MEMBER
-from pymc_statespace_filters.filters.protocol import HealthFilter
-from pymc_statespace_filters.filters.recommendation import (
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import FilterWarning
+from ..filters.outcomes import COLLAPSED, FAILURES, NO_FINITE_MEMBER
+from ..filters.protocol import HealthFilter
+from ..filters.recommendation import (
     collapse_remedy,
     exact_filter,
     jump_problem,
     repetition_problem,
     short_form,
 )
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.diagnostics import TermHealth
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..ops.base import evaluator
+from ..ops.diagnostics import TermHealth
+from ..ops.likelihood import LogLikelihood
+from ..system.model import StateSpaceModel
 
 type Arguments = tuple[Any, ...]
 

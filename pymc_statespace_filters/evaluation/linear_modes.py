@@ -9,12 +9,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.rest_points import VectorField, rest_points, vector_field
-from pymc_statespace_filters.system.checks import shortened
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_system
+from ..errors import ModelError
+from ..system.checks import shortened
+from ..system.model import StateSpaceModel
+from ..system.parameters import flat_parameters
+from ..system.record import check_system
+from .rest_points import VectorField, rest_points, vector_field
 
 INTERVAL = (0.05, 0.95)  # quantiles of the draws
 

@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
-from pymc_statespace_filters.filters.outcomes import COLLAPSED, NONE
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
-from pymc_statespace_filters.filters.records import single_records
-from pymc_statespace_filters.ops.base import HEALTH_SIZE, evaluator
-from pymc_statespace_filters.ops.batch import BatchLogLikelihood, has_batch
-from pymc_statespace_filters.ops.distributed import check_ranks, distributed_evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
-from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
-from pymc_statespace_filters.system.checks import check_count
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import CheckedPanel, checked_panel
-from pymc_statespace_filters.system.panel_parameters import panel_parameters
-from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_seed, checked_record
+from ..errors import DataMismatchError, ModelError
+from ..filters.outcomes import COLLAPSED, NONE
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_system_and_filter
+from ..filters.records import single_records
+from ..ops.base import HEALTH_SIZE, evaluator
+from ..ops.batch import BatchLogLikelihood, has_batch
+from ..ops.distributed import check_ranks, distributed_evaluator
+from ..ops.likelihood import LogLikelihood
+from ..ops.panel import PanelLogLikelihood
+from ..parallel.communicator import Communicator, communicator_of
+from ..system.checks import check_count
+from ..system.model import StateSpaceModel
+from ..system.panel import CheckedPanel, checked_panel
+from ..system.panel_parameters import panel_parameters
+from ..system.parameters import flat_parameters
+from ..system.record import check_seed, checked_record
+from .filter_warnings import warn_about, warn_of_choice
 
 
 def log_likelihood(

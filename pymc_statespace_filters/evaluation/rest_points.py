@@ -8,12 +8,12 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
-from pymc_statespace_filters.compiler.native.rows import interpreted_at_points
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.equations import as_vector
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.signature import parameter_symbols
+from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
+from ..compiler.native.rows import interpreted_at_points
+from ..errors import ModelError
+from ..system.equations import as_vector
+from ..system.model import StateSpaceModel
+from ..system.signature import parameter_symbols
 
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 30  # of a step of Newton's method that does not lead closer

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..errors import ModelError
+from ..filters.protocol import Filter
+from ..system.model import StateSpaceModel
 
 STATE, _RECORD = "filter_state", "filter_state_record"
 

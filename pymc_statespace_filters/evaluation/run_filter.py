@@ -7,26 +7,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about, warn_of_choice
-from pymc_statespace_filters.evaluation.resumption import (
-    attributes,
-    going_on,
-    resumes,
-    states_before,
-    stored,
-)
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
-from pymc_statespace_filters.filters.records import single_records
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.states import FilterRun, ResumableRun
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import checked_panel, row_coords
-from pymc_statespace_filters.system.panel_parameters import panel_parameters
-from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_seed, checked_record
-from pymc_statespace_filters.system.steps import check_at, rows_at
+from ..errors import ModelError
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_system_and_filter
+from ..filters.records import single_records
+from ..ops.base import evaluator
+from ..ops.states import FilterRun, ResumableRun
+from ..system.model import StateSpaceModel
+from ..system.panel import checked_panel, row_coords
+from ..system.panel_parameters import panel_parameters
+from ..system.parameters import flat_parameters
+from ..system.record import check_seed, checked_record
+from ..system.steps import check_at, rows_at
+from .filter_warnings import warn_about, warn_of_choice
+from .resumption import attributes, going_on, resumes, states_before, stored
 
 
 def run_filter(

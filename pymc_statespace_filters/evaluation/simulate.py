@@ -7,34 +7,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    MemberArguments,
-    jit,
-)
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
-from pymc_statespace_filters.compiler.lowering.observation_sampler import distribution_sampler
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import (
-    address_of,
-    cached_on_disk,
-    call_address,
-)
-from pymc_statespace_filters.compiler.native.jit import copy_into
-from pymc_statespace_filters.compiler.native.python_call import call_in_thread, call_machine_code
-from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.records import single_records
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.progress import slow_compilation
-from pymc_statespace_filters.system.checks import check_finite, check_flag, check_random_seed
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import checked_panel, row_coords
-from pymc_statespace_filters.system.panel_parameters import panel_parameters
-from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import check_inputs, check_system
-from pymc_statespace_filters.system.steps import steps_of
+from ..compiler.codegen.function_types import CompiledFunction, MemberArguments, jit
+from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.lowering.entry_points import entry_point
+from ..compiler.lowering.observation_sampler import distribution_sampler
+from ..compiler.native.cache_key import key_of
+from ..compiler.native.entry_point import address_of, cached_on_disk, call_address
+from ..compiler.native.jit import copy_into
+from ..compiler.native.python_call import call_in_thread, call_machine_code
+from ..compiler.numerics.record_noise import generators_of_records
+from ..errors import ModelError
+from ..filters.records import single_records
+from ..parallel.signals import held_interrupts
+from ..progress import slow_compilation
+from ..system.checks import check_finite, check_flag, check_random_seed
+from ..system.model import StateSpaceModel
+from ..system.panel import checked_panel, row_coords
+from ..system.panel_parameters import panel_parameters
+from ..system.parameters import flat_parameters
+from ..system.record import check_inputs, check_system
+from ..system.steps import steps_of
 
 _MANY_STEPS = 100_000  # some milliseconds at the least
 

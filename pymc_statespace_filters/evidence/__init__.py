@@ -1,19 +1,15 @@
 """Evidence of a model from posterior draws, and model comparison by evidence."""
 
-from pymc_statespace_filters.evidence.comparison import (
+from .comparison import (
     DimensionCorrection,
     average_models,
     compare_evidence,
     marginal_modes,
     prior_sensitivity,
 )
-from pymc_statespace_filters.evidence.estimation import (
-    EvidenceEstimates,
-    chib_jeliazkov,
-    estimate_evidence,
-)
-from pymc_statespace_filters.evidence.evidence import Evidence
-from pymc_statespace_filters.evidence.shorter_steps import step_error
+from .estimation import EvidenceEstimates, chib_jeliazkov, estimate_evidence
+from .evidence import Evidence
+from .shorter_steps import step_error
 
 __all__ = [
     "DimensionCorrection",

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2
 
-from pymc_statespace_filters.evidence.evidence import Evidence
+from .evidence import Evidence
 
 # One false alarm in a thousand sets of estimates; none for differences too small to matter.
 LEVEL = 0.001

@@ -9,20 +9,20 @@ import pandas as pd
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.compiler.native.compilation import COMPILATION
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.agreement import Agreement, assess_agreement
-from pymc_statespace_filters.evidence.estimators.bridge import Bridge
-from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.estimators.laplace import Laplace
-from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
-from pymc_statespace_filters.evidence.estimators.protocol import Estimator
-from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
-from pymc_statespace_filters.evidence.evidence import Evidence
-from pymc_statespace_filters.evidence.runner import run_estimators
-from pymc_statespace_filters.parallel.cpu_affinity import cores_set_to
-from pymc_statespace_filters.system.checks import check_count, check_positive
+from ..compiler.native.compilation import COMPILATION
+from ..errors import EvidenceWarning, ModelError
+from ..parallel.cpu_affinity import cores_set_to
+from ..system.checks import check_count, check_positive
+from .agreement import Agreement, assess_agreement
+from .estimators.bridge import Bridge
+from .estimators.chib_jeliazkov import ChibJeliazkov
+from .estimators.importance import Importance
+from .estimators.laplace import Laplace
+from .estimators.prior_monte_carlo import PriorMonteCarlo
+from .estimators.protocol import Estimator
+from .estimators.tempered_smc import TemperedSMC
+from .evidence import Evidence
+from .runner import run_estimators
 
 _BUILT_IN: tuple[Estimator, ...] = (
     ChibJeliazkov(),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
+from ..errors import ModelError
 
 GROUP = "evidence"
 NOISE = ("none", "refreshed", "held")

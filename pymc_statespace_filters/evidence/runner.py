@@ -10,29 +10,19 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.checks.convergence import check_convergence
-from pymc_statespace_filters.evidence.checks.discretisation import check_discretisation
-from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
-    N_EVALUATIONS,
-    max_log_likelihood,
-)
-from pymc_statespace_filters.evidence.estimators.protocol import (
-    Estimate,
-    Estimator,
-    uses_draws,
-)
-from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, build_posterior
-from pymc_statespace_filters.evidence.posterior.observed_data import (
-    data_fingerprint,
-    observation_count,
-)
-from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.density import ModelDensity
-from pymc_statespace_filters.pymc_model.inspection import exactness
-from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
-from pymc_statespace_filters.pymc_model.support import Support
+from ..errors import EvidenceWarning, ModelError
+from ..progress import row_progress
+from ..pymc_model.density import ModelDensity
+from ..pymc_model.inspection import exactness
+from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
+from ..pymc_model.support import Support
+from .checks.convergence import check_convergence
+from .checks.discretisation import check_discretisation
+from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
+from .estimators.protocol import Estimate, Estimator, uses_draws
+from .evidence import Evidence, store_evidence
+from .posterior.draws import Posterior, build_posterior
+from .posterior.observed_data import data_fingerprint, observation_count
 
 MAXIMUM = "maximum likelihood"
 SHARED = "shared proposals"

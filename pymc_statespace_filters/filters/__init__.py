@@ -4,18 +4,18 @@
 with members everything but its update; a filter of another kind satisfies `Filter` by itself.
 """
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction
-from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.filters.ekf import EKF
-from pymc_statespace_filters.filters.enkf import EnKF
-from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
-from pymc_statespace_filters.filters.ensemble.loop import Outcome, ensemble_filter, failed
-from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
-from pymc_statespace_filters.filters.grid import GridFilter
-from pymc_statespace_filters.filters.guided_pf import GuidedPF
-from pymc_statespace_filters.filters.iplf import IPLF
-from pymc_statespace_filters.filters.pf_enkf import PFEnKF
-from pymc_statespace_filters.filters.protocol import (
+from ..compiler.codegen.function_types import CompiledFunction
+from .bootstrap import BootstrapPF
+from .ekf import EKF
+from .enkf import EnKF
+from .ensemble.base import EnsembleFilterBase
+from .ensemble.loop import Outcome, ensemble_filter, failed
+from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .grid import GridFilter
+from .guided_pf import GuidedPF
+from .iplf import IPLF
+from .pf_enkf import PFEnKF
+from .protocol import (
     BatchFilter,
     DifferentiableFilter,
     EnsembleFilter,
@@ -26,7 +26,7 @@ from pymc_statespace_filters.filters.protocol import (
     StatesFilter,
     System,
 )
-from pymc_statespace_filters.filters.ukf import UKF
+from .ukf import UKF
 
 __all__ = [
     "EKF",

@@ -5,15 +5,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
-from pymc_statespace_filters.filters.ensemble.loop import Outcome, failed
-from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
-from pymc_statespace_filters.filters.ensemble.reductions import count
-from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
-from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters.plan import log_density
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.jit import njit_internal
+from .ensemble.kalman_update import mark_finite
+from .ensemble.loop import Outcome, failed
+from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .ensemble.reductions import count
+from .ensemble.weights import normalise_weights
+from .outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .plan import log_density
 
 
 @njit_internal

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, pointer
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
+from ..compiler.native.entry_point import EntryPoint, pointer
+from ..compiler.native.jit import njit_internal
+from ..compiler.native.plan import (
     DAMAGED,
     HEALTH_SIZE,
     INPUT_COLUMNS,
@@ -27,10 +27,10 @@ from pymc_statespace_filters.compiler.native.plan import (
     plan_entry,
     plan_words,
 )
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
-from pymc_statespace_filters.filters.outcomes import NONE, OUT_OF_MEMORY
-from pymc_statespace_filters.filters.plan import PLAN, VERSION
-from pymc_statespace_filters.system import panel
+from ..compiler.numerics.record_noise import seed_of_record
+from ..system import panel
+from .outcomes import NONE, OUT_OF_MEMORY
+from .plan import PLAN, VERSION
 
 OK = np.int64(0)
 ALL_STEPS = np.int64(np.iinfo(np.int64).max)

@@ -6,22 +6,11 @@ from typing import ClassVar
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.symbols import (
-    call,
-    jacobian_of,
-    observation_moments,
-    process_noise_cov,
-)
-from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
-from pymc_statespace_filters.filters.gaussian.linearization import (
-    GaussianState,
-    Linear,
-    Seen,
-    Symbols,
-    seen,
-)
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.symbols import call, jacobian_of, observation_moments, process_noise_cov
+from ..system.model import StateSpaceModel
+from .gaussian.base import GaussianFilterBase
+from .gaussian.linearization import GaussianState, Linear, Seen, Symbols, seen
+from .protocol import System
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,14 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.compiler.numerics.small_cholesky import log_gaussian
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.ancestral_smoother import (
-    CARRY_PAST,
-    NO_LAG,
-    SMOOTH,
-)
-from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
-from pymc_statespace_filters.filters.ensemble.kalman_update import (
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.jit import njit_internal
+from ..compiler.native.plan import Plan
+from ..compiler.numerics.small_cholesky import log_gaussian
+from ..errors import ModelError
+from .ensemble.ancestral_smoother import CARRY_PAST, NO_LAG, SMOOTH
+from .ensemble.base import EnsembleFilterBase
+from .ensemble.kalman_update import (
     Moments,
     check_simulated_observations,
     forecast_covariances,
@@ -27,17 +23,12 @@ from pymc_statespace_filters.filters.ensemble.kalman_update import (
     mark_finite,
     moments_workspace,
 )
-from pymc_statespace_filters.filters.ensemble.loop import Outcome, ensemble_filter, failed
-from pymc_statespace_filters.filters.ensemble.noise import NoiseSizes, observation_normals
-from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NO_FINITE_MEMBER,
-    NONE,
-    ZERO_WEIGHTS,
-)
-from pymc_statespace_filters.filters.plan import log_density, observe
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.filters.settings import check_choice, check_count
+from .ensemble.loop import Outcome, ensemble_filter, failed
+from .ensemble.noise import NoiseSizes, observation_normals
+from .outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .plan import log_density, observe
+from .protocol import System
+from .settings import check_choice, check_count
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0

@@ -1,7 +1,7 @@
 """Signatures of the functions that a plan computes; see the functions of `filters.protocol`."""
 
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
+from ..compiler.native.plan import Plan
+from ..compiler.native.planned_function import PlannedFunction
 
 _DATA = (("observed", 2), ("inputs", 2), ("t0", 0))
 _RECORD = (("theta", 1), ("steps", 1), *_DATA)

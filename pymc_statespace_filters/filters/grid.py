@@ -17,16 +17,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.calls import OK, likelihood_entry
-from pymc_statespace_filters.filters.functions import likelihood, predictions, run, states
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE
-from pymc_statespace_filters.filters.plan import make_plan, read_system, settings_of
-from pymc_statespace_filters.filters.point_mass.forward_pass import (
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.jit import njit_internal
+from ..compiler.native.plan import Plan
+from ..compiler.native.planned_function import PlannedFunction
+from ..errors import ModelError
+from .calls import OK, likelihood_entry
+from .functions import likelihood, predictions, run, states
+from .outcomes import COVARIANCE_NOT_POSITIVE
+from .plan import make_plan, read_system, settings_of
+from .point_mass.forward_pass import (
     END,
     ON_GRID,
     ON_SEGMENTS,
@@ -36,15 +36,12 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     next_attempt,
     write_outcome,
 )
-from pymc_statespace_filters.filters.point_mass.predictions import GRID_PREDICTIONS
-from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
-from pymc_statespace_filters.filters.point_mass.rows import FILTERED, MOMENTS
-from pymc_statespace_filters.filters.point_mass.segment_pass import (
-    discard_segments,
-    pass_on_segments,
-)
-from pymc_statespace_filters.filters.point_mass.states import GRID_RUN, GRID_STATES
-from pymc_statespace_filters.filters.protocol import System
+from .point_mass.predictions import GRID_PREDICTIONS
+from .point_mass.recursion import has_valid_covariances
+from .point_mass.rows import FILTERED, MOMENTS
+from .point_mass.segment_pass import discard_segments, pass_on_segments
+from .point_mass.states import GRID_RUN, GRID_STATES
+from .protocol import System
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
 _WITH_KINKS = 1e-5

@@ -12,28 +12,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import NORMALS
-from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.bootstrap import update
-from pymc_statespace_filters.filters.calls import OK, likelihood_entry
-from pymc_statespace_filters.filters.ensemble.callbacks import (
-    ENDED,
-    RESAMPLED,
-    UPDATED,
-    emit,
-)
-from pymc_statespace_filters.filters.ensemble.defence import (
-    NOBODY,
-    UNGUIDED,
-    first_unguided,
-    is_doubtful,
-    unguided_at_start,
-)
-from pymc_statespace_filters.filters.ensemble.guide import make_guide
-from pymc_statespace_filters.filters.ensemble.guided_moves import (
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.jit import njit_internal
+from ..compiler.native.plan import NORMALS
+from ..compiler.numerics.normals import FILL_NORMALS
+from ..errors import ModelError
+from .bootstrap import update
+from .calls import OK, likelihood_entry
+from .ensemble.callbacks import ENDED, RESAMPLED, UPDATED, emit
+from .ensemble.defence import NOBODY, UNGUIDED, first_unguided, is_doubtful, unguided_at_start
+from .ensemble.guide import make_guide
+from .ensemble.guided_moves import (
     begin_interval,
     emit_forecast,
     guided_particles,
@@ -43,25 +32,15 @@ from pymc_statespace_filters.filters.ensemble.guided_moves import (
     start,
     weigh_moves,
 )
-from pymc_statespace_filters.filters.ensemble.guided_predictions import (
-    copy_again,
-    predict,
-    start_copies,
-)
-from pymc_statespace_filters.filters.ensemble.loop import (
-    N_LEADING,
-    n_sums,
-    noise_of_rank,
-    observer_of,
-    rank_of,
-)
-from pymc_statespace_filters.filters.ensemble.noise import initial_rows, resampling_normals
-from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter
-from pymc_statespace_filters.filters.ensemble.reductions import local_partition
-from pymc_statespace_filters.filters.ensemble.resampling import resampler
-from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.plan import PLAN, read_system, settings_of
-from pymc_statespace_filters.filters.protocol import System
+from .ensemble.guided_predictions import copy_again, predict, start_copies
+from .ensemble.loop import N_LEADING, n_sums, noise_of_rank, observer_of, rank_of
+from .ensemble.noise import initial_rows, resampling_normals
+from .ensemble.particle_filter import ParticleFilter
+from .ensemble.reductions import local_partition
+from .ensemble.resampling import resampler
+from .outcomes import NONE, is_missing
+from .plan import PLAN, read_system, settings_of
+from .protocol import System
 
 
 @njit_internal

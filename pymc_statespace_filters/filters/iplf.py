@@ -16,27 +16,16 @@ from pytensor.gradient import disconnected_grad
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.conditional_moments import (
-    conditional_moments,
-    unknown_moments,
-)
-from pymc_statespace_filters.compiler.lowering.gaussian import differentiable_log_density
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
-from pymc_statespace_filters.filters.gaussian.linearization import (
-    GaussianState,
-    Seen,
-    Symbols,
-    seen,
-)
-from pymc_statespace_filters.filters.gaussian.sigma_points import (
-    SigmaPoints,
-    at_points,
-)
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.system.checks import check_count
-from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.conditional_moments import conditional_moments, unknown_moments
+from ..compiler.lowering.gaussian import differentiable_log_density
+from ..errors import ModelError
+from ..system.checks import check_count
+from ..system.distributions import SCALAR_LAWS, law_name
+from ..system.model import StateSpaceModel
+from .gaussian.base import GaussianFilterBase
+from .gaussian.linearization import GaussianState, Seen, Symbols, seen
+from .gaussian.sigma_points import SigmaPoints, at_points
+from .protocol import System
 
 _MOST_ITERATIONS = 1000
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from ..compiler.native.jit import inline_always
 
 # Fewer effective particles than this behind a term, and one of them decides it.
 COLLAPSED = 3.0

@@ -5,31 +5,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.filters.ensemble.kalman_update import (
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.jit import njit_internal
+from ..errors import ModelError
+from .bootstrap import BootstrapPF
+from .ensemble.kalman_update import (
     copy_members,
     forecast_covariances,
     forecast_means,
     kalman_update,
     mark_finite,
 )
-from pymc_statespace_filters.filters.ensemble.loop import Outcome, failed
-from pymc_statespace_filters.filters.ensemble.noise import observation_normals
-from pymc_statespace_filters.filters.ensemble.particle_filter import ParticleFilter, particle_filter
-from pymc_statespace_filters.filters.ensemble.reductions import count
-from pymc_statespace_filters.filters.ensemble.weights import log_sum, normalise_weights
-from pymc_statespace_filters.filters.kernel_density.density import density_method
-from pymc_statespace_filters.filters.kernel_density.importance_weights import (
-    importance_workspace,
-    reweight,
-)
-from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
-from pymc_statespace_filters.filters.plan import log_density, observe
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.filters.settings import check_choice
+from .ensemble.loop import Outcome, failed
+from .ensemble.noise import observation_normals
+from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .ensemble.reductions import count
+from .ensemble.weights import log_sum, normalise_weights
+from .kernel_density.density import density_method
+from .kernel_density.importance_weights import importance_workspace, reweight
+from .outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .plan import log_density, observe
+from .protocol import System
+from .settings import check_choice
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 

@@ -9,17 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import MemberArguments
-from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
-from pymc_statespace_filters.compiler.lowering.guide_loops import (
-    FollowArguments,
-    LookBackArguments,
-)
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint, call_address
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import N_HEADER, Plan, version_of
-from pymc_statespace_filters.filters.protocol import System
+from ..compiler.codegen.function_types import MemberArguments
+from ..compiler.lowering.entry_points import entry_point
+from ..compiler.lowering.guide_loops import FollowArguments, LookBackArguments
+from ..compiler.native.cache_key import key_of
+from ..compiler.native.entry_point import EntryPoint, call_address
+from ..compiler.native.jit import njit_internal
+from ..compiler.native.plan import N_HEADER, Plan, version_of
+from .protocol import System
 
 
 class PlanSlots(NamedTuple):

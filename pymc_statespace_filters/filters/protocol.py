@@ -19,13 +19,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    MemberFunction,
-    ParameterFunction,
-)
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.errors import ModelError
+from ..compiler.codegen.function_types import CompiledFunction, MemberFunction, ParameterFunction
+from ..compiler.native.planned_function import PlannedFunction
+from ..errors import ModelError
 
 type Array = NDArray[np.float64]
 type Integers = NDArray[np.int64]

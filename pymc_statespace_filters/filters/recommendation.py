@@ -7,19 +7,19 @@ from collections.abc import Iterable
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.bootstrap import BootstrapPF
-from pymc_statespace_filters.filters.ekf import EKF
-from pymc_statespace_filters.filters.enkf import EnKF
-from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
-from pymc_statespace_filters.filters.grid import GridFilter
-from pymc_statespace_filters.filters.guided_pf import GuidedPF
-from pymc_statespace_filters.filters.iplf import IPLF
-from pymc_statespace_filters.filters.pf_enkf import PFEnKF
-from pymc_statespace_filters.filters.protocol import Filter, System, check_filter
-from pymc_statespace_filters.filters.ukf import UKF
-from pymc_statespace_filters.system.record import check_system
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import ModelError
+from ..system.record import check_system
+from .bootstrap import BootstrapPF
+from .ekf import EKF
+from .enkf import EnKF
+from .gaussian.base import GaussianFilterBase
+from .grid import GridFilter
+from .guided_pf import GuidedPF
+from .iplf import IPLF
+from .pf_enkf import PFEnKF
+from .protocol import Filter, System, check_filter
+from .ukf import UKF
 
 # In the order in which messages name them, with a first number of particles.
 FILTERS: tuple[Filter, ...] = (

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import jit
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP, CheckedPanel
+from ..compiler.codegen.function_types import jit
+from ..compiler.numerics.record_noise import seed_of_record
+from ..system.panel import FIRST_INPUT, RECORD, STEP, CheckedPanel
+from .outcomes import NONE
 
 
 @jit

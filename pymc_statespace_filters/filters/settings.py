@@ -5,8 +5,8 @@ from numbers import Real
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import is_integer
+from ..errors import ModelError
+from ..system.checks import is_integer
 
 MOST_MEMBERS = 10**8
 

@@ -7,22 +7,13 @@ nonlinear estimation" (2000). Points, weights and regression are in `gaussian.si
 
 from dataclasses import dataclass
 
-from pymc_statespace_filters.compiler.lowering.symbols import observation_moments
-from pymc_statespace_filters.filters.gaussian.base import GaussianFilterBase
-from pymc_statespace_filters.filters.gaussian.linearization import (
-    GaussianState,
-    Seen,
-    Symbols,
-    seen,
-)
-from pymc_statespace_filters.filters.gaussian.sigma_points import (
-    SigmaPoints,
-    at_points,
-    check_kappa,
-)
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.system.checks import check_finite, check_positive
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.symbols import observation_moments
+from ..system.checks import check_finite, check_positive
+from ..system.model import StateSpaceModel
+from .gaussian.base import GaussianFilterBase
+from .gaussian.linearization import GaussianState, Seen, Symbols, seen
+from .gaussian.sigma_points import SigmaPoints, at_points, check_kappa
+from .protocol import System
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,22 +18,19 @@ from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 from pytensor.tensor.type import TensorType
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.compiled_system import (
-    CompiledSystem,
-    compile_system,
-)
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.compilation import COMPILATION
-from pymc_statespace_filters.compiler.native.entry_point import cached_on_disk
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.compiler.native.python_call import TimedCall, call_machine_code
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Compiled, Filter
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.progress import slow_compilation
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
+from ..compiler.codegen.function_types import CompiledFunction, jit
+from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
+from ..compiler.native.cache_key import key_of
+from ..compiler.native.compilation import COMPILATION
+from ..compiler.native.entry_point import cached_on_disk
+from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.native.python_call import TimedCall, call_machine_code
+from ..errors import ModelError
+from ..filters.protocol import Compiled, Filter
+from ..parallel.signals import held_interrupts
+from ..progress import slow_compilation
+from ..system.model import StateSpaceModel
+from ..system.panel import FIRST_INPUT, N_COLUMNS, RECORD, STEP
 
 HEALTH_SIZE = 3
 _READY = 0x0001 | 0x0100 | 0x0400  # flags of NumPy: contiguous in C's order, aligned, writeable

@@ -8,15 +8,10 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.blockwise import Blockwise
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import BatchFilter, Compiled
-from pymc_statespace_filters.ops.base import (
-    HEALTH_SIZE,
-    RECORD_INPUTS,
-    FilterOp,
-    theta_cotangent_only,
-)
-from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
+from ..compiler.lowering.compiled_system import CompiledSystem
+from ..filters.protocol import BatchFilter, Compiled
+from .base import HEALTH_SIZE, RECORD_INPUTS, FilterOp, theta_cotangent_only
+from .likelihood import LogLikelihood, LogLikelihoodGradient
 
 
 class BatchLogLikelihood(FilterOp):

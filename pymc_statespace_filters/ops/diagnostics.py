@@ -2,9 +2,9 @@
 
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import Compiled, HealthFilter, PredictionFilter
-from pymc_statespace_filters.ops.base import FilterOp
+from ..compiler.lowering.compiled_system import CompiledSystem
+from ..filters.protocol import Compiled, HealthFilter, PredictionFilter
+from .base import FilterOp
 
 
 class TermHealth(FilterOp):

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.plan import (
+from ..compiler.native.plan import (
     N_RECORD,
     N_REQUEST,
     N_RESULTS,
@@ -23,13 +23,13 @@ from pymc_statespace_filters.compiler.native.plan import (
     RESULTS,
     PlanFunction,
 )
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
-from pymc_statespace_filters.filters.recommendation import short_form
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..errors import ModelError
+from ..filters.protocol import EnsembleFilter, Filter
+from ..filters.recommendation import short_form
+from ..parallel.communicator import Communicator
+from ..system.model import StateSpaceModel
+from .base import RECORD_INPUTS, evaluator
+from .likelihood import LogLikelihood
 
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 

@@ -17,18 +17,18 @@ from jax.custom_derivatives import SymbolicZero
 from jax.experimental.buffer_callback import buffer_callback
 from pytensor.link.jax.dispatch import jax_funcify
 
-from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
-from pymc_statespace_filters.ops.base import HEALTH_SIZE
-from pymc_statespace_filters.ops.batch import BatchLogLikelihood
-from pymc_statespace_filters.ops.likelihood import (
+from ..errors import GradientUnavailableError, ModelError
+from .base import HEALTH_SIZE
+from .batch import BatchLogLikelihood
+from .likelihood import (
     LogLikelihood,
     LogLikelihoodGradient,
     TapedLogLikelihood,
     TapePullback,
     check_has_gradient,
 )
-from pymc_statespace_filters.ops.many_points import gradients, values
-from pymc_statespace_filters.ops.panel import (
+from .many_points import gradients, values
+from .panel import (
     PanelLogLikelihood,
     PanelLogLikelihoodGradient,
     PanelTapePullback,

@@ -13,7 +13,7 @@ from pytensor.graph.rewriting.basic import graph_rewriter
 @graph_rewriter
 def import_conversions(fgraph: FunctionGraph) -> None:
     """Import the module that registers how operations are converted to JAX."""
-    from pymc_statespace_filters.ops import jax as jax
+    from . import jax as jax
 
 
 optdb.register("statespace_import_jax_conversions", import_conversions, "jax", position=0)

@@ -15,20 +15,11 @@ from pytensor.graph.fg import FunctionGraph
 from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.rewriting.basic import register_specialize
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import (
-    CompiledSystem,
-    compile_system,
-)
-from pymc_statespace_filters.errors import GradientUnavailableError
-from pymc_statespace_filters.filters.protocol import Compiled, DifferentiableFilter
-from pymc_statespace_filters.filters.recommendation import filters_for, listed, short_form
-from pymc_statespace_filters.ops.base import (
-    HEALTH_SIZE,
-    RECORD_INPUTS,
-    FilterOp,
-    ThetaDerivative,
-    theta_cotangent_only,
-)
+from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
+from ..errors import GradientUnavailableError
+from ..filters.protocol import Compiled, DifferentiableFilter
+from ..filters.recommendation import filters_for, listed, short_form
+from .base import HEALTH_SIZE, RECORD_INPUTS, FilterOp, ThetaDerivative, theta_cotangent_only
 
 
 class LogLikelihood(FilterOp):

@@ -10,16 +10,12 @@ from math import prod
 
 import numpy as np
 
-from pymc_statespace_filters.filters.protocol import BatchFilter, PanelFilter
-from pymc_statespace_filters.ops.base import FilterOp, evaluator
-from pymc_statespace_filters.ops.batch import BatchLogLikelihood
-from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
-from pymc_statespace_filters.ops.panel import (
-    PanelLogLikelihood,
-    PanelTapePullback,
-    TapedPanelLogLikelihood,
-)
-from pymc_statespace_filters.system.panel import N_COLUMNS, RECORD, STEP
+from ..filters.protocol import BatchFilter, PanelFilter
+from ..system.panel import N_COLUMNS, RECORD, STEP
+from .base import FilterOp, evaluator
+from .batch import BatchLogLikelihood
+from .likelihood import LogLikelihood, LogLikelihoodGradient
+from .panel import PanelLogLikelihood, PanelTapePullback, TapedPanelLogLikelihood
 
 type Arrays = Sequence[np.ndarray]
 type Shape = tuple[int, ...]

@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import Compiled, EnsembleFilter
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from ..compiler.lowering.compiled_system import CompiledSystem
+from ..filters.protocol import Compiled, EnsembleFilter
+from .base import RECORD_INPUTS, FilterOp
+from .likelihood import LogLikelihood
 
 
 class StoredNoise(FilterOp):

@@ -16,23 +16,23 @@ from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.rewriting.basic import register_specialize
 
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.filters.protocol import Compiled, PanelFilter
-from pymc_statespace_filters.filters.records import end_of_record, include_health, single_record
-from pymc_statespace_filters.ops.base import RECORD_INPUTS
-from pymc_statespace_filters.ops.likelihood import (
+from ..compiler.codegen.function_types import CompiledFunction, jit
+from ..compiler.lowering.compiled_system import CompiledSystem
+from ..compiler.native.cache_key import key_of
+from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.numerics.record_noise import seed_of_record
+from ..filters.outcomes import NONE
+from ..filters.protocol import Compiled, PanelFilter
+from ..filters.records import end_of_record, include_health, single_record
+from ..system.panel import RECORD
+from .base import RECORD_INPUTS
+from .likelihood import (
     LogLikelihood,
     LogLikelihoodGradient,
     TapedLogLikelihood,
     TapePullback,
     fused,
 )
-from pymc_statespace_filters.system.panel import RECORD
 
 PANEL_INPUTS = (("theta", "float64", 2), ("steps", "int64", 2), *RECORD_INPUTS[2:])
 _CHECKS = ("check_panel(theta, steps, inputs)", "check_observed(steps, observed)")

@@ -5,10 +5,10 @@ from typing import ClassVar
 import pytensor.tensor as pt
 from pytensor.tensor.type import TensorType
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import CompiledSystem
-from pymc_statespace_filters.filters.protocol import Compiled, RunFilter, StatesFilter
-from pymc_statespace_filters.ops.base import RECORD_INPUTS, FilterOp
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.compiled_system import CompiledSystem
+from ..filters.protocol import Compiled, RunFilter, StatesFilter
+from ..system.model import StateSpaceModel
+from .base import RECORD_INPUTS, FilterOp
 
 
 class States(FilterOp):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.parallel.mpi import mpi
+from .mpi import mpi
 
 _MAX_LAYOUTS = 256
 

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ParallelError
-from pymc_statespace_filters.parallel.allgather import ColumnAllgather
-from pymc_statespace_filters.parallel.environment import check_environments, describe_environment
-from pymc_statespace_filters.parallel.mpi import check_threads, mpi, mpi_communicator
+from ..errors import ParallelError
+from .allgather import ColumnAllgather
+from .environment import check_environments, describe_environment
+from .mpi import check_threads, mpi, mpi_communicator
 
 Result = TypeVar("Result")
 

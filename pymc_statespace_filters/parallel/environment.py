@@ -8,7 +8,7 @@ from zlib import crc32
 
 from numba.core.registry import cpu_target
 
-from pymc_statespace_filters.errors import ParallelError, ParallelWarning
+from ..errors import ParallelError, ParallelWarning
 
 _PACKAGES = ("pymc-statespace-filters", "pymc", "pytensor", "numba", "llvmlite", "numpy", "scipy")
 _PROCESSOR = "processor"

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import Any
 
-from pymc_statespace_filters.errors import ModelError, ParallelError
+from ..errors import ModelError, ParallelError
 
 WORLD = "world"
 

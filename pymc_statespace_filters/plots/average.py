@@ -11,17 +11,10 @@ from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import with_unit
-from pymc_statespace_filters.plots.canvas import (
-    BOUND,
-    band,
-    canvas,
-    curve,
-    format_probability,
-    size_of_panels,
-)
-from pymc_statespace_filters.plots.legend import add_legend
+from ..errors import ModelError
+from .axes import with_unit
+from .canvas import BOUND, band, canvas, curve, format_probability, size_of_panels
+from .legend import add_legend
 
 AVERAGE = "average"
 N_GRID = 512

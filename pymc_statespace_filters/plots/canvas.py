@@ -10,8 +10,8 @@ from arviz_base import rcParams
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from pymc_statespace_filters.plots.axes import STEPS, label_rows
-from pymc_statespace_filters.plots.legend import DOTS_PER_INCH
+from .axes import STEPS, label_rows
+from .legend import DOTS_PER_INCH
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4

@@ -10,10 +10,10 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xticks
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence import Evidence
-from pymc_statespace_filters.plots.axes import linear_ticks
-from pymc_statespace_filters.plots.canvas import annotate, canvas_of_rows, interval
+from ..errors import ModelError
+from ..evidence import Evidence
+from .axes import linear_ticks
+from .canvas import annotate, canvas_of_rows, interval
 
 N_TICKS = 5  # numbers of many digits beside each other
 

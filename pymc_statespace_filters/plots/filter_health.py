@@ -16,19 +16,12 @@ from arviz_stats.ecdf_utils import (
 )
 from scipy.stats import norm
 
-from pymc_statespace_filters.plots.axes import label_ticks, logarithmic_ticks, time_label
-from pymc_statespace_filters.plots.canvas import PANELS_IN_LINE, band, canvas, curve, interval
-from pymc_statespace_filters.plots.legend import add_legend, legend_style
-from pymc_statespace_filters.plots.marks import (
-    bars,
-    draw_bands,
-    draw_median,
-    over_draws,
-    point_size,
-    points,
-)
-from pymc_statespace_filters.plots.panels import one_record
-from pymc_statespace_filters.plots.results import group_of, rename_last_dims, variable_of
+from .axes import label_ticks, logarithmic_ticks, time_label
+from .canvas import PANELS_IN_LINE, band, canvas, curve, interval
+from .legend import add_legend, legend_style
+from .marks import bars, draw_bands, draw_median, over_draws, point_size, points
+from .panels import one_record
+from .results import group_of, rename_last_dims, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
 PROB, TAIL = 0.95, 1.96  # of the bands expected of a calibrated filter

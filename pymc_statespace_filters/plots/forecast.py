@@ -8,10 +8,11 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import label_axes, time_label
-from pymc_statespace_filters.plots.legend import add_legend, legend_style
-from pymc_statespace_filters.plots.marks import (
+from ..errors import ModelError
+from ..system.checks import check_count
+from .axes import label_axes, time_label
+from .legend import add_legend, legend_style
+from .marks import (
     DATA,
     TRUTH,
     canvas_over_time,
@@ -23,17 +24,9 @@ from pymc_statespace_filters.plots.marks import (
     point_size,
     points,
 )
-from pymc_statespace_filters.plots.panels import several_records
-from pymc_statespace_filters.plots.results import (
-    SAMPLE_DIMS,
-    data_of,
-    group_of,
-    rename_last_dims,
-    truth_of,
-    variable_of,
-)
-from pymc_statespace_filters.plots.transforms import axis_label, functions_of, transformed
-from pymc_statespace_filters.system.checks import check_count
+from .panels import several_records
+from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, truth_of, variable_of
+from .transforms import axis_label, functions_of, transformed
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations

@@ -8,9 +8,9 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from pymc_statespace_filters.plots.canvas import BOUND, band, canvas, curve, interval
-from pymc_statespace_filters.plots.legend import legend_style
-from pymc_statespace_filters.plots.results import SAMPLE_DIMS
+from .canvas import BOUND, band, canvas, curve, interval
+from .legend import legend_style
+from .results import SAMPLE_DIMS
 
 # Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
 DRAWS = {"color": "C0"}

@@ -10,14 +10,9 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.canvas import (
-    annotate,
-    canvas_of_rows,
-    format_probability,
-    interval,
-)
-from pymc_statespace_filters.plots.legend import add_legend, legend_style
+from ..errors import ModelError
+from .canvas import annotate, canvas_of_rows, format_probability, interval
+from .legend import add_legend, legend_style
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 STYLE = {"color": "C0"}

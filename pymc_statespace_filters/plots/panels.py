@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import unit_of
-from pymc_statespace_filters.plots.results import group_of
+from ..errors import ModelError
+from .axes import unit_of
+from .results import group_of
 
 MOST_RECORDS = 12  # that a figure shows unless others are chosen
 RECORDS_IN_LINE = 3

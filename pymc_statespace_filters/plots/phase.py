@@ -8,28 +8,14 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, labelled_y, line_xy
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import unit_of, with_unit
-from pymc_statespace_filters.plots.canvas import canvas
-from pymc_statespace_filters.plots.legend import add_legend
-from pymc_statespace_filters.plots.marks import (
-    DOTS,
-    PATHS,
-    TRUTH,
-    over_draws,
-    path_xy,
-    points_xy,
-    thin_draws,
-)
-from pymc_statespace_filters.plots.panels import one_record
-from pymc_statespace_filters.plots.results import (
-    SAMPLE_DIMS,
-    name_of_states,
-    select_names,
-    states_of,
-    truth_of,
-)
-from pymc_statespace_filters.system.checks import check_count
+from ..errors import ModelError
+from ..system.checks import check_count
+from .axes import unit_of, with_unit
+from .canvas import canvas
+from .legend import add_legend
+from .marks import DOTS, PATHS, TRUTH, over_draws, path_xy, points_xy, thin_draws
+from .panels import one_record
+from .results import SAMPLE_DIMS, name_of_states, select_names, states_of, truth_of
 
 
 def plot_phase(

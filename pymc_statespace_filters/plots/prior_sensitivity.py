@@ -10,12 +10,12 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, set_ylim
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence import prior_sensitivity
-from pymc_statespace_filters.evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
-from pymc_statespace_filters.plots.axes import logarithmic_ticks
-from pymc_statespace_filters.plots.canvas import band, canvas, curve, interval, size_of_panels
-from pymc_statespace_filters.plots.legend import add_legend
+from ..errors import ModelError
+from ..evidence import prior_sensitivity
+from ..evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
+from .axes import logarithmic_ticks
+from .canvas import band, canvas, curve, interval, size_of_panels
+from .legend import add_legend
 
 LABELS = {
     "prob": ("exponent", "exponent α of the correction"),

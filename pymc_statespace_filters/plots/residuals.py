@@ -9,20 +9,14 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
 
-from pymc_statespace_filters.diagnostics.innovations import standardised
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import few_ticks, label_x, time_label, unit_of, with_unit
-from pymc_statespace_filters.plots.canvas import band, canvas, interval
-from pymc_statespace_filters.plots.legend import add_legend
-from pymc_statespace_filters.plots.marks import bars, point_size, points, points_xy
-from pymc_statespace_filters.plots.panels import one_record
-from pymc_statespace_filters.plots.results import (
-    SAMPLE_DIMS,
-    data_of,
-    group_of,
-    rename_last_dims,
-    variable_of,
-)
+from ..diagnostics.innovations import standardised
+from ..errors import ModelError
+from .axes import few_ticks, label_x, time_label, unit_of, with_unit
+from .canvas import band, canvas, interval
+from .legend import add_legend
+from .marks import bars, point_size, points, points_xy
+from .panels import one_record
+from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, variable_of
 
 TAIL = 1.96  # of the 95 % band of a standard normal
 SEEN = {"color": "C0"}

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
+from ..errors import ModelError
 
 SAMPLE_DIMS = ("chain", "draw")
 CALLS = {  # that make the groups

@@ -6,19 +6,14 @@ from typing import Any
 import xarray as xr
 from arviz_plots import PlotCollection
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import label_axes, time_label
-from pymc_statespace_filters.plots.canvas import curve
-from pymc_statespace_filters.plots.legend import add_legend
-from pymc_statespace_filters.plots.marks import DRAWS, canvas_over_time, draw_data
-from pymc_statespace_filters.plots.panels import facets_of_simulation
-from pymc_statespace_filters.plots.results import measured_by, observations_of, select_names
-from pymc_statespace_filters.plots.transforms import (
-    axis_label,
-    functions_of,
-    of_record,
-    transformed,
-)
+from ..errors import ModelError
+from .axes import label_axes, time_label
+from .canvas import curve
+from .legend import add_legend
+from .marks import DRAWS, canvas_over_time, draw_data
+from .panels import facets_of_simulation
+from .results import measured_by, observations_of, select_names
+from .transforms import axis_label, functions_of, of_record, transformed
 
 PATH = {**DRAWS, "width": 1.5}
 

@@ -6,11 +6,12 @@ from typing import Any
 import xarray as xr
 from arviz_plots import PlotCollection
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import label_axes, time_label
-from pymc_statespace_filters.plots.canvas import curve
-from pymc_statespace_filters.plots.legend import add_legend
-from pymc_statespace_filters.plots.marks import (
+from ..errors import ModelError
+from ..system.checks import check_count
+from .axes import label_axes, time_label
+from .canvas import curve
+from .legend import add_legend
+from .marks import (
     DOTS,
     FEW,
     PATHS,
@@ -25,8 +26,8 @@ from pymc_statespace_filters.plots.marks import (
     points,
     thin_draws,
 )
-from pymc_statespace_filters.plots.panels import several_records
-from pymc_statespace_filters.plots.results import (
+from .panels import several_records
+from .results import (
     data_of,
     measured_by,
     name_of_states,
@@ -35,15 +36,8 @@ from pymc_statespace_filters.plots.results import (
     states_of,
     truth_of,
 )
-from pymc_statespace_filters.plots.simulation import draw_simulation, refuse_without_draws
-from pymc_statespace_filters.plots.transforms import (
-    Functions,
-    axis_label,
-    functions_of,
-    of_record,
-    transformed,
-)
-from pymc_statespace_filters.system.checks import check_count
+from .simulation import draw_simulation, refuse_without_draws
+from .transforms import Functions, axis_label, functions_of, of_record, transformed
 
 
 def plot_states(

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.plots.axes import unit_of, with_unit
-from pymc_statespace_filters.plots.results import check_names
+from ..errors import ModelError
+from .axes import unit_of, with_unit
+from .results import check_names
 
 Functions = Mapping[str, Callable[[Any], Any]]
 

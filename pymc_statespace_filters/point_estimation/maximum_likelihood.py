@@ -7,17 +7,17 @@ import pandas as pd
 from numpy.typing import NDArray
 from pymc.model import Model, modelcontext
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.point_estimation.estimate import MaximumLikelihoodEstimate
-from pymc_statespace_filters.point_estimation.noisy import maximize_estimated
-from pymc_statespace_filters.point_estimation.peak import Peak
-from pymc_statespace_filters.point_estimation.smooth import maximize_smooth
-from pymc_statespace_filters.point_estimation.standard_errors import errors_of, scalar_labels
-from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
-from pymc_statespace_filters.pymc_model.factors import ModelFactors
-from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS, Population
-from pymc_statespace_filters.sampling.starts.population import population_of
-from pymc_statespace_filters.system.checks import check_random_seed
+from ..errors import ModelError
+from ..pymc_model.constrained_values import ConstrainedValues
+from ..pymc_model.factors import ModelFactors
+from ..sampling.starts.annealing import N_SWEEPS, Population
+from ..sampling.starts.population import population_of
+from ..system.checks import check_random_seed
+from .estimate import MaximumLikelihoodEstimate
+from .noisy import maximize_estimated
+from .peak import Peak
+from .smooth import maximize_smooth
+from .standard_errors import errors_of, scalar_labels
 
 Array = NDArray[np.float64]
 

@@ -13,18 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.evidence.estimators.maximum_likelihood import maximize_noisy
-from pymc_statespace_filters.evidence.estimators.newton import BatchFunction, EdgeError
-from pymc_statespace_filters.evidence.log_mean import log_mean_of_independent
-from pymc_statespace_filters.point_estimation.peak import (
-    EDGE,
-    HIDDEN,
-    Lost,
-    Peak,
-    unconstrained_hessian,
-)
-from pymc_statespace_filters.point_estimation.smooth import population_scale, rescaled
-from pymc_statespace_filters.sampling.starts.annealing import Population
+from ..evidence.estimators.maximum_likelihood import maximize_noisy
+from ..evidence.estimators.newton import BatchFunction, EdgeError
+from ..evidence.log_mean import log_mean_of_independent
+from ..sampling.starts.annealing import Population
+from .peak import EDGE, HIDDEN, Lost, Peak, unconstrained_hessian
+from .smooth import population_scale, rescaled
 
 MIN_CURVATURE = 0.2  # below, a direction counts as one without curvature
 MAX_STEP = 2.0  # standard errors, from the centre of a round to the next

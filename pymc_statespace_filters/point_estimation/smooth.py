@@ -13,22 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from pymc_statespace_filters.evidence.estimators.maximum_likelihood import maximize_along_edge
-from pymc_statespace_filters.evidence.estimators.newton import (
-    BatchFunction,
-    EdgeError,
-    derivatives,
-    newton_maximize,
-)
-from pymc_statespace_filters.point_estimation.peak import (
-    EDGE,
-    INCREASING,
-    LEVEL,
-    Lost,
-    Peak,
-    unconstrained_hessian,
-)
-from pymc_statespace_filters.sampling.starts.annealing import Population
+from ..evidence.estimators.maximum_likelihood import maximize_along_edge
+from ..evidence.estimators.newton import BatchFunction, EdgeError, derivatives, newton_maximize
+from ..sampling.starts.annealing import Population
+from .peak import EDGE, INCREASING, LEVEL, Lost, Peak, unconstrained_hessian
 
 N_STARTS = 5
 LENGTHS = 4.0 ** -np.arange(12)  # tried for a scale, relative to the population

@@ -7,8 +7,8 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.point_estimation.estimate import flattened
-from pymc_statespace_filters.point_estimation.peak import EDGE, HIDDEN, INCREASING, Peak
+from .estimate import flattened
+from .peak import EDGE, HIDDEN, INCREASING, Peak
 
 STEP = 1e-3  # of the differences, in standard deviations of the population
 # Standard errors, of a move along a direction that changes a parameter; with noisy directions.

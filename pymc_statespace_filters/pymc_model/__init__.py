@@ -1,4 +1,4 @@
 """State-space systems as variables of a PyMC model."""
 
 # Registers how the variable is drawn, also where a model is only unpickled.
-from pymc_statespace_filters.pymc_model import dispatch as dispatch
+from . import dispatch as dispatch

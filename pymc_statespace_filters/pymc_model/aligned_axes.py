@@ -23,8 +23,8 @@ from pytensor.tensor.shape import Reshape, Shape, Shape_i, SpecifyShape
 from pytensor.tensor.special import LogSumExp, Softmax
 from pytensor.tensor.subtensor import AdvancedSubtensor, Subtensor
 
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
-from pymc_statespace_filters.system.panel import RECORD
+from ..ops.panel import PanelLogLikelihood
+from ..system.panel import RECORD
 
 
 class Aligned(NamedTuple):

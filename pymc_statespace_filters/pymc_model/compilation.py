@@ -10,11 +10,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.compilation import (
-    COMPILATION,
-    undamaged_files,
-    warning_filter,
-)
+from ..compiler.native.compilation import COMPILATION, undamaged_files, warning_filter
 
 
 def compile_density(inputs: Sequence[Variable], outputs: Sequence[Variable], **options: Any) -> Any:

@@ -4,7 +4,7 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
+from .compilation import compile_raveled
 
 Array = NDArray[np.float64]
 

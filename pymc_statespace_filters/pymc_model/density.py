@@ -12,12 +12,12 @@ import pymc as pm
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
-from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
-from pymc_statespace_filters.pymc_model.graph_rewrites import smooth_filters, with_filter
-from pymc_statespace_filters.pymc_model.inspection import noise_seeds
+from ..compiler.native.pytensor_function import NativeFunction
+from ..compiler.native.rows import Rows
+from ..errors import ModelError
+from .compilation import compile_raveled
+from .graph_rewrites import smooth_filters, with_filter
+from .inspection import noise_seeds
 
 Array = NDArray[np.float64]
 

@@ -13,20 +13,16 @@ from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.simulate import simulator
-from pymc_statespace_filters.filters.records import end_of_record, single_record
-from pymc_statespace_filters.ops.base import cache_key, check_panel, check_record
-from pymc_statespace_filters.ops.batch import vectorized
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.panel import PANEL_INPUTS, PanelLogLikelihood
-from pymc_statespace_filters.pymc_model.random_variable import (
-    PanelRV,
-    StateSpaceRV,
-    draw_in_python,
-)
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+from ..compiler.native.cache_key import key_of
+from ..errors import ModelError
+from ..evaluation.simulate import simulator
+from ..filters.records import end_of_record, single_record
+from ..ops.base import cache_key, check_panel, check_record
+from ..ops.batch import vectorized
+from ..ops.likelihood import LogLikelihood
+from ..ops.panel import PANEL_INPUTS, PanelLogLikelihood
+from ..system.panel import FIRST_INPUT, RECORD, STEP
+from .random_variable import PanelRV, StateSpaceRV, draw_in_python
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
 

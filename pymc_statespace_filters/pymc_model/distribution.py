@@ -12,21 +12,18 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
-from pymc_statespace_filters.pymc_model import dispatch as dispatch  # registers draw and density
-from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
-from pymc_statespace_filters.system.checks import is_integer
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import (
-    SymbolicPanel,
-    symbolic_panel,
-)
-from pymc_statespace_filters.system.panel_parameters import symbolic_panel_parameters
-from pymc_statespace_filters.system.parameters import check_names, symbolic_parameters
-from pymc_statespace_filters.system.record import check_seed, symbolic_record
+from ..errors import ModelError
+from ..evaluation.filter_warnings import warn_of_choice
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_system_and_filter
+from ..system.checks import is_integer
+from ..system.model import StateSpaceModel
+from ..system.panel import SymbolicPanel, symbolic_panel
+from ..system.panel_parameters import symbolic_panel_parameters
+from ..system.parameters import check_names, symbolic_parameters
+from ..system.record import check_seed, symbolic_record
+from . import dispatch as dispatch  # registers draw and density
+from .random_variable import PanelRV, StateSpaceRV
 
 
 class StateSpace(Continuous):

@@ -4,8 +4,8 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.pymc_model.density import ModelDensity
-from pymc_statespace_filters.pymc_model.prior import ModelPrior
+from .density import ModelDensity
+from .prior import ModelPrior
 
 Array = NDArray[np.float64]
 

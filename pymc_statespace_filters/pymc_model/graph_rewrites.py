@@ -13,25 +13,18 @@ from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ekf import EKF
-from pymc_statespace_filters.filters.grid import GridFilter
-from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
-from pymc_statespace_filters.ops.distributed import (
-    CallbackLogLikelihood,
-    CallbackLogLikelihoodOfNoise,
-)
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
-from pymc_statespace_filters.pymc_model.inspection import (
-    likelihood_nodes,
-    noisy_filters,
-    state_space_nodes,
-)
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import ModelError
+from ..filters.ekf import EKF
+from ..filters.grid import GridFilter
+from ..filters.protocol import EnsembleFilter, Filter
+from ..filters.recommendation import check_system_and_filter
+from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
+from ..ops.likelihood import LogLikelihood
+from ..ops.noise import LogLikelihoodOfNoise, StoredNoise
+from ..ops.panel import PanelLogLikelihood
+from ..system.model import StateSpaceModel
+from .inspection import likelihood_nodes, noisy_filters, state_space_nodes
 
 
 class CallbackLikelihoods(NamedTuple):

@@ -12,13 +12,13 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import collapse_remedy, quiet_filter, short_form
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.random_variable import PanelRV, StateSpaceRV
-from pymc_statespace_filters.system.panel import RECORD
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import ModelError
+from ..filters.protocol import Filter
+from ..filters.recommendation import collapse_remedy, quiet_filter, short_form
+from ..ops.likelihood import LogLikelihood
+from ..system.panel import RECORD
+from .random_variable import PanelRV, StateSpaceRV
 
 
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:

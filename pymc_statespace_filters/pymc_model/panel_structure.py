@@ -25,18 +25,8 @@ from pytensor.scalar.basic import Add
 from pytensor.tensor.elemwise import CAReduce
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.pymc_model.aligned_axes import (
-    Aligned,
-    Mixed,
-    Status,
-    follow,
-    records_of_rows,
-)
-from pymc_statespace_filters.pymc_model.inspection import (
-    log_density_terms,
-    panel_variables,
-    state_space_nodes,
-)
+from .aligned_axes import Aligned, Mixed, Status, follow, records_of_rows
+from .inspection import log_density_terms, panel_variables, state_space_nodes
 
 
 class PanelStructure(NamedTuple):

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pymc.initial_point import make_initial_point_fn
 from pytensor.graph.replace import graph_replace
 
-from pymc_statespace_filters.compiler.native.rows import at_points
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from ..compiler.native.rows import at_points
+from ..errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
 

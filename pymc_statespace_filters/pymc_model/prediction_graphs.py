@@ -5,16 +5,12 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.symbols import (
-    jacobian_of,
-    observation_moments,
-    symbols_of,
-)
-from pymc_statespace_filters.filters.protocol import DifferentiableFilter, PredictionFilter
-from pymc_statespace_filters.ops.diagnostics import Predictions
-from pymc_statespace_filters.ops.likelihood import TapedLogLikelihood
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.lowering.symbols import jacobian_of, observation_moments, symbols_of
+from ..filters.protocol import DifferentiableFilter, PredictionFilter
+from ..ops.diagnostics import Predictions
+from ..ops.likelihood import TapedLogLikelihood
+from .state_graphs import StateSpaceVariable
 
 type Graphs = list[TensorVariable]
 

@@ -11,9 +11,9 @@ from pymc.pytensorf import collect_default_updates, reseed_rngs
 from pymc.pytensorf import compile as compile_pymc
 from pytensor.compile import SharedVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.density import RowFunction
-from pymc_statespace_filters.pymc_model.support import can_sample, is_restricted
+from ..errors import ModelError
+from .density import RowFunction
+from .support import can_sample, is_restricted
 
 Array = NDArray[np.float64]
 

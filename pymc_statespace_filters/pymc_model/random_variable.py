@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from pytensor.tensor.random.op import RandomVariable
 
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..filters.protocol import Filter
+from ..system.model import StateSpaceModel
 
 
 class StateSpaceRV(RandomVariable):

@@ -7,14 +7,14 @@ import pymc as pm
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.protocol import Filter, StatesFilter, check_states_filter
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
-from pymc_statespace_filters.ops.diagnostics import TermHealth
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.states import States
-from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..compiler.lowering.compiled_system import compile_system
+from ..filters.protocol import Filter, StatesFilter, check_states_filter
+from ..filters.recommendation import check_system_and_filter
+from ..ops.diagnostics import TermHealth
+from ..ops.likelihood import LogLikelihood
+from ..ops.states import States
+from ..system.model import StateSpaceModel
+from .inspection import state_space_nodes
 
 
 class StateSpaceVariable(NamedTuple):

@@ -11,19 +11,19 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.symbols import call, jacobian_of, symbols_of
-from pymc_statespace_filters.compiler.native.rows import interpreted_at_points
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ekf import EKF
-from pymc_statespace_filters.filters.protocol import EnsembleFilter, Filter
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
-from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
-from pymc_statespace_filters.system.accumulators import without_resets
-from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
+from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
+from ..compiler.native.rows import interpreted_at_points
+from ..errors import ModelError
+from ..filters.ekf import EKF
+from ..filters.protocol import EnsembleFilter, Filter
+from ..ops.panel import PanelLogLikelihood
+from ..system.accumulators import without_resets
+from ..system.integrators.coupled_noise import CoupledNoise
+from ..system.model import StateSpaceModel
+from ..system.panel import FIRST_INPUT, RECORD, STEP
+from .compilation import compile_raveled
+from .inspection import likelihood_nodes
 
 MAX_STEPS = 500
 STEPS_PER_JACOBIAN = 10

@@ -9,12 +9,12 @@ import numpy as np
 from pymc.model import Model, modelcontext
 from xarray import DataTree
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import folder_name
-from pymc_statespace_filters.sampling.run.driver import sample_models
-from pymc_statespace_filters.sampling.run.request import ExecutionOptions, sampling_request
-from pymc_statespace_filters.sampling.run.warm_start import warm_started, warm_started_models
-from pymc_statespace_filters.system.checks import check_flag
+from ..errors import ModelError
+from ..system.checks import check_flag
+from .checkpoint.checkpoint import folder_name
+from .run.driver import sample_models
+from .run.request import ExecutionOptions, sampling_request
+from .run.warm_start import warm_started, warm_started_models
 
 
 @overload

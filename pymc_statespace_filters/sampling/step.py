@@ -16,14 +16,14 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.progress import stat_values, step_columns
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key
-from pymc_statespace_filters.sampling.kernel.state import ChainState
-from pymc_statespace_filters.sampling.output import sample_stats
-from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
-from pymc_statespace_filters.sampling.run.chain import Chain
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target.target import Target
+from ..progress import stat_values, step_columns
+from .kernel.random_numbers import draw_key
+from .kernel.state import ChainState
+from .output import sample_stats
+from .output.warnings import PhaseStatistics, closing_warning
+from .run.chain import Chain
+from .target.settings import DRAMSettings
+from .target.target import Target
 
 
 @dataclass_state

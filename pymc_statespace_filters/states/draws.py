@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.posterior_draws import noise_was_moved, posterior_group
-from pymc_statespace_filters.system.checks import is_integer
+from ..errors import ModelError
+from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
+from ..system.checks import is_integer
 
 SAMPLE_DIMS = ("chain", "draw")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.pymc_model.state_graphs import observed_variables, smoothing_method
-from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import add_group, join_rows, row_coords, state_dims
-from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
-from pymc_statespace_filters.system.checks import check_random_seed
-from pymc_statespace_filters.system.steps import check_at, rows_at
+from ..pymc_model.state_graphs import observed_variables, smoothing_method
+from ..system.checks import check_random_seed
+from ..system.steps import check_at, rows_at
+from .draws import select_draws
+from .groups import add_group, join_rows, row_coords, state_dims
+from .variable import VariableAtDraws, select_variables
 
 
 def filtered_states(

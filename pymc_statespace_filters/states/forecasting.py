@@ -7,16 +7,16 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.compiler.native.python_call import call_machine_code
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.simulate import continuation
-from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import add_group, join_rows, row_coords, state_dims
-from pymc_statespace_filters.states.record import Array, RecordAtDraws
-from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
-from pymc_statespace_filters.system.checks import check_random_seed, is_integer
-from pymc_statespace_filters.system.steps import steps_of
+from ..compiler.native.python_call import call_machine_code
+from ..errors import ModelError
+from ..evaluation.simulate import continuation
+from ..pymc_model.state_graphs import observed_variables
+from ..system.checks import check_random_seed, is_integer
+from ..system.steps import steps_of
+from .draws import select_draws
+from .groups import add_group, join_rows, row_coords, state_dims
+from .record import Array, RecordAtDraws
+from .variable import VariableAtDraws, select_variables
 
 
 def forecast(

@@ -10,24 +10,18 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.evaluation.simulate import simulator
-from pymc_statespace_filters.parallel.cpu_affinity import available_cores
-from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
-from pymc_statespace_filters.states.draws import select_draws
-from pymc_statespace_filters.states.groups import (
-    add_group,
-    by_record,
-    join_rows,
-    row_coords,
-    state_dims,
-)
-from pymc_statespace_filters.states.prediction_errors import prediction_errors
-from pymc_statespace_filters.states.record import Array, RecordAtDraws, simulate_observations
-from pymc_statespace_filters.states.variable import VariableAtDraws, select_variables
-from pymc_statespace_filters.system.checks import check_flag, check_random_seed
-from pymc_statespace_filters.system.record import check_observed
-from pymc_statespace_filters.system.steps import steps_of
+from ..errors import FilterWarning, ModelError
+from ..evaluation.simulate import simulator
+from ..parallel.cpu_affinity import available_cores
+from ..pymc_model.state_graphs import observed_variables
+from ..system.checks import check_flag, check_random_seed
+from ..system.record import check_observed
+from ..system.steps import steps_of
+from .draws import select_draws
+from .groups import add_group, by_record, join_rows, row_coords, state_dims
+from .prediction_errors import prediction_errors
+from .record import Array, RecordAtDraws, simulate_observations
+from .variable import VariableAtDraws, select_variables
 
 
 def free_run(

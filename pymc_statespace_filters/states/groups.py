@@ -7,9 +7,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
-from pymc_statespace_filters.states.record import Array
-from pymc_statespace_filters.states.variable import VariableAtDraws
+from ..pymc_model.state_graphs import StateSpaceVariable
+from .record import Array
+from .variable import VariableAtDraws
 
 
 def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.states.draws import SAMPLE_DIMS
+from .draws import SAMPLE_DIMS
 
 PROBABILITIES = np.array([0.5, 0.9])  # of the central intervals
 

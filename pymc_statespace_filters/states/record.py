@@ -9,23 +9,15 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.native.python_call import call_machine_code
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.simulate import observer
-from pymc_statespace_filters.pymc_model.state_graphs import (
-    StateSpaceVariable,
-    states_of,
-    term_health_of,
-)
-from pymc_statespace_filters.system.accumulators import (
-    inputs_of_user,
-    n_input_rows,
-    with_resets,
-)
+from ..compiler.native.python_call import call_machine_code
+from ..compiler.numerics.record_noise import seed_of_record
+from ..errors import ModelError
+from ..evaluation.simulate import observer
+from ..pymc_model.state_graphs import StateSpaceVariable, states_of, term_health_of
+from ..system.accumulators import inputs_of_user, n_input_rows, with_resets
 
 if TYPE_CHECKING:
-    from pymc_statespace_filters.states.variable import VariableAtDraws
+    from .variable import VariableAtDraws
 
 Array = NDArray[np.float64]
 

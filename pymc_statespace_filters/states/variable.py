@@ -14,25 +14,21 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
-from pymc_statespace_filters.compiler.native.compilation import undamaged_files
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
-from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.compiler.numerics.record_noise import generators_of_records
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.state_graphs import (
-    StateSpaceVariable,
-    observed_variables,
-    with_other_filter,
-)
-from pymc_statespace_filters.states.draws import SAMPLE_DIMS, PosteriorDraws
-from pymc_statespace_filters.states.record import Array, Graphs, RecordAtDraws
-from pymc_statespace_filters.system.panel import FIRST_INPUT, RECORD, STEP
-from pymc_statespace_filters.system.panel_inputs import panel_inputs
-from pymc_statespace_filters.system.panel_records import records_of
-from pymc_statespace_filters.system.record import check_inputs
+from ..compiler.native.compilation import undamaged_files
+from ..compiler.native.pytensor_function import NativeFunction
+from ..compiler.native.rows import Rows
+from ..compiler.numerics.record_noise import generators_of_records
+from ..errors import ModelError
+from ..evaluation.filter_warnings import warn_about
+from ..filters.outcomes import NONE
+from ..progress import row_progress
+from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables, with_other_filter
+from ..system.panel import FIRST_INPUT, RECORD, STEP
+from ..system.panel_inputs import panel_inputs
+from ..system.panel_records import records_of
+from ..system.record import check_inputs
+from .draws import SAMPLE_DIMS, PosteriorDraws
+from .record import Array, Graphs, RecordAtDraws
 
 
 class VariableAtDraws:

@@ -4,7 +4,7 @@ Exported for new integrators: the protocol `Integrator`, `read_equation` for the
 and `as_vector` and `as_matrix` for what these return.
 """
 
-from pymc_statespace_filters.system.equations import Equation, as_matrix, as_vector, read_equation
-from pymc_statespace_filters.system.integrators import Integrator
+from .equations import Equation, as_matrix, as_vector, read_equation
+from .integrators import Integrator
 
 __all__ = ["Equation", "Integrator", "as_matrix", "as_vector", "read_equation"]

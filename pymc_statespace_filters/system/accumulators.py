@@ -14,7 +14,7 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 if TYPE_CHECKING:
-    from pymc_statespace_filters.system.model import StateSpaceModel
+    from .model import StateSpaceModel
 
 
 def reset(

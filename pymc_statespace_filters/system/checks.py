@@ -6,7 +6,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
+from ..errors import ModelError
 
 
 def is_integer(value: Any) -> TypeGuard[int]:

@@ -13,8 +13,8 @@ from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import shortened
+from ..errors import ModelError
+from .checks import shortened
 
 RESERVED = {
     "x": "the state",

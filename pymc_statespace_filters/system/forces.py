@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pytensor import config
 from pytensor.tensor import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
+from ..errors import ModelError
 
 __all__ = ["cubic", "freeplay", "hysteresis", "hysteresis_branch"]
 

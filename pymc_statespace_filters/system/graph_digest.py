@@ -23,7 +23,7 @@ from pytensor.graph.type import Type
 from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.subtensor import Subtensor, unflatten_index_variables
 
-from pymc_statespace_filters.errors import ModelError
+from ..errors import ModelError
 
 # Where the noise of a function belongs, by the function's name in messages.
 _NOISE_OF = {

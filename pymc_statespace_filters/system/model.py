@@ -5,16 +5,11 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.graph_digest import describe, digest
-from pymc_statespace_filters.system.integrators.protocol import Integrator, bound_to_states
-from pymc_statespace_filters.system.signature import (
-    checked_names,
-    names_of_states,
-    read_signature,
-    size_of,
-)
-from pymc_statespace_filters.system.tracing import Equations, read, size, trace
+from ..errors import ModelError
+from .graph_digest import describe, digest
+from .integrators.protocol import Integrator, bound_to_states
+from .signature import checked_names, names_of_states, read_signature, size_of
+from .tracing import Equations, read, size, trace
 
 
 @dataclass(init=False, repr=False)

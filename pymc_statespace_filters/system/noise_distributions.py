@@ -8,9 +8,9 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_positive
-from pymc_statespace_filters.system.distributions.vector import conditional_shares
+from ..errors import ModelError
+from .checks import check_positive
+from .distributions.vector import conditional_shares
 
 
 def euler_multinomial(size: Any, rates: Sequence[Any], dt: Any) -> list[TensorVariable]:

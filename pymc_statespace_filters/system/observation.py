@@ -13,8 +13,8 @@ from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.equations import (
+from ..errors import ModelError
+from .equations import (
     Equation,
     as_symbol,
     as_vector,
@@ -22,7 +22,7 @@ from pymc_statespace_filters.system.equations import (
     read_equation,
     trace_covariance,
 )
-from pymc_statespace_filters.system.graph_digest import freeze
+from .graph_digest import freeze
 
 Values = Mapping[str, TensorVariable]
 

@@ -17,13 +17,13 @@ import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_finite
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel_inputs import panel_inputs, symbolic_panel_inputs
-from pymc_statespace_filters.system.panel_records import Records, records_of
-from pymc_statespace_filters.system.record import check_observed
-from pymc_statespace_filters.system.steps import check_steps, steps_of
+from ..errors import ModelError
+from .checks import check_finite
+from .model import StateSpaceModel
+from .panel_inputs import panel_inputs, symbolic_panel_inputs
+from .panel_records import Records, records_of
+from .record import check_observed
+from .steps import check_steps, steps_of
 
 # Columns of the rows of a panel.
 RECORD, STEP, FIRST_INPUT = range(3)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import shortened
-from pymc_statespace_filters.system.panel_records import records_of
-from pymc_statespace_filters.system.steps import nearest_steps
+from ..errors import ModelError
+from .checks import shortened
+from .panel_records import records_of
+from .steps import nearest_steps
 
 
 def panel_from(

@@ -9,11 +9,11 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import shortened
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel_records import Records
-from pymc_statespace_filters.system.record import check_inputs, inputs_of_other_shape
+from ..errors import ModelError
+from .checks import shortened
+from .model import StateSpaceModel
+from .panel_records import Records
+from .record import check_inputs, inputs_of_other_shape
 
 
 def _own_inputs(inputs: Any, records: Records) -> list[Any] | None:

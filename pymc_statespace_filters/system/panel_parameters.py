@@ -9,11 +9,11 @@ from pytensor.graph.basic import Variable
 from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.panel import SymbolicPanel
-from pymc_statespace_filters.system.panel_records import Records
-from pymc_statespace_filters.system.parameters import check_complete, check_names, numbers
+from ..errors import ModelError
+from .model import StateSpaceModel
+from .panel import SymbolicPanel
+from .panel_records import Records
+from .parameters import check_complete, check_names, numbers
 
 _OTHER_NUMBER = (
     "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "

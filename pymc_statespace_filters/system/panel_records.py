@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import is_integer, shortened
+from ..errors import ModelError
+from .checks import is_integer, shortened
 
 
 class Records(NamedTuple):

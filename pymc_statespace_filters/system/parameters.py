@@ -8,8 +8,8 @@ import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ..errors import ModelError
+from .model import StateSpaceModel
 
 
 def check_names(system: StateSpaceModel, params: Mapping[str, Any]) -> None:

@@ -18,10 +18,10 @@ from pytensor.tensor.math import Prod, Sum
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.distributions import LAWS, Law, law_name, parameters_of
-from pymc_statespace_filters.system.equations import Equation, as_symbol, static_shape
-from pymc_statespace_filters.system.graph_digest import is_made_after
+from ..errors import ModelError
+from .distributions import LAWS, Law, law_name, parameters_of
+from .equations import Equation, as_symbol, static_shape
+from .graph_digest import is_made_after
 
 Values = Mapping[str, TensorVariable]
 

@@ -11,15 +11,11 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.accumulators import (
-    n_input_rows,
-    with_resets,
-    with_symbolic_resets,
-)
-from pymc_statespace_filters.system.checks import check_finite, check_floats, shortened
-from pymc_statespace_filters.system.model import StateSpaceModel
-from pymc_statespace_filters.system.steps import steps_of
+from ..errors import ModelError
+from .accumulators import n_input_rows, with_resets, with_symbolic_resets
+from .checks import check_finite, check_floats, shortened
+from .model import StateSpaceModel
+from .steps import steps_of
 
 
 class CheckedRecord(NamedTuple):

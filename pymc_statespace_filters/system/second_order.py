@@ -8,16 +8,10 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import shortened
-from pymc_statespace_filters.system.equations import (
-    Equation,
-    as_matrix,
-    as_symbol,
-    as_vector,
-    read_equation,
-)
-from pymc_statespace_filters.system.signature import parameter_names
+from ..errors import ModelError
+from .checks import shortened
+from .equations import Equation, as_matrix, as_symbol, as_vector, read_equation
+from .signature import parameter_names
 
 
 def second_order(

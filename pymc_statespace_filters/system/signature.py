@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import is_integer
-from pymc_statespace_filters.system.equations import Equation
+from ..errors import ModelError
+from .checks import is_integer
+from .equations import Equation
 
 
 @dataclass(frozen=True)

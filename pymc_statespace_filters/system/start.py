@@ -11,10 +11,10 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.equations import Equation, as_vector, read_equation
-from pymc_statespace_filters.system.graph_digest import freeze
-from pymc_statespace_filters.system.random_variables import trace_distributions
+from ..errors import ModelError
+from .equations import Equation, as_vector, read_equation
+from .graph_digest import freeze
+from .random_variables import trace_distributions
 
 Values = Mapping[str, TensorVariable]
 

@@ -4,14 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import (
-    check_finite,
-    check_floats,
-    check_positive,
-    is_integer,
-    shortened,
-)
+from ..errors import ModelError
+from .checks import check_finite, check_floats, check_positive, is_integer, shortened
 
 # Times must lie on the grid of steps to this fraction of a step.
 GRID_TOLERANCE = 1e-6

@@ -14,10 +14,10 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.accumulators import reset
-from pymc_statespace_filters.system.checks import check_positive
-from pymc_statespace_filters.system.equations import (
+from ..errors import ModelError
+from .accumulators import reset
+from .checks import check_positive
+from .equations import (
     Equation,
     as_matrix,
     as_vector,
@@ -25,17 +25,17 @@ from pymc_statespace_filters.system.equations import (
     read_equation,
     trace_covariance,
 )
-from pymc_statespace_filters.system.graph_digest import freeze
-from pymc_statespace_filters.system.integrators.protocol import Integrator
-from pymc_statespace_filters.system.observation import (
+from .graph_digest import freeze
+from .integrators.protocol import Integrator
+from .observation import (
     DensityObservation,
     GaussianObservation,
     TracedObservation,
     read_observation,
 )
-from pymc_statespace_filters.system.random_variables import Drawn, trace_distributions
-from pymc_statespace_filters.system.signature import Signature, parameter_symbols, size_of
-from pymc_statespace_filters.system.start import Start, check_start, read_initial_mean, trace_start
+from .random_variables import Drawn, trace_distributions
+from .signature import Signature, parameter_symbols, size_of
+from .start import Start, check_start, read_initial_mean, trace_start
 
 Values = Mapping[str, TensorVariable]
 

@@ -11,8 +11,12 @@ from pytensor.graph.fg import FunctionGraph
 from pytensor.graph.traversal import io_toposort
 from pytensor.link.numba.dispatch.basic import numba_funcify_and_cache_key
 
-from pymc_statespace_filters.compiler.codegen.array_linalg import use_loops
-from pymc_statespace_filters.compiler.codegen.function_types import (
+from ...errors import LoweringError
+from ..native.cache_key import key_of
+from ..native.compilation import undamaged_files, warning_filter
+from ..native.entry_point import EntryPoint
+from .array_linalg import use_loops
+from .function_types import (
     MEMBER_ARGUMENTS,
     MEMBER_INPUTS,
     CompiledFunction,
@@ -20,10 +24,6 @@ from pymc_statespace_filters.compiler.codegen.function_types import (
     VectorFunction,
     function_of,
 )
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.compilation import undamaged_files, warning_filter
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.errors import LoweringError
 
 # The code that reads a whole input, if not its name.
 _WHOLE = {

@@ -16,7 +16,7 @@ from pytensor.tensor.linalg.solvers.psd import CholeskySolve
 from pytensor.tensor.linalg.solvers.triangular import SolveTriangular
 from pytensor.tensor.math import Dot
 
-from pymc_statespace_filters.compiler.native.cache_key import key_of
+from ..native.cache_key import key_of
 
 
 @numba_njit

@@ -17,27 +17,16 @@ from numba import types
 from pytensor.link.numba.dispatch.basic import numba_funcify
 from pytensor.scalar.math import Log1mexp, Sigmoid, Softplus
 
-from pymc_statespace_filters.compiler.codegen.expressions import (
-    BOOLEAN,
-    FLOAT,
-    INTEGER,
-    Expression,
-    Value,
-    in_order,
-    kind_of,
-)
-from pymc_statespace_filters.compiler.codegen.function_types import jit
-from pymc_statespace_filters.compiler.codegen.machine_code import BOOL, DOUBLE, INT, Module
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.numerics import exponential, hyperbolic, trigonometric
-from pymc_statespace_filters.compiler.numerics.quantiles.binomial import (
-    bernoulli_quantile,
-    binomial_quantile,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_quantile
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
-from pymc_statespace_filters.compiler.numerics.quantiles.poisson import poisson_quantile
-from pymc_statespace_filters.errors import LoweringError
+from ...errors import LoweringError
+from ..native.entry_point import F64_PTR, EntryPoint
+from ..numerics import exponential, hyperbolic, trigonometric
+from ..numerics.quantiles.binomial import bernoulli_quantile, binomial_quantile
+from ..numerics.quantiles.gamma import gamma_quantile
+from ..numerics.quantiles.normal import normal_probability
+from ..numerics.quantiles.poisson import poisson_quantile
+from .expressions import BOOLEAN, FLOAT, INTEGER, Expression, Value, in_order, kind_of
+from .function_types import jit
+from .machine_code import BOOL, DOUBLE, INT, Module
 
 QUANTILES = {
     function.py_func.__name__: function

@@ -10,15 +10,9 @@ import numpy as np
 from numba import types
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    EntryPoint,
-    address_of,
-    arguments_class,
-    call_address,
-)
-from pymc_statespace_filters.compiler.native.jit import linked
+from ..native.cache_key import FAST_MATH
+from ..native.entry_point import F64_PTR, EntryPoint, address_of, arguments_class, call_address
+from ..native.jit import linked
 
 # Inputs that differ between the members of an ensemble.
 MEMBER_INPUTS = frozenset({"x", "z"})

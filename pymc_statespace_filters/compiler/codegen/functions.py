@@ -20,29 +20,14 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import load_item, make_array, store_item
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.compiler.codegen.array_fallback import (
-    array_member_function,
-    array_vector_function,
-)
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter, n_operations
-from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    CompiledFunction,
-    Graph,
-    MemberFunction,
-    VectorFunction,
-    function_of,
-)
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    DOUBLE,
-    POINTER,
-    Code,
-    Module,
-    constant,
-)
-from pymc_statespace_filters.compiler.codegen.members import member_entry_point
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
-from pymc_statespace_filters.compiler.native.cache_key import key_of
+from ..native.cache_key import key_of
+from .array_fallback import array_member_function, array_vector_function
+from .emitter import Emitter, n_operations
+from .expressions import Arena, Value
+from .function_types import CompiledFunction, Graph, MemberFunction, VectorFunction, function_of
+from .machine_code import DOUBLE, POINTER, Code, Module, constant
+from .members import member_entry_point
+from .scalarize import NotUnrollableError, unroll
 
 _LOG = logging.getLogger("pymc_statespace_filters")
 

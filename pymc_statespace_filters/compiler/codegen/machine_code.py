@@ -21,10 +21,10 @@ from numba.core.registry import cpu_target
 from pytensor import config
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.progress import slow_compilation
+from ...parallel.signals import held_interrupts
+from ...progress import slow_compilation
+from ..native.cache_key import key_of
+from ..native.entry_point import EntryPoint
 
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 POINTER = DOUBLE.as_pointer()

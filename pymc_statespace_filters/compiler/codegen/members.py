@@ -17,25 +17,14 @@ from llvmlite import ir
 from numba import carray, types
 from numba.core import cgutils
 
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter, depends_on
-from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    MEMBER_ARGUMENTS,
-    MEMBER_INPUTS,
-    Graph,
-)
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    DOUBLE,
-    INT,
-    POINTER,
-    Module,
-    ModuleEntryPoint,
-    constant,
-)
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.numerics.quantiles.binomial import binomial_block
-from pymc_statespace_filters.compiler.numerics.quantiles.gamma import gamma_block
-from pymc_statespace_filters.compiler.numerics.quantiles.poisson import poisson_block
+from ..native.entry_point import F64_PTR, EntryPoint
+from ..numerics.quantiles.binomial import binomial_block
+from ..numerics.quantiles.gamma import gamma_block
+from ..numerics.quantiles.poisson import poisson_block
+from .emitter import Emitter, depends_on
+from .expressions import FLOAT, Expression, Value
+from .function_types import MEMBER_ARGUMENTS, MEMBER_INPUTS, Graph
+from .machine_code import DOUBLE, INT, POINTER, Module, ModuleEntryPoint, constant
 
 BLOCK = 64
 

@@ -10,22 +10,10 @@ from typing import Any, NamedTuple
 from llvmlite import ir
 from numba import types
 
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter
-from pymc_statespace_filters.compiler.codegen.expressions import Value
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    BOOL,
-    DOUBLE,
-    INT,
-    POINTER,
-    Code,
-    Module,
-    constant,
-)
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    arguments_class,
-)
+from ..native.entry_point import F64_PTR, I64_PTR, arguments_class
+from .emitter import Emitter
+from .expressions import Value
+from .machine_code import BOOL, DOUBLE, INT, POINTER, Code, Module, constant
 
 ALONG_ARGUMENTS = {
     "W": F64_PTR, "steps": I64_PTR, "row_width": types.intp, "n_rows": types.intp,

@@ -13,7 +13,7 @@ import numpy as np
 import pytensor.scalar as ps
 from pytensor.graph.basic import Apply
 
-from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant
+from .expressions import Arena, Value, is_constant
 
 
 def inner(arena: Arena, a: Iterable, b: Iterable) -> Value:

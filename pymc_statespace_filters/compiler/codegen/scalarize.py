@@ -37,8 +37,8 @@ from pytensor.tensor.subtensor import (
     unflatten_index_variables,
 )
 
-from pymc_statespace_filters.compiler.codegen.expressions import Arena, Value, is_constant, plain
-from pymc_statespace_filters.compiler.codegen.scalar_linalg import (
+from .expressions import Arena, Value, is_constant, plain
+from .scalar_linalg import (
     cholesky,
     cholesky_solve,
     determinant,
@@ -47,10 +47,7 @@ from pymc_statespace_filters.compiler.codegen.scalar_linalg import (
     solve,
     solve_triangular,
 )
-from pymc_statespace_filters.compiler.codegen.semidefinite import (
-    SemidefiniteCholesky,
-    unrolled_root,
-)
+from .semidefinite import SemidefiniteCholesky, unrolled_root
 
 
 class NotUnrollableError(Exception):

@@ -15,8 +15,8 @@ from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_
 from pytensor.tensor.linalg import solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.expressions import Arena
-from pymc_statespace_filters.compiler.native.cache_key import key_of
+from ..native.cache_key import key_of
+from .expressions import Arena
 
 # Relative to the variance of the component. A pivot below the first is rounding of zero; one below
 # minus the second belongs to no covariance.

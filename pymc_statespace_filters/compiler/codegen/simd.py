@@ -14,21 +14,13 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter, depends_on
-from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Expression, Value, in_order
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.functions import unrolled
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    Module,
-    ModuleEntryPoint,
-    constant,
-)
-from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES, sorted_by_number
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    EntryPoint,
-    arguments_class,
-)
+from ..native.entry_point import F64_PTR, EntryPoint, arguments_class
+from .emitter import Emitter, depends_on
+from .expressions import FLOAT, Expression, Value, in_order
+from .function_types import Graph
+from .functions import unrolled
+from .machine_code import Module, ModuleEntryPoint, constant
+from .members import LLVM_TYPES, sorted_by_number
 
 LANES = 32  # at most
 LANES_AT_ONCE = 8  # the number of lanes is a multiple of this

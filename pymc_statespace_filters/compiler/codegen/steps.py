@@ -12,35 +12,18 @@ import numpy as np
 from llvmlite import ir
 from numba import carray
 
-from pymc_statespace_filters.compiler.codegen.array_fallback import array_code, used_inputs
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter, depends_on
-from pymc_statespace_filters.compiler.codegen.expressions import FLOAT, Value
-from pymc_statespace_filters.compiler.codegen.function_types import Graph, function_of
-from pymc_statespace_filters.compiler.codegen.functions import log_choice, unrolled
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    Module,
-    ModuleEntryPoint,
-    constant,
-)
-from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES, sorted_by_number
-from pymc_statespace_filters.compiler.codegen.record_loops import (
-    ALONG_ARGUMENTS,
-    Part,
-    Sizes,
-    backward_loop,
-    forward_loop,
-)
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.codegen.simd import (
-    INPUTS,
-    LANE_ARGUMENTS,
-    PARAMETERS,
-    STATE,
-    TIME,
-    LaneFunction,
-)
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
+from ..native.entry_point import EntryPoint
+from ..native.jit import njit_internal
+from .array_fallback import array_code, used_inputs
+from .emitter import Emitter, depends_on
+from .expressions import FLOAT, Value
+from .function_types import Graph, function_of
+from .functions import log_choice, unrolled
+from .machine_code import Module, ModuleEntryPoint, constant
+from .members import LLVM_TYPES, sorted_by_number
+from .record_loops import ALONG_ARGUMENTS, Part, Sizes, backward_loop, forward_loop
+from .scalarize import NotUnrollableError
+from .simd import INPUTS, LANE_ARGUMENTS, PARAMETERS, STATE, TIME, LaneFunction
 
 NOISE = "z"
 

@@ -6,34 +6,18 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    Graph,
-    MemberFunction,
-    ParameterFunction,
-)
-from pymc_statespace_filters.compiler.codegen.functions import member_function
-from pymc_statespace_filters.compiler.lowering import quantiles, structure
-from pymc_statespace_filters.compiler.lowering.constants import (
-    extend,
-    lowered,
-    pull_back,
-)
-from pymc_statespace_filters.compiler.lowering.covariances import (
-    covariances,
-    followed_by_square_roots,
-)
-from pymc_statespace_filters.compiler.lowering.expected_observation import expected_observation
-from pymc_statespace_filters.compiler.lowering.gaussian import observation_log_density
-from pymc_statespace_filters.compiler.lowering.guidance import (
-    guided_noise,
-    linearize_step,
-    n_gains,
-    observation_information,
-)
-from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
-from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.function_types import Graph, MemberFunction, ParameterFunction
+from ..codegen.functions import member_function
+from ..native.entry_point import EntryPoint
+from . import quantiles, structure
+from .constants import extend, lowered, pull_back
+from .covariances import covariances, followed_by_square_roots
+from .expected_observation import expected_observation
+from .gaussian import observation_log_density
+from .guidance import guided_noise, linearize_step, n_gains, observation_information
+from .jumps import jumping_equations
+from .symbols import call, symbols_of
 
 quantiles.register()
 

@@ -7,13 +7,9 @@ import pytensor.tensor as pt
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.symbols import (
-    SYMBOLS,
-    observation_moments,
-    symbols_of,
-)
-from pymc_statespace_filters.system.distributions import SCALAR_LAWS, parameters_of
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.distributions import SCALAR_LAWS, parameters_of
+from ...system.model import StateSpaceModel
+from .symbols import SYMBOLS, observation_moments, symbols_of
 
 
 def conditional_moments(

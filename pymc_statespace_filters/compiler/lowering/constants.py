@@ -22,11 +22,9 @@ from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.math import Dot
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    ParameterFunction,
-)
-from pymc_statespace_filters.compiler.lowering.staged import ENTRY_POINTS, staged
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.function_types import ParameterFunction
+from .staged import ENTRY_POINTS, staged
 
 # Functions that are called at every step; the others, once per evaluation.
 _AT_EVERY_STEP = (

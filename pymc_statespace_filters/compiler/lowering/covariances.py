@@ -8,14 +8,11 @@ from numba import carray, types
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    ParameterFunction,
-    jit,
-)
-from pymc_statespace_filters.compiler.lowering.staged import staged
-from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.function_types import ParameterFunction, jit
+from ..native.entry_point import F64_PTR, EntryPoint
+from .staged import staged
+from .symbols import call
 
 
 def covariances(

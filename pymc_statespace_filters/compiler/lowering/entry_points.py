@@ -5,19 +5,19 @@ from typing import Any
 
 from llvmlite import ir
 
-from pymc_statespace_filters.compiler.codegen.function_types import VectorFunction
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
-from pymc_statespace_filters.compiler.codegen.machine_code import INT, Module, ModuleEntryPoint
-from pymc_statespace_filters.compiler.codegen.members import LLVM_TYPES
-from pymc_statespace_filters.compiler.lowering.guidance import smoothed_cov, step_back
-from pymc_statespace_filters.compiler.lowering.guide_loops import (
+from ..codegen.function_types import VectorFunction
+from ..codegen.functions import vector_functions
+from ..codegen.machine_code import INT, Module, ModuleEntryPoint
+from ..codegen.members import LLVM_TYPES
+from ..native.entry_point import EntryPoint
+from .guidance import smoothed_cov, step_back
+from .guide_loops import (
     FOLLOW_ARGUMENTS,
     LOOK_BACK_ARGUMENTS,
     LOOP_ARGUMENTS,
     follow_loop,
     look_back_loop,
 )
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 
 
 @lru_cache(maxsize=2048)

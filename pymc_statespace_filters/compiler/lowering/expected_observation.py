@@ -9,9 +9,9 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, call, symbols_of
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...errors import ModelError
+from ...system.model import StateSpaceModel
+from .symbols import SYMBOLS, call, symbols_of
 
 
 def expected_observation(

@@ -7,9 +7,9 @@ import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.lowering.symbols import call, observation_moments
-from pymc_statespace_filters.compiler.numerics.small_cholesky import LOG_TWO_PI
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..numerics.small_cholesky import LOG_TWO_PI
+from .symbols import call, observation_moments
 
 
 def without_missing(

@@ -8,14 +8,10 @@ import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.lowering.gaussian import (
-    log_normal,
-    observation_log_density,
-    without_missing,
-)
-from pymc_statespace_filters.compiler.lowering.symbols import jacobian_of, observation_moments
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.function_types import Graph
+from .gaussian import log_normal, observation_log_density, without_missing
+from .symbols import jacobian_of, observation_moments
 
 
 def n_gains(n: int, m: int) -> int:

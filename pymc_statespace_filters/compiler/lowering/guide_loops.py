@@ -11,14 +11,10 @@ from typing import Any
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.codegen.function_types import MemberArguments
-from pymc_statespace_filters.compiler.lowering.guidance import n_gains, step_size
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    arguments_class,
-    call_address,
-)
-from pymc_statespace_filters.compiler.native.jit import inline_always
+from ..codegen.function_types import MemberArguments
+from ..native.entry_point import F64_PTR, arguments_class, call_address
+from ..native.jit import inline_always
+from .guidance import n_gains, step_size
 
 FOLLOW_ARGUMENTS = {
     "c": F64_PTR, "inputs": F64_PTR, "first": types.intp, "last": types.intp, "t0": types.float64,

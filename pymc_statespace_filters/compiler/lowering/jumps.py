@@ -13,17 +13,13 @@ import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor as pt
 
-from pymc_statespace_filters.compiler.codegen.emitter import depends_on
-from pymc_statespace_filters.compiler.codegen.expressions import Expression, Value
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.functions import unrolled
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.lowering.symbols import (
-    observation_moments,
-    symbols_of,
-    transition_moments,
-)
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.emitter import depends_on
+from ..codegen.expressions import Expression, Value
+from ..codegen.function_types import Graph
+from ..codegen.functions import unrolled
+from ..codegen.scalarize import NotUnrollableError
+from .symbols import observation_moments, symbols_of, transition_moments
 
 _STEPPED = (
     ps.Sign, ps.Floor, ps.Ceil, ps.Trunc, ps.RoundHalfToEven, ps.RoundHalfAwayFromZero, ps.Mod,

@@ -5,12 +5,12 @@ import pytensor
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 
-from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
-from pymc_statespace_filters.compiler.codegen.function_types import CompiledFunction, jit
-from pymc_statespace_filters.compiler.lowering.symbols import SYMBOLS, symbols_of
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.jit import copy_into
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.array_fallback import array_code
+from ..codegen.function_types import CompiledFunction, jit
+from ..native.cache_key import key_of
+from ..native.jit import copy_into
+from .symbols import SYMBOLS, symbols_of
 
 
 def distribution_sampler(system: StateSpaceModel, graph: FrozenFunctionGraph) -> CompiledFunction:

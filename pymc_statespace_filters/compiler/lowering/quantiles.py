@@ -4,10 +4,10 @@ from typing import Any
 
 from pytensor.link.numba.dispatch.basic import register_funcify_and_cache_key
 
-from pymc_statespace_filters.compiler.codegen.emitter import QUANTILES
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.jit import njit_callable
-from pymc_statespace_filters.system.quantiles import NoDerivative, Quantile
+from ...system.quantiles import NoDerivative, Quantile
+from ..codegen.emitter import QUANTILES
+from ..native.cache_key import key_of
+from ..native.jit import njit_callable
 
 
 def register() -> None:

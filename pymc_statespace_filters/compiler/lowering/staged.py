@@ -16,26 +16,14 @@ from numba.core import cgutils
 from pytensor.graph.traversal import io_toposort
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.array_fallback import array_code
-from pymc_statespace_filters.compiler.codegen.emitter import Emitter
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    PARAMETER_ARGUMENTS,
-    Graph,
-    ParameterFunction,
-    jit,
-)
-from pymc_statespace_filters.compiler.codegen.functions import unrolled
-from pymc_statespace_filters.compiler.codegen.machine_code import (
-    DOUBLE,
-    INT,
-    POINTER,
-    Module,
-    ModuleEntryPoint,
-    constant,
-)
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.system.linear_step import LinearStep, LinearStepBack, make_functions
+from ...system.linear_step import LinearStep, LinearStepBack, make_functions
+from ..codegen.array_fallback import array_code
+from ..codegen.emitter import Emitter
+from ..codegen.function_types import PARAMETER_ARGUMENTS, Graph, ParameterFunction, jit
+from ..codegen.functions import unrolled
+from ..codegen.machine_code import DOUBLE, INT, POINTER, Module, ModuleEntryPoint, constant
+from ..codegen.scalarize import NotUnrollableError
+from ..native.entry_point import F64_PTR, EntryPoint
 
 _STEP = make_functions(jit)
 

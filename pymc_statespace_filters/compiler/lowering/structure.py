@@ -11,20 +11,13 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.emitter import depends_on
-from pymc_statespace_filters.compiler.codegen.expressions import is_constant
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.functions import unrolled
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.lowering.symbols import (
-    SYMBOLS,
-    call,
-    jacobian_of,
-    process_noise_cov,
-    symbols_of,
-    transition_moments,
-)
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
+from ..codegen.emitter import depends_on
+from ..codegen.expressions import is_constant
+from ..codegen.function_types import Graph
+from ..codegen.functions import unrolled
+from ..codegen.scalarize import NotUnrollableError
+from .symbols import SYMBOLS, call, jacobian_of, process_noise_cov, symbols_of, transition_moments
 
 _N_TRIALS = 5
 _KINKED = (

@@ -7,7 +7,7 @@ from pytensor.gradient import jacobian
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...system.model import StateSpaceModel
 
 # What the traced functions of a system are functions of, in this order.
 SYMBOLS = ("theta", "x", "q", "u", "t", "e", "d")

@@ -9,7 +9,7 @@ import numba
 import pytensor
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
-from pymc_statespace_filters.compiler.native.sources import Sources
+from .sources import Sources
 
 # No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it
 # folds x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.

@@ -26,13 +26,10 @@ from numba.extending import intrinsic
 from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
-from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH, key_of
-from pymc_statespace_filters.compiler.native.code_library import (
-    InternalLinkageCompiler,
-    with_internal_linkage,
-)
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.progress import slow_compilation
+from ...parallel.signals import held_interrupts
+from ...progress import slow_compilation
+from .cache_key import FAST_MATH, key_of
+from .code_library import InternalLinkageCompiler, with_internal_linkage
 
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)

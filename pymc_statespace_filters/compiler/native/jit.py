@@ -12,7 +12,7 @@ from functools import partial
 
 from numba import njit
 
-from pymc_statespace_filters.compiler.native.code_library import LinkedCompiler
+from .code_library import LinkedCompiler
 
 linked = partial(
     njit,

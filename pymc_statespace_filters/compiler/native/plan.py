@@ -24,8 +24,8 @@ import llvmlite.binding as llvm
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.native.entry_point import I64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
+from .entry_point import I64_PTR, EntryPoint
+from .jit import njit_internal
 
 
 class RecordSlots(NamedTuple):

@@ -13,8 +13,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import _empty_nd_impl, populate_array
 
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.plan import (
+from ...errors import ModelError
+from .cache_key import key_of
+from .plan import (
     ARGUMENTS,
     DEFAULTS,
     HEADER,
@@ -31,7 +32,6 @@ from pymc_statespace_filters.compiler.native.plan import (
     Plan,
     PlanFunction,
 )
-from pymc_statespace_filters.errors import ModelError
 
 type Names = Sequence[tuple[str, int]]
 

@@ -18,17 +18,11 @@ from numba import carray, njit, typeof, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
-from pymc_statespace_filters.compiler.native.entry_point import (
-    F64_PTR,
-    I64_PTR,
-    EntryPoint,
-    call_address,
-    pointer,
-)
-from pymc_statespace_filters.compiler.native.python_call import call_machine_code
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.progress import slow_compilation
+from ...parallel.signals import held_interrupts
+from ...progress import slow_compilation
+from .code_library import with_internal_linkage
+from .entry_point import F64_PTR, I64_PTR, EntryPoint, call_address, pointer
+from .python_call import call_machine_code
 
 _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 

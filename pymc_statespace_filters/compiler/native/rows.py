@@ -11,10 +11,10 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.entry_point import njit_cached
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
-from pymc_statespace_filters.parallel.cpu_affinity import available_cores
-from pymc_statespace_filters.parallel.signals import held_interrupts
+from ...parallel.cpu_affinity import available_cores
+from ...parallel.signals import held_interrupts
+from .entry_point import njit_cached
+from .pytensor_function import NativeFunction, make_call
 
 _REFRESH_SECONDS = 0.1
 # Control block of each thread: rows done, written by the thread; stop, written by the main thread.

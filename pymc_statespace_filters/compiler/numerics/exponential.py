@@ -11,16 +11,8 @@ that of `_log_parts` and its evaluation are fdlibm's (Sun Microsystems, 1993).
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    ROUND,
-    bits_of,
-    float_of,
-    fma,
-    polynomial,
-    power_of_two,
-    sign_bit,
-)
+from ..native.jit import inlined
+from .intrinsics import ROUND, bits_of, float_of, fma, polynomial, power_of_two, sign_bit
 
 LOG2_E, _LOG2_E_LOW = 1.4426950408889634, 2.0355273740931033e-17
 _LOG10_E, _LOG10_E_LOW = 0.4342944819032518, 1.098319650216765e-17

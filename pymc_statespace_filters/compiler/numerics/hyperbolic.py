@@ -1,13 +1,8 @@
 """Hyperbolic functions for vector code, by the rules of `exponential`."""
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.exponential import exp, exp_times
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    fma,
-    polynomial,
-    sign_bit,
-    with_sign,
-)
+from ..native.jit import inlined
+from .exponential import exp, exp_times
+from .intrinsics import fma, polynomial, sign_bit, with_sign
 
 # (tanh(x) / x - 1) / z for z = x**2 <= 0.55**2
 _TANH = (

@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import inlined
+from ..native.jit import inlined
 
 ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it rounds to an integer, held in the lowest bits
 _ROUND_BIASED = ROUND + 1023.0

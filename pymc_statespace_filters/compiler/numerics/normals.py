@@ -17,9 +17,9 @@ import math
 import numpy as np
 from numba import carray, njit, types
 
-from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, EntryPoint
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_strict
-from pymc_statespace_filters.compiler.numerics.exponential import (
+from ..native.entry_point import F64_PTR, EntryPoint
+from ..native.jit import inline_always, njit_strict
+from .exponential import (
     EXPONENT_BITS,
     MANTISSA,
     ONE_OVER_SQRT_HALF,
@@ -27,9 +27,9 @@ from pymc_statespace_filters.compiler.numerics.exponential import (
     TWO_52,
     TWO_52_BIASED,
 )
-from pymc_statespace_filters.compiler.numerics.intrinsics import bits_of, float_of, fma, polynomial
-from pymc_statespace_filters.compiler.numerics.philox import LOW_WORD, key_words, philox
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+from .intrinsics import bits_of, float_of, fma, polynomial
+from .philox import LOW_WORD, key_words, philox
+from .restricted_domain import exp
 
 BLOCK = 64
 """Rows of noise are padded to a multiple of this number of members."""

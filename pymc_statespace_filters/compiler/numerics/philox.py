@@ -9,8 +9,8 @@ branches and no rejection, so that loops vectorise.
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always
-from pymc_statespace_filters.compiler.numerics.intrinsics import float_of
+from ..native.jit import inline_always
+from .intrinsics import float_of
 
 INITIAL, PROCESS, OBSERVATION, RESAMPLING, STATES = (np.uint64(purpose) for purpose in range(5))
 """Purposes: the independent streams of a step."""

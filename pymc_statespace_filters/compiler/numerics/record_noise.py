@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_callable
+from ..native.jit import njit_callable
 
 
 @njit_callable

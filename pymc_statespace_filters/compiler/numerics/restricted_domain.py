@@ -8,8 +8,8 @@ The polynomial of log is fdlibm's (Sun Microsystems, 1993).
 
 import math
 
-from pymc_statespace_filters.compiler.native.jit import inline_always
-from pymc_statespace_filters.compiler.numerics.exponential import (
+from ..native.jit import inline_always
+from .exponential import (
     EXPONENT_BITS,
     LN2_HIGH,
     LN2_LOW,
@@ -21,12 +21,7 @@ from pymc_statespace_filters.compiler.numerics.exponential import (
     TWO_52,
     TWO_52_BIASED,
 )
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    ROUND,
-    bits_of,
-    float_of,
-    polynomial,
-)
+from .intrinsics import ROUND, bits_of, float_of, polynomial
 
 _EXP = tuple(1.0 / math.factorial(i) for i in range(12, -1, -1))  # Taylor: truncation 2e-16
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
+from ..native.jit import inline_always, njit_internal
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 

@@ -10,16 +10,8 @@ Angles are reduced by pi / 2 in three parts, which with fused multiplications is
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    ROUND,
-    bits_of,
-    float_of,
-    fma,
-    polynomial,
-    sign_bit,
-    with_sign,
-)
+from ..native.jit import inlined
+from .intrinsics import ROUND, bits_of, float_of, fma, polynomial, sign_bit, with_sign
 
 _TWO_OVER_PI = 0.6366197723675814
 _HALF_PI, _HALF_PI_2 = 1.5707963267948966, 6.123233995736766e-17

@@ -7,8 +7,8 @@ import arviz as az
 import numpy as np
 import xarray as xr
 
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.lower_chains import lower_chains
+from ...lower_chains import lower_chains
+from ..posterior.draws import Posterior
 
 MAX_RHAT = 1.05
 # Effective draws of all chains with which R-hat and ESS are reliable (Vehtari et al. 2021).

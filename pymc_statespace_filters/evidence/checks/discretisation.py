@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
-from pymc_statespace_filters.evidence.posterior.observed_data import scalar_count
-from pymc_statespace_filters.pymc_model.density import RowFunction
-from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps, step_stability
+from ...pymc_model.density import RowFunction
+from ...pymc_model.step_refinement import densities_by_steps, step_stability
+from ..posterior.observed_data import scalar_count
 
 N_DRAWS = 100
 MIN_DRAWS = 2  # affected; a single one may be chance

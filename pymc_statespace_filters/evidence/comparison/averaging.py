@@ -8,8 +8,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_count
+from ...errors import ModelError
+from ...system.checks import check_count
 
 N_NORMALS = 50_000
 SAMPLE_DIMS = ("chain", "draw")

@@ -10,17 +10,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.comparison.probabilities import (
-    check_ci_prob,
-    prior_weights,
-    probabilities,
-)
-from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike, select_evidences
-from pymc_statespace_filters.evidence.comparison.sentences import needs_warning, sentences
-from pymc_statespace_filters.evidence.comparison.step_errors import step_error_columns
-from pymc_statespace_filters.evidence.comparison.table import EvidenceTable
-from pymc_statespace_filters.evidence.evidence import Evidence
+from ...errors import EvidenceWarning, ModelError
+from ..evidence import Evidence
+from .probabilities import check_ci_prob, prior_weights, probabilities
+from .selection import EvidenceLike, select_evidences
+from .sentences import needs_warning, sentences
+from .step_errors import step_error_columns
+from .table import EvidenceTable
 
 # Kass and Raftery (1995), section 3.2: lower limits of twice the log Bayes factor.
 STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.0: "very strong"}

@@ -10,7 +10,7 @@ from arviz_base.labels import BaseLabeller
 from arviz_base.sel_utils import xarray_sel_iter
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 MIN_INDEPENDENT = 100  # draws for a bandwidth
 

@@ -13,20 +13,13 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence.comparison.compare import (
-    DimensionCorrection,
-    compare_evidence,
-)
-from pymc_statespace_filters.evidence.comparison.probabilities import (
-    check_ci_prob,
-    prior_weights,
-    probabilities,
-)
-from pymc_statespace_filters.evidence.comparison.scaled_prior import ReweightedEvidence
-from pymc_statespace_filters.evidence.comparison.selection import EvidenceLike
-from pymc_statespace_filters.evidence.comparison.width_curve import WidthCurves, width_curves
-from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+from ...errors import EvidenceWarning, ModelError
+from ...pymc_model.posterior_draws import unconstrained_draws
+from .compare import DimensionCorrection, compare_evidence
+from .probabilities import check_ci_prob, prior_weights, probabilities
+from .scaled_prior import ReweightedEvidence
+from .selection import EvidenceLike
+from .width_curve import WidthCurves, width_curves
 
 EXPONENTS = np.linspace(0, 4, 41)
 WIDTHS = np.geomspace(0.25, 4, 17)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 N_NORMALS = 50_000
 

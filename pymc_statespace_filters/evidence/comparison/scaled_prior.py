@@ -25,15 +25,10 @@ from pymc.pytensorf import compile as compile_pymc
 from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.rows import at_points
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.log_mean import (
-    MIN_EFFECTIVE,
-    SAME,
-    log_mean_of_chains,
-    pareto_k,
-)
-from pymc_statespace_filters.pymc_model.support import can_sample
+from ...compiler.native.rows import at_points
+from ...errors import ModelError
+from ...pymc_model.support import can_sample
+from ..log_mean import MIN_EFFECTIVE, SAME, log_mean_of_chains, pareto_k
 
 EDGE = 0.05  # fraction of a bounded support, at each end
 # Limits beyond which the reweighted evidence is unreliable.

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import xarray as xr
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.evidence.agreement import assess_agreement
-from pymc_statespace_filters.evidence.evidence import Evidence, stored_evidences
+from ...errors import DataMismatchError, ModelError
+from ..agreement import assess_agreement
+from ..evidence import Evidence, stored_evidences
 
 EvidenceLike = Evidence | Mapping[str, Evidence] | xr.DataTree
 ByEstimator = Mapping[str, Evidence]

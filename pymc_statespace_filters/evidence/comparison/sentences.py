@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pandas as pd
 
-from pymc_statespace_filters.evidence.comparison.step_errors import step_error_sentences
-from pymc_statespace_filters.evidence.evidence import Evidence
+from ..evidence import Evidence
+from .step_errors import step_error_sentences
 
 
 def sentences(

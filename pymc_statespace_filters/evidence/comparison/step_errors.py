@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 SIGNIFICANT = 2.0  # standard errors
 

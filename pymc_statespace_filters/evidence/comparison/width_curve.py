@@ -11,14 +11,8 @@ from typing import NamedTuple
 import pymc as pm
 import xarray as xr
 
-from pymc_statespace_filters.evidence.comparison.scaled_prior import (
-    MAX_BEYOND,
-    MAX_PARETO_K,
-    UNCHANGED,
-    ReweightedEvidence,
-    ScaledPrior,
-)
-from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE
+from ..log_mean import MIN_EFFECTIVE
+from .scaled_prior import MAX_BEYOND, MAX_PARETO_K, UNCHANGED, ReweightedEvidence, ScaledPrior
 
 MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown
 

@@ -44,11 +44,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
-from pymc_statespace_filters.evidence.estimators.whitening import Whitening
-from pymc_statespace_filters.evidence.log_mean import log_mean, mcse_of_chains, mcse_of_walkers
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from ...errors import DataMismatchError
+from ..log_mean import log_mean, mcse_of_chains, mcse_of_walkers
+from ..posterior.draws import Posterior
+from .random_walk_proposal import Proposal
+from .whitening import Whitening
 
 N_WALKERS = 64
 N_WARMUP = 30

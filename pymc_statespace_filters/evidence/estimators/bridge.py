@@ -50,25 +50,12 @@ from scipy.optimize import brentq
 from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
-from pymc_statespace_filters.evidence.estimators.normal_proposals import (
-    NormalProposals,
-    normal_proposals,
-)
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.stopping import (
-    check_target,
-    is_small,
-    shortfall,
-    totals,
-)
-from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
-from pymc_statespace_filters.evidence.log_mean import (
-    MIN_EFFECTIVE,
-    LogMean,
-    log_mean_of_chains,
-    log_mean_of_independent,
-)
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
+from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ..posterior.draws import Posterior, check_overlap
+from .normal_proposals import NormalProposals, normal_proposals
+from .protocol import Estimate
+from .stopping import check_target, is_small, shortfall, totals
+from .whitening import Whitening, moments
 
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # the error of `MIN_EFFECTIVE` terms of relative variance one
 MAX_GAP = 4.0

@@ -39,33 +39,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.block_ordinates import (
-    BlockEstimate,
-    estimate_in_blocks,
-)
-from pymc_statespace_filters.evidence.estimators.normal_proposals import normal_proposals
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.random_walk_proposal import (
-    Proposal,
-    ProposalPlan,
-    plan_proposal,
-)
-from pymc_statespace_filters.evidence.estimators.stopping import (
-    FEWEST,
-    check_target,
-    is_small,
-    ratio_of_errors,
-    shortfall,
-)
-from pymc_statespace_filters.evidence.log_mean import (
-    MIN_EFFECTIVE,
-    LogMean,
-    log_mean_of_chains,
-    log_mean_of_independent,
-)
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
-from pymc_statespace_filters.system.checks import check_count
+from ...errors import ModelError
+from ...system.checks import check_count
+from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ..posterior.draws import Posterior, check_overlap
+from .block_ordinates import BlockEstimate, estimate_in_blocks
+from .normal_proposals import normal_proposals
+from .protocol import Estimate
+from .random_walk_proposal import Proposal, ProposalPlan, plan_proposal
+from .stopping import FEWEST, check_target, is_small, ratio_of_errors, shortfall
 
 MIN_PROPOSALS = 100
 MOST_PROPOSALS = 20_000

@@ -27,20 +27,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.stopping import (
-    check_target,
-    is_small,
-    shortfall,
-    totals,
-)
-from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
-from pymc_statespace_filters.evidence.log_mean import (
-    MIN_EFFECTIVE,
-    log_mean_of_independent,
-    pareto_k,
-)
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, check_overlap
+from ..log_mean import MIN_EFFECTIVE, log_mean_of_independent, pareto_k
+from ..posterior.draws import Posterior, check_overlap
+from .protocol import Estimate
+from .stopping import check_target, is_small, shortfall, totals
+from .student_mixture import choose_mixture
 
 MAX_PARETO_K = 0.7
 MOST_COMPARED = 10_000  # draws whose weights are compared with those of the proposals

@@ -19,17 +19,11 @@ import arviz as az
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.newton import (
-    BatchFunction,
-    EdgeError,
-    best_of_chains,
-    derivatives,
-    newton_maximize,
-)
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from ...errors import ModelError
+from ..posterior.draws import Posterior
+from .newton import BatchFunction, EdgeError, best_of_chains, derivatives, newton_maximize
+from .protocol import Estimate
+from .whitening import moments_within_chains
 
 N_STARTS = 3
 STEP = 0.05  # of the fine differences, in standard deviations of the draws; doubled for the coarse

@@ -7,14 +7,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from pymc_statespace_filters.evidence.estimators.newton import (
-    BatchFunction,
-    best_of_chains,
-    newton_maximize,
-)
-from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
-from pymc_statespace_filters.evidence.log_mean import log_mean_of_independent
-from pymc_statespace_filters.evidence.posterior.draws import Posterior, log_likelihood_of
+from ..log_mean import log_mean_of_independent
+from ..posterior.draws import Posterior, log_likelihood_of
+from .newton import BatchFunction, best_of_chains, newton_maximize
+from .whitening import moments_within_chains
 
 N_STARTS = 3
 BEYOND = -1e300  # finite stand-in for -inf, which the simplex cannot use

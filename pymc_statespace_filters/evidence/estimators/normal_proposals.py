@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from ..posterior.draws import Posterior
+from .whitening import Whitening, moments
 
 BLOCK = 500  # points
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from pymc_statespace_filters.evidence.estimators.smc_moves import Particles
-from pymc_statespace_filters.evidence.log_mean import mcse_of_chains
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.student_mixture import fit_mixture, place_components, standardised
+from ...student_mixture import fit_mixture, place_components, standardised
+from ..log_mean import mcse_of_chains
+from ..posterior.draws import Posterior
+from .smc_moves import Particles
 
 FALSE_ALARMS = 0.002  # probability of a difference in any region, if there is none
 N_COMPONENTS = 8

@@ -18,17 +18,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.stopping import (
-    check_target,
-    is_small,
-    shortfall,
-    totals,
-)
-from pymc_statespace_filters.evidence.log_mean import MIN_EFFECTIVE, log_mean_of_independent
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.system.checks import check_count
+from ...errors import ModelError
+from ...system.checks import check_count
+from ..log_mean import MIN_EFFECTIVE, log_mean_of_independent
+from ..posterior.draws import Posterior
+from .protocol import Estimate
+from .stopping import check_target, is_small, shortfall, totals
 
 MIN_DRAWS = 100
 

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from ..posterior.draws import Posterior
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, NormalProposals
-from pymc_statespace_filters.evidence.estimators.stopping import ratio_of_errors
-from pymc_statespace_filters.evidence.estimators.whitening import Whitening, moments
-from pymc_statespace_filters.evidence.log_mean import log_mean, log_mean_of_chains
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from ...errors import DataMismatchError
+from ..log_mean import log_mean, log_mean_of_chains
+from ..posterior.draws import Posterior
+from .normal_proposals import BLOCK, NormalProposals
+from .stopping import ratio_of_errors
+from .whitening import Whitening, moments
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 N_PILOT = BLOCK  # evaluations to choose the scale, not used for the estimate

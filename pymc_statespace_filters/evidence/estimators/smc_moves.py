@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.whitening import Whitening
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.student_mixture import StudentMixture
+from ...errors import ModelError
+from ...student_mixture import StudentMixture
+from ..posterior.draws import Posterior
+from .whitening import Whitening
 
 MIN_ALIVE = 50  # prior draws of positive likelihood
 

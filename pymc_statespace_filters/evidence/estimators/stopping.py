@@ -14,8 +14,8 @@ draws' error alone exceeds the target, whatever the evaluations, they stop at it
 import math
 from collections.abc import Iterator
 
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.system.checks import check_positive
+from ...system.checks import check_positive
+from ..posterior.draws import Posterior
 
 FEWEST, MOST = 1000, 16_000  # evaluations with a target
 MOST_WITHOUT_TARGET = 10_000

@@ -6,13 +6,9 @@ The number of components minimises the variance of the weights of held-out draws
 import numpy as np
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.evidence.estimators.whitening import moments
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.student_mixture import (
-    StudentMixture,
-    fit_mixture,
-    place_components,
-)
+from ...student_mixture import StudentMixture, fit_mixture, place_components
+from ..posterior.draws import Posterior
+from .whitening import moments
 
 MOST_COMPONENTS = 10
 MIN_GAIN = 0.02  # in the log of the weights' second moment, to accept a further component

@@ -49,21 +49,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.populations import compare_with_draws
-from pymc_statespace_filters.evidence.estimators.protocol import Estimate
-from pymc_statespace_filters.evidence.estimators.smc_moves import (
+from ...errors import ModelError
+from ...student_mixture import StudentMixture
+from ...system.checks import check_count, is_integer
+from ...tempering import next_temperature
+from ..posterior.draws import Posterior
+from .populations import compare_with_draws
+from .protocol import Estimate
+from .smc_moves import (
     Particles,
     cross_fit,
     metropolis_step,
     resample_systematic,
     sample_prior_particles,
 )
-from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
-from pymc_statespace_filters.student_mixture import StudentMixture
-from pymc_statespace_filters.system.checks import check_count, is_integer
-from pymc_statespace_filters.tempering import next_temperature
+from .student_mixture import choose_mixture
 
 MIN_RUNS, MIN_PARTICLES = 8, 50
 ESS_FRACTION = 0.85  # left by a step of the temperature; longer steps miss tails

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.pymc_model.density import ModelDensity
-from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
-from pymc_statespace_filters.pymc_model.prior import ModelPrior
+from ...errors import DataMismatchError, ModelError
+from ...pymc_model.density import ModelDensity
+from ...pymc_model.posterior_draws import unconstrained_draws
+from ...pymc_model.prior import ModelPrior
 
 N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
 STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie

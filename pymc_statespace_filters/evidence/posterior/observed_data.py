@@ -7,9 +7,9 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.pymc_model.aligned_axes import records_of_rows
-from pymc_statespace_filters.pymc_model.inspection import scored_rows
-from pymc_statespace_filters.pymc_model.random_variable import PanelRV
+from ...pymc_model.aligned_axes import records_of_rows
+from ...pymc_model.inspection import scored_rows
+from ...pymc_model.random_variable import PanelRV
 
 
 class _Observed(NamedTuple):

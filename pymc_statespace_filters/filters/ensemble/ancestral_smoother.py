@@ -20,42 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import (
-    copy_into,
-    inline_always,
-    njit_internal,
-    njit_reassoc,
-)
-from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, plan_entry
-from pymc_statespace_filters.compiler.numerics.small_cholesky import (
-    cholesky,
-    solve_lower,
-    solve_lower_transposed,
-)
-from pymc_statespace_filters.filters.calls import (
-    ALL_STEPS,
-    OK,
-    opened,
-    single_record,
-    wanted_rows,
-)
-from pymc_statespace_filters.filters.ensemble.callbacks import (
-    CALLBACK_ARGUMENTS,
-    ENDED,
-    FORECAST,
-    RESAMPLED,
-    UPDATED,
-    run_observed,
-)
-from pymc_statespace_filters.filters.ensemble.kalman_update import mark_finite
-from pymc_statespace_filters.filters.ensemble.summaries import (
-    finite_weights,
-    summarise_row,
-    write_summaries,
-)
-from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.plan import PLAN, free_states
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.jit import copy_into, inline_always, njit_internal, njit_reassoc
+from ...compiler.native.plan import RECORD, REQUEST, plan_entry
+from ...compiler.numerics.small_cholesky import cholesky, solve_lower, solve_lower_transposed
+from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
+from ..outcomes import NONE, is_missing
+from ..plan import PLAN, free_states
+from .callbacks import CALLBACK_ARGUMENTS, ENDED, FORECAST, RESAMPLED, UPDATED, run_observed
+from .kalman_update import mark_finite
+from .summaries import finite_weights, summarise_row, write_summaries
 
 LAG = 10
 """Observations after which the past of a resampled particle is settled."""

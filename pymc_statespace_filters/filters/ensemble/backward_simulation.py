@@ -18,33 +18,18 @@ import math
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, plan_entry
-from pymc_statespace_filters.compiler.numerics.philox import STATES, key_words, open_unit, philox
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.compiler.numerics.small_cholesky import cholesky, solve_lower
-from pymc_statespace_filters.filters.calls import (
-    ALL_STEPS,
-    OK,
-    opened,
-    single_record,
-    wanted_rows,
-)
-from pymc_statespace_filters.filters.ensemble.callbacks import (
-    CALLBACK_ARGUMENTS,
-    FORECAST,
-    UPDATED,
-    run_observed,
-)
-from pymc_statespace_filters.filters.ensemble.summaries import (
-    choose,
-    finite_weights,
-    write_summaries,
-)
-from pymc_statespace_filters.filters.ensemble.weights import normalise
-from pymc_statespace_filters.filters.outcomes import COVARIANCE_NOT_POSITIVE, NONE
-from pymc_statespace_filters.filters.plan import PLAN, propagate, read_system
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.jit import copy_into, inline_always, njit_internal
+from ...compiler.native.plan import RECORD, REQUEST, plan_entry
+from ...compiler.numerics.philox import STATES, key_words, open_unit, philox
+from ...compiler.numerics.restricted_domain import exp
+from ...compiler.numerics.small_cholesky import cholesky, solve_lower
+from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
+from ..outcomes import COVARIANCE_NOT_POSITIVE, NONE
+from ..plan import PLAN, propagate, read_system
+from .callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED, run_observed
+from .summaries import choose, finite_weights, write_summaries
+from .weights import normalise
 
 PARTICLES_PER_PATH = 16
 _LEAST_PATHS = 16

@@ -3,21 +3,15 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK, padded
-from pymc_statespace_filters.filters.ensemble.noise import STORE_NORMALS, NoiseSizes, n_stored
-from pymc_statespace_filters.filters.ensemble.summaries import (
-    LAST_EVENTS,
-    MEMBER_RUN,
-    MEMBER_STATES,
-    STORE_MEMBERS,
-    SUMMARISE,
-)
-from pymc_statespace_filters.filters.functions import likelihood, run, states, term_health
-from pymc_statespace_filters.filters.plan import make_plan
-from pymc_statespace_filters.filters.protocol import System
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.plan import Plan
+from ...compiler.native.planned_function import PlannedFunction
+from ...compiler.numerics.normals import BLOCK, padded
+from ..functions import likelihood, run, states, term_health
+from ..plan import make_plan
+from ..protocol import System
+from .noise import STORE_NORMALS, NoiseSizes, n_stored
+from .summaries import LAST_EVENTS, MEMBER_RUN, MEMBER_STATES, STORE_MEMBERS, SUMMARISE
 
 
 class EnsembleFilterBase:

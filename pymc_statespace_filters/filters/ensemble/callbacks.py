@@ -9,22 +9,16 @@ its callback, and makes results of what that wrote.
 import numpy as np
 from numba import types
 
-from pymc_statespace_filters.compiler.native.entry_point import (
+from ...compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
     arguments_class,
     call_address,
     call_for_status,
 )
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
-    HEALTH_SIZE,
-    N_RESULTS,
-    RECORD,
-    REQUEST,
-    RESULTS,
-)
-from pymc_statespace_filters.filters.plan import PLAN
+from ...compiler.native.jit import keep_alive, njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, N_RESULTS, RECORD, REQUEST, RESULTS
+from ..plan import PLAN
 
 FORECAST, PREDICTED, UPDATED, RESAMPLED, ENDED = (np.int64(event) for event in range(5))
 """Events at step k: members were initialised or moved there from step k - 1; if they were guided by

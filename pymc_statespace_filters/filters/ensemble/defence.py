@@ -14,9 +14,9 @@ are left for a place, they begin with the first particle, and the mixture has th
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.compiler.numerics.exponential import exp, log
-from pymc_statespace_filters.compiler.numerics.normals import uniform
+from ...compiler.native.jit import copy_into, njit_internal
+from ...compiler.numerics.exponential import exp, log
+from ...compiler.numerics.normals import uniform
 
 STRIDE = 10
 UNGUIDED = 1.0 / STRIDE

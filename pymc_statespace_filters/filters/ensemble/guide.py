@@ -28,15 +28,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.filters.ensemble.information import (
-    mean_information,
-    new_information,
-    newton_update,
-    update_work,
-)
-from pymc_statespace_filters.filters.outcomes import is_missing
-from pymc_statespace_filters.filters.plan import follow, look_back
+from ...compiler.native.jit import copy_into, njit_internal
+from ..outcomes import is_missing
+from ..plan import follow, look_back
+from .information import mean_information, new_information, newton_update, update_work
 
 _MOST_ITERATIONS = 8
 _SETTLED = 0.01  # square of the move of the path, over the variance of the state

@@ -5,19 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.ensemble.callbacks import FORECAST, emit
-from pymc_statespace_filters.filters.ensemble.defence import (
-    NOBODY,
-    STRIDE,
-    mixture_weight,
-    undo_guide,
-)
-from pymc_statespace_filters.filters.ensemble.loop import Members, new_members
-from pymc_statespace_filters.filters.ensemble.noise import process_normals, process_rows
-from pymc_statespace_filters.filters.ensemble.resampling import resample
-from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
-from pymc_statespace_filters.filters.plan import initialise, propagate_guided
+from ...compiler.native.jit import njit_internal
+from ..plan import initialise, propagate_guided
+from .callbacks import FORECAST, emit
+from .defence import NOBODY, STRIDE, mixture_weight, undo_guide
+from .loop import Members, new_members
+from .noise import process_normals, process_rows
+from .resampling import resample
+from .weights import normalise_weights
 
 _NUMBER_BYTES = 8
 

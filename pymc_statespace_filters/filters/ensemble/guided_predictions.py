@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.filters.ensemble.callbacks import PREDICTED, emit
-from pymc_statespace_filters.filters.ensemble.guide import leave_unguided
-from pymc_statespace_filters.filters.ensemble.loop import Members
-from pymc_statespace_filters.filters.ensemble.noise import initial_rows, process_normals
-from pymc_statespace_filters.filters.plan import initialise, propagate_guided
+from ...compiler.native.jit import copy_into, njit_internal
+from ..plan import initialise, propagate_guided
+from .callbacks import PREDICTED, emit
+from .guide import leave_unguided
+from .loop import Members
+from .noise import initial_rows, process_normals
 
 _NUMBER_BYTES = 8
 

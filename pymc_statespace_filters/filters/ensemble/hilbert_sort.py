@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray, types
 
-from pymc_statespace_filters.compiler.native.entry_point import (
+from ...compiler.native.entry_point import (
     F64_PTR,
     I64_PTR,
     EntryPoint,
     arguments_class,
     call_address,
 )
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal, njit_reassoc
+from ...compiler.native.jit import copy_into, njit_internal, njit_reassoc
 
 MOST_STATES = 8  # of 8 bits each: a key is one 64-bit integer
 

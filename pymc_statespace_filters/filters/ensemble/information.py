@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import copy_into, njit_internal
-from pymc_statespace_filters.compiler.numerics.small_cholesky import semidefinite_cholesky
-from pymc_statespace_filters.filters.plan import observation_information
+from ...compiler.native.jit import copy_into, njit_internal
+from ...compiler.numerics.small_cholesky import semidefinite_cholesky
+from ..plan import observation_information
 
 _N_NEWTON, _N_HALVINGS = 12, 12
 _CONVERGED = 1e-4  # nats

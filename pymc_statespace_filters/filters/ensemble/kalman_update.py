@@ -8,14 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.small_cholesky import (
-    cholesky,
-    solve_lower,
-    solve_lower_transposed,
-)
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.reductions import (
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.small_cholesky import cholesky, solve_lower, solve_lower_transposed
+from ...errors import ModelError
+from ..protocol import System
+from .reductions import (
     FIRST_ROW,
     allgather_sums,
     sum_members,
@@ -24,8 +21,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
     sum_values,
     total,
 )
-from pymc_statespace_filters.filters.ensemble.weights import total_weight, weigh
-from pymc_statespace_filters.filters.protocol import System
+from .weights import total_weight, weigh
 
 
 @njit_internal

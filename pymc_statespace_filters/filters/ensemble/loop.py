@@ -6,36 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import NORMALS, REQUEST, STATE
-from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
-from pymc_statespace_filters.filters.calls import OK, likelihood_entry, reals_at, state_given
-from pymc_statespace_filters.filters.ensemble.callbacks import (
-    ENDED,
-    FORECAST,
-    RESAMPLED,
-    UPDATED,
-    emit,
-)
-from pymc_statespace_filters.filters.ensemble.noise import (
-    NoiseSizes,
-    initial_normals,
-    n_stored,
-    noise_of,
-    process_normals,
-    sizes_of,
-)
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
-from pymc_statespace_filters.filters.ensemble.reductions import local_partition
-from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.plan import (
-    PLAN,
-    initialise,
-    propagate,
-    read_system,
-    settings_of,
-)
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.jit import copy_into, inline_always, njit_internal
+from ...compiler.native.plan import NORMALS, REQUEST, STATE
+from ...compiler.numerics.normals import FILL_NORMALS
+from ..calls import OK, likelihood_entry, reals_at, state_given
+from ..outcomes import NONE, is_missing
+from ..plan import PLAN, initialise, propagate, read_system, settings_of
+from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
+from .noise import NoiseSizes, initial_normals, n_stored, noise_of, process_normals, sizes_of
+from .partition import RankLayout
+from .reductions import local_partition
 
 N_LEADING = 6
 """Settings of every filter: the number of members and five of `NoiseSizes`."""

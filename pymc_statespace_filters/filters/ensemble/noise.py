@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.entry_point import pointer
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
+from ...compiler.native.entry_point import pointer
+from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.native.plan import (
     DAMAGED,
     N_RECORD,
     N_REQUEST,
@@ -24,14 +24,9 @@ from pymc_statespace_filters.compiler.native.plan import (
     plan_entry,
     plan_words,
 )
-from pymc_statespace_filters.compiler.numerics.normals import FILL_NORMALS
-from pymc_statespace_filters.compiler.numerics.philox import (
-    INITIAL,
-    OBSERVATION,
-    PROCESS,
-    RESAMPLING,
-)
-from pymc_statespace_filters.filters.plan import VERSION, settings_of
+from ...compiler.numerics.normals import FILL_NORMALS
+from ...compiler.numerics.philox import INITIAL, OBSERVATION, PROCESS, RESAMPLING
+from ..plan import VERSION, settings_of
 
 _fill = FILL_NORMALS.external
 _NUMBER_BYTES = 8

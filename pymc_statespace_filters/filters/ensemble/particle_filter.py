@@ -3,17 +3,19 @@
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.filters.ensemble import ancestral_smoother, backward_simulation
-from pymc_statespace_filters.filters.ensemble.ancestral_smoother import CARRY_PAST, LAG
-from pymc_statespace_filters.filters.ensemble.backward_simulation import STORE
-from pymc_statespace_filters.filters.ensemble.base import EnsembleFilterBase
-from pymc_statespace_filters.filters.ensemble.hilbert_sort import ORDER_PARTICLES
-from pymc_statespace_filters.filters.ensemble.loop import ensemble_filter
-from pymc_statespace_filters.filters.ensemble.noise import resampling_normals
-from pymc_statespace_filters.filters.ensemble.resampling import (
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.jit import njit_internal
+from ...compiler.native.plan import Plan
+from ..protocol import System
+from ..settings import check_choice, check_count, check_fraction
+from . import ancestral_smoother, backward_simulation
+from .ancestral_smoother import CARRY_PAST, LAG
+from .backward_simulation import STORE
+from .base import EnsembleFilterBase
+from .hilbert_sort import ORDER_PARTICLES
+from .loop import ensemble_filter
+from .noise import resampling_normals
+from .resampling import (
     SCHEMES,
     check_sortable,
     n_normals,
@@ -21,8 +23,6 @@ from pymc_statespace_filters.filters.ensemble.resampling import (
     resampler,
     smooth_resampling,
 )
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.filters.settings import check_choice, check_count, check_fraction
 
 _N_SETTINGS = 2  # threshold of resampling, number of its scheme
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
+from ...compiler.native.entry_point import call_address
+from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.numerics.normals import BLOCK
 
 MEMBERS, BLOCKS = np.int64(BLOCK), np.int64(1)
 """Columns of a block: an array has a column for each member, or one for each block.

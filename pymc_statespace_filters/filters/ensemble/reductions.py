@@ -10,20 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import (
-    inline_always,
-    njit_internal,
-    njit_reassoc,
-    njit_strict,
-)
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
-from pymc_statespace_filters.filters.ensemble.partition import (
-    BLOCKS,
-    MEMBERS,
-    RankLayout,
-    allgather,
-    local_range,
-)
+from ...compiler.native.jit import inline_always, njit_internal, njit_reassoc, njit_strict
+from ...compiler.numerics.normals import BLOCK
+from .partition import BLOCKS, MEMBERS, RankLayout, allgather, local_range
 
 HALVES = (32, 16, 8, 4, 2, 1)
 """The halves of a block, then of its first half, and so on."""

@@ -16,17 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK, exponential, padded, uniform
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.ensemble.hilbert_sort import (
-    MOST_STATES,
-    OrderWork,
-    order_at,
-    order_workspace,
-)
-from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
-from pymc_statespace_filters.filters.ensemble.reductions import sum_blocks
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.normals import BLOCK, exponential, padded, uniform
+from ...errors import ModelError
+from .hilbert_sort import MOST_STATES, OrderWork, order_at, order_workspace
+from .partition import MEMBERS, allgather
+from .reductions import sum_blocks
 
 
 @njit_internal

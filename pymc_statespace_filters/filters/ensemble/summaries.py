@@ -5,26 +5,14 @@ import math
 import numpy as np
 from numba import carray
 
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.jit import copy_into, inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
-from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
-from pymc_statespace_filters.filters.calls import (
-    OK,
-    first_unknown,
-    opened,
-    reals_at,
-    wanted_rows,
-)
-from pymc_statespace_filters.filters.ensemble.callbacks import (
-    CALLBACK_ARGUMENTS,
-    PREDICTED,
-    UPDATED,
-    run_observed,
-    searchsorted,
-)
-from pymc_statespace_filters.filters.ensemble.weights import effective_number, normalise
-from pymc_statespace_filters.filters.plan import PLAN
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.jit import copy_into, inline_always, njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
+from ...compiler.numerics.philox import STATES, uniform_at
+from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
+from ..plan import PLAN
+from .callbacks import CALLBACK_ARGUMENTS, PREDICTED, UPDATED, run_observed, searchsorted
+from .weights import effective_number, normalise
 
 LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
 """The last event at a step that a moment includes."""

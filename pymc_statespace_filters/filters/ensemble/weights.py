@@ -8,16 +8,10 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
-from pymc_statespace_filters.compiler.numerics.restricted_domain import EXP_LOWEST, exp
-from pymc_statespace_filters.filters.ensemble.reductions import (
-    FIRST_ROW,
-    HALVES,
-    allgather_sums,
-    sum_squares,
-    sum_values,
-)
+from ...compiler.native.jit import njit_internal, njit_reassoc
+from ...compiler.numerics.normals import BLOCK
+from ...compiler.numerics.restricted_domain import EXP_LOWEST, exp
+from .reductions import FIRST_ROW, HALVES, allgather_sums, sum_squares, sum_values
 
 
 @njit_internal

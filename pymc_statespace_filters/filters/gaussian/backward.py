@@ -2,18 +2,14 @@
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
-    HEALTH_SIZE,
-    RECORD,
-    REQUEST,
-    RESULTS,
-    plan_entry,
-)
-from pymc_statespace_filters.filters.calls import OK, opened, reals_at
-from pymc_statespace_filters.filters.gaussian.forward import forward_pass
-from pymc_statespace_filters.filters.gaussian.group import (
+from ...compiler.native.entry_point import call_address
+from ...compiler.native.jit import njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ..calls import OK, opened, reals_at
+from ..outcomes import NONE, is_missing
+from ..plan import PLAN, settings_of
+from .forward import forward_pass
+from .group import (
     END,
     N_OF_LANE,
     N_ROWS,
@@ -35,16 +31,7 @@ from pymc_statespace_filters.filters.gaussian.group import (
     set_all,
     table_of,
 )
-from pymc_statespace_filters.filters.gaussian.machine import (
-    STRETCH,
-    call,
-    n_lanes_of,
-    read_machine,
-    rows_at,
-    workspace,
-)
-from pymc_statespace_filters.filters.outcomes import NONE, is_missing
-from pymc_statespace_filters.filters.plan import PLAN, settings_of
+from .machine import STRETCH, call, n_lanes_of, read_machine, rows_at, workspace
 
 
 @njit_internal

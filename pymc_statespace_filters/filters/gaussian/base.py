@@ -6,28 +6,22 @@ from typing import ClassVar
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters import functions
-from pymc_statespace_filters.filters.gaussian import deterministic
-from pymc_statespace_filters.filters.gaussian.backward import BACKWARD
-from pymc_statespace_filters.filters.gaussian.forward import FORWARD
-from pymc_statespace_filters.filters.gaussian.functions import filter_plan
-from pymc_statespace_filters.filters.gaussian.linearization import (
-    Linearization,
-    predict,
-    start,
-    state_size,
-    update,
-)
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
-from pymc_statespace_filters.filters.gaussian.states import RUN, states_plan
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.function_types import Graph
+from ...compiler.lowering.symbols import symbols_of
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.plan import Plan
+from ...compiler.native.planned_function import PlannedFunction
+from ...errors import ModelError
+from ...system.model import StateSpaceModel
+from .. import functions
+from ..protocol import System
+from . import deterministic
+from .backward import BACKWARD
+from .forward import FORWARD
+from .functions import filter_plan
+from .linearization import Linearization, predict, start, state_size, update
+from .recursion import GaussianFilterFunctions
+from .states import RUN, states_plan
 
 
 class GaussianFilterBase:

@@ -36,18 +36,12 @@ from pytensor.graph.replace import graph_replace
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
-from pymc_statespace_filters.compiler.codegen.simd import LaneFunction
-from pymc_statespace_filters.filters.gaussian.functions import covariances_at
-from pymc_statespace_filters.filters.gaussian.linearization import (
-    Linearization,
-    Symbols,
-    innovation_of,
-    pack,
-    unpack,
-)
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
+from ...compiler.codegen.function_types import Graph
+from ...compiler.codegen.semidefinite import semidefinite_root
+from ...compiler.codegen.simd import LaneFunction
+from .functions import covariances_at
+from .linearization import Linearization, Symbols, innovation_of, pack, unpack
+from .recursion import GaussianFilterFunctions
 
 
 class BrysonFrazier:

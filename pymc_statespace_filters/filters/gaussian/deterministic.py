@@ -8,11 +8,11 @@ filter is the state.
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.lowering.gaussian import differentiable_log_density
-from pymc_statespace_filters.compiler.lowering.symbols import call, symbols_of
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.function_types import Graph
+from ...compiler.lowering.gaussian import differentiable_log_density
+from ...compiler.lowering.symbols import call, symbols_of
+from ...system.model import StateSpaceModel
+from .recursion import GaussianFilterFunctions
 
 
 def filter_functions(system: StateSpaceModel) -> GaussianFilterFunctions:

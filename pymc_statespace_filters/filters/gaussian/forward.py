@@ -7,17 +7,13 @@ memory. The tape of a record alone has all states: before each step and before e
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.lowering.covariances import semidefinite_cholesky
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
-    HEALTH_SIZE,
-    RECORD,
-    REQUEST,
-    RESULTS,
-    plan_entry,
-)
-from pymc_statespace_filters.filters.calls import OK, opened, reals_at
-from pymc_statespace_filters.filters.gaussian.group import (
+from ...compiler.lowering.covariances import semidefinite_cholesky
+from ...compiler.native.jit import njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ..calls import OK, opened, reals_at
+from ..outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, OUT_OF_MEMORY, is_missing
+from ..plan import PLAN, settings_of
+from .group import (
     ALIVE,
     BEGIN,
     N_OF_LANE,
@@ -41,22 +37,7 @@ from pymc_statespace_filters.filters.gaussian.group import (
     step_at,
     table_of,
 )
-from pymc_statespace_filters.filters.gaussian.machine import (
-    STRETCH,
-    call,
-    n_lanes_of,
-    read_machine,
-    rows_at,
-    workspace,
-)
-from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NO_FINITE_MEMBER,
-    NONE,
-    OUT_OF_MEMORY,
-    is_missing,
-)
-from pymc_statespace_filters.filters.plan import PLAN, settings_of
+from .machine import STRETCH, call, n_lanes_of, read_machine, rows_at, workspace
 
 
 @njit_internal

@@ -15,19 +15,19 @@ import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.codegen.simd import LANES, LaneFunction, lane_functions
-from pymc_statespace_filters.compiler.codegen.steps import Places, step_functions
-from pymc_statespace_filters.compiler.lowering.covariances import covariances
-from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
-from pymc_statespace_filters.compiler.native.plan import Plan
-from pymc_statespace_filters.filters.gaussian.machine import rows_of_vectors
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions, vjps
-from pymc_statespace_filters.filters.plan import make_plan
-from pymc_statespace_filters.filters.protocol import System
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.function_types import Graph
+from ...compiler.codegen.scalarize import NotUnrollableError
+from ...compiler.codegen.simd import LANES, LaneFunction, lane_functions
+from ...compiler.codegen.steps import Places, step_functions
+from ...compiler.lowering.covariances import covariances
+from ...compiler.lowering.symbols import call
+from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.plan import Plan
+from ...system.model import StateSpaceModel
+from ..plan import make_plan
+from ..protocol import System
+from .machine import rows_of_vectors
+from .recursion import GaussianFilterFunctions, vjps
 
 ALONG = ("predict", "update", "along")
 ALONG_BACK = ("predict_back", "update_back", "along_back")

@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.record_loops import AlongArguments
-from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import RECORD
-from pymc_statespace_filters.filters.calls import integers_at, reals_at, state_given
-from pymc_statespace_filters.filters.gaussian.machine import STRETCH
-from pymc_statespace_filters.filters.plan import PLAN
-from pymc_statespace_filters.system import panel
+from ...compiler.codegen.record_loops import AlongArguments
+from ...compiler.native.entry_point import call_address
+from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.native.plan import RECORD
+from ...system import panel
+from ..calls import integers_at, reals_at, state_given
+from ..plan import PLAN
+from .machine import STRETCH
 
 # Columns of the records: the row of theta, the first row of the table and the number of rows, and
 # what leads from a row to its term.

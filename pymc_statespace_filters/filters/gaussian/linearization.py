@@ -14,10 +14,10 @@ import pytensor.tensor as pt
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.semidefinite import regular_factor
-from pymc_statespace_filters.compiler.lowering.gaussian import log_normal, without_missing
-from pymc_statespace_filters.compiler.lowering.symbols import call
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.semidefinite import regular_factor
+from ...compiler.lowering.gaussian import log_normal, without_missing
+from ...compiler.lowering.symbols import call
+from ...system.model import StateSpaceModel
 
 Symbols = Mapping[str, TensorVariable]
 

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.simd import LANES_AT_ONCE, LaneArguments
-from pymc_statespace_filters.compiler.native.entry_point import call_address
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.plan import PLAN
+from ...compiler.codegen.simd import LANES_AT_ONCE, LaneArguments
+from ...compiler.native.entry_point import call_address
+from ...compiler.native.jit import inline_always, njit_internal
+from ..plan import PLAN
 
 STRETCH = 32  # steps; the states of all lanes fit into the processor's cache
 

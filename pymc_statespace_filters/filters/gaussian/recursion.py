@@ -14,8 +14,8 @@ import pytensor.tensor as pt
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.function_types import Graph
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.function_types import Graph
+from ...system.model import StateSpaceModel
 
 MAX_EXPLICIT = 8  # states
 

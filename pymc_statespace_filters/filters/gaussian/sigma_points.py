@@ -25,11 +25,11 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.codegen.semidefinite import semidefinite_root
-from pymc_statespace_filters.compiler.lowering.symbols import symbols_of, transition_moments
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.gaussian.linearization import GaussianState, Linear, Symbols
-from pymc_statespace_filters.system.model import StateSpaceModel
+from ...compiler.codegen.semidefinite import semidefinite_root
+from ...compiler.lowering.symbols import symbols_of, transition_moments
+from ...errors import ModelError
+from ...system.model import StateSpaceModel
+from .linearization import GaussianState, Linear, Symbols
 
 AtPoints = Callable[[TensorVariable], list[TensorVariable]]
 

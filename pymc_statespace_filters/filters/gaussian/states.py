@@ -8,32 +8,20 @@ from functools import lru_cache
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.codegen.function_types import jit
-from pymc_statespace_filters.compiler.lowering.covariances import semidefinite_cholesky
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
-    HEALTH_SIZE,
-    RECORD,
-    REQUEST,
-    RESULTS,
-    STATE,
-    Plan,
-    plan_entry,
-)
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK, FILL_NORMALS
-from pymc_statespace_filters.compiler.numerics.philox import STATES
-from pymc_statespace_filters.filters.calls import OK, opened, reals_at, wanted_rows
-from pymc_statespace_filters.filters.gaussian.bryson_frazier import BrysonFrazier
-from pymc_statespace_filters.filters.gaussian.forward import forward_pass
-from pymc_statespace_filters.filters.gaussian.functions import (
-    ALONG,
-    Functions,
-    checked,
-    compiled,
-    extensions,
-    places_of,
-)
-from pymc_statespace_filters.filters.gaussian.group import (
+from ...compiler.codegen.function_types import jit
+from ...compiler.lowering.covariances import semidefinite_cholesky
+from ...compiler.native.jit import njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, Plan, plan_entry
+from ...compiler.numerics.normals import BLOCK, FILL_NORMALS
+from ...compiler.numerics.philox import STATES
+from ..calls import OK, opened, reals_at, wanted_rows
+from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
+from ..plan import PLAN, make_plan, settings_of
+from ..protocol import System
+from .bryson_frazier import BrysonFrazier
+from .forward import forward_pass
+from .functions import ALONG, Functions, checked, compiled, extensions, places_of
+from .group import (
     N_OF_RECORD,
     copy,
     load_parameters,
@@ -43,12 +31,9 @@ from pymc_statespace_filters.filters.gaussian.group import (
     set_all,
     table_of,
 )
-from pymc_statespace_filters.filters.gaussian.linearization import Linearization
-from pymc_statespace_filters.filters.gaussian.machine import call, read_machine, workspace
-from pymc_statespace_filters.filters.gaussian.recursion import GaussianFilterFunctions
-from pymc_statespace_filters.filters.outcomes import NONE, OUT_OF_MEMORY, is_missing
-from pymc_statespace_filters.filters.plan import PLAN, make_plan, settings_of
-from pymc_statespace_filters.filters.protocol import System
+from .linearization import Linearization
+from .machine import call, read_machine, workspace
+from .recursion import GaussianFilterFunctions
 
 MOMENTS = {"predicted": 0, "filtered": 1, "smoothed": 2}
 _PREDICTED, _, _SMOOTHED = MOMENTS.values()

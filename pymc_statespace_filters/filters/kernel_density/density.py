@@ -16,23 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
-from pymc_statespace_filters.compiler.numerics.small_cholesky import (
-    LOG_TWO_PI,
-    semidefinite_cholesky,
-)
-from pymc_statespace_filters.filters.kernel_density.direct_sum import (
-    compact,
-    kernel_sum_workspace,
-    log_kernel_sum,
-)
-from pymc_statespace_filters.filters.kernel_density.gridded_sum import gridded_sum_workspace
-from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
-from pymc_statespace_filters.filters.kernel_density.shifted_sum import (
-    log_gridded_sums,
-    shifted_sum_workspace,
-)
+from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.numerics.normals import BLOCK
+from ...compiler.numerics.small_cholesky import LOG_TWO_PI, semidefinite_cholesky
+from .direct_sum import compact, kernel_sum_workspace, log_kernel_sum
+from .gridded_sum import gridded_sum_workspace
+from .points import Points, complete_points
+from .shifted_sum import log_gridded_sums, shifted_sum_workspace
 
 _SQRT_HALF = math.sqrt(0.5)
 _KNOWN = 1e-13  # a smaller spread, relative to the mean, is rounding of a value known exactly

@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.filters.ensemble.reductions import HALVES
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.normals import BLOCK
+from ...compiler.numerics.restricted_domain import exp
+from ..ensemble.reductions import HALVES
 
 
 @njit_internal

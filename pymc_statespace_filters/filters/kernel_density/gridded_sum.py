@@ -25,18 +25,12 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.normals import BLOCK
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.filters.ensemble.partition import (
-    BLOCKS,
-    MEMBERS,
-    RankLayout,
-    allgather,
-    local_range,
-)
-from pymc_statespace_filters.filters.kernel_density.points import complete_points
-from pymc_statespace_filters.filters.kernel_density.simd_windows import (
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.normals import BLOCK
+from ...compiler.numerics.restricted_domain import exp
+from ..ensemble.partition import BLOCKS, MEMBERS, RankLayout, allgather, local_range
+from .points import complete_points
+from .simd_windows import (
     LANES,
     POINTS,
     REACH,

@@ -9,20 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.ensemble.kalman_update import (
-    Moments,
-    equal_weights,
-    moments_workspace,
-)
-from pymc_statespace_filters.filters.ensemble.reductions import weighted_cov, weighted_mean
-from pymc_statespace_filters.filters.kernel_density.density import (
-    density_workspace,
-    kernel_workspace,
-    log_kernel_density,
-    scott_bandwidth,
-)
-from pymc_statespace_filters.filters.plan import log_density
+from ...compiler.native.jit import njit_internal
+from ..ensemble.kalman_update import Moments, equal_weights, moments_workspace
+from ..ensemble.reductions import weighted_cov, weighted_mean
+from ..plan import log_density
+from .density import density_workspace, kernel_workspace, log_kernel_density, scott_bandwidth
 
 
 class Scratch(NamedTuple):

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.ensemble.partition import MEMBERS, allgather
+from ...compiler.native.jit import njit_internal
+from ..ensemble.partition import MEMBERS, allgather
 
 
 class Points(NamedTuple):

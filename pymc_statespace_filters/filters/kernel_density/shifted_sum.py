@@ -16,17 +16,12 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp, log
-from pymc_statespace_filters.filters.ensemble.partition import (
-    BLOCKS,
-    MEMBERS,
-    allgather,
-    local_range,
-)
-from pymc_statespace_filters.filters.kernel_density.direct_sum import compact, log_kernel_sum
-from pymc_statespace_filters.filters.kernel_density.gridded_sum import FLOOR, gridded_sums
-from pymc_statespace_filters.filters.kernel_density.points import Points, complete_points
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.restricted_domain import exp, log
+from ..ensemble.partition import BLOCKS, MEMBERS, allgather, local_range
+from .direct_sum import compact, log_kernel_sum
+from .gridded_sum import FLOOR, gridded_sums
+from .points import Points, complete_points
 
 _LOG_FLOOR = math.log(FLOOR)
 _FEW = 64  # so many exact sums cost less than another grid; both costs are O(N)

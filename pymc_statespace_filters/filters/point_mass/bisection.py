@@ -5,25 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.outcomes import (
-    GRID_TOO_LARGE,
-    NO_FINITE_MEMBER,
-    NO_PROCESS_NOISE,
-    NONE,
-    ZERO_WEIGHTS,
-)
-from pymc_statespace_filters.filters.plan import log_density, step_moments
-from pymc_statespace_filters.filters.point_mass.recursion import TOO_SHORT
-from pymc_statespace_filters.filters.point_mass.segments import (
-    MAX_SEGMENTS,
-    POINTS,
-    density,
-    narrowest_within,
-    points_of,
-    tail,
-    weight,
-)
+from ...compiler.native.jit import njit_internal
+from ..outcomes import GRID_TOO_LARGE, NO_FINITE_MEMBER, NO_PROCESS_NOISE, NONE, ZERO_WEIGHTS
+from ..plan import log_density, step_moments
+from .recursion import TOO_SHORT
+from .segments import MAX_SEGMENTS, POINTS, density, narrowest_within, points_of, tail, weight
 
 # Of a segment, in standard deviations of the noise: of the step before, and of the next one.
 _WIDEST = 4.0

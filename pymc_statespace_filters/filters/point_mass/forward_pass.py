@@ -9,16 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.outcomes import (
-    GRID_TOO_LARGE,
-    NO_PROCESS_NOISE,
-    NONE,
-    TOO_FAR,
-    is_missing,
-)
-from pymc_statespace_filters.filters.plan import step_moments
-from pymc_statespace_filters.filters.point_mass.recursion import (
+from ...compiler.native.jit import inline_always, njit_internal
+from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, TOO_FAR, is_missing
+from ..plan import step_moments
+from .recursion import (
     REFINEMENT,
     TOO_COARSE,
     TOO_SHORT,

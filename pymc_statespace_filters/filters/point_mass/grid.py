@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal, njit_reassoc
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+from ...compiler.native.jit import njit_internal, njit_reassoc
+from ...compiler.numerics.restricted_domain import exp
 
 MAX_POINTS = 8192
 """A grid of more points is a failure, see `filters.outcomes`."""

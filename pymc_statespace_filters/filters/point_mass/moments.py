@@ -2,7 +2,7 @@
 
 import math
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal, njit_reassoc
+from ...compiler.native.jit import inline_always, njit_internal, njit_reassoc
 
 _HALVINGS = 40  # of the bisection for a draw within a cell
 _STRIDE = 16  # points, in the search for that cell

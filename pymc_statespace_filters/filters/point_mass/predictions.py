@@ -12,26 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import keep_alive, njit_internal
-from pymc_statespace_filters.compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
-from pymc_statespace_filters.filters.calls import OK, opened, reals_at, single_record
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.filters.plan import PLAN, observe, read_system, settings_of
-from pymc_statespace_filters.filters.point_mass.forward_pass import (
-    END,
-    ON_GRID,
-    ON_SEGMENTS,
-    attempt,
-    first_grid,
-    next_attempt,
-)
-from pymc_statespace_filters.filters.point_mass.grid import grid_points
-from pymc_statespace_filters.filters.point_mass.moments import total_mass
-from pymc_statespace_filters.filters.point_mass.recursion import has_valid_covariances
-from pymc_statespace_filters.filters.point_mass.segment_pass import (
-    pass_on_segments,
-)
-from pymc_statespace_filters.filters.point_mass.segments import POINTS, points_of
+from ...compiler.native.jit import keep_alive, njit_internal
+from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
+from ..calls import OK, opened, reals_at, single_record
+from ..outcomes import NONE
+from ..plan import PLAN, observe, read_system, settings_of
+from .forward_pass import END, ON_GRID, ON_SEGMENTS, attempt, first_grid, next_attempt
+from .grid import grid_points
+from .moments import total_mass
+from .recursion import has_valid_covariances
+from .segment_pass import pass_on_segments
+from .segments import POINTS, points_of
 
 
 class _Laws(NamedTuple):

@@ -12,16 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.outcomes import (
-    GRID_TOO_LARGE,
-    NO_FINITE_MEMBER,
-    NO_PROCESS_NOISE,
-    NONE,
-    ZERO_WEIGHTS,
-)
-from pymc_statespace_filters.filters.plan import log_density, step_moments
-from pymc_statespace_filters.filters.point_mass.grid import (
+from ...compiler.native.jit import njit_internal
+from ..outcomes import GRID_TOO_LARGE, NO_FINITE_MEMBER, NO_PROCESS_NOISE, NONE, ZERO_WEIGHTS
+from ..plan import log_density, step_moments
+from .grid import (
     MAX_POINTS,
     aliasing,
     coarseness,
@@ -34,15 +28,7 @@ from pymc_statespace_filters.filters.point_mass.grid import (
     total,
     weigh,
 )
-from pymc_statespace_filters.filters.point_mass.tiles import (
-    LANES,
-    Tiles,
-    block_of,
-    multiply,
-    no_tiles,
-    tiles_to_sources,
-    tiles_to_targets,
-)
+from .tiles import LANES, Tiles, block_of, multiply, no_tiles, tiles_to_sources, tiles_to_targets
 
 # Reasons to repeat the pass on another grid; all other codes are those of `outcomes`.
 TOO_COARSE, TOO_SHORT = -1, -2

@@ -8,32 +8,12 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.filters.outcomes import (
-    NO_FINITE_MEMBER,
-    NONE,
-    TOO_FAR,
-    is_missing,
-)
-from pymc_statespace_filters.filters.point_mass.bisection import (
-    Accuracy,
-    Step,
-    known_point,
-    resolved_segments,
-)
-from pymc_statespace_filters.filters.point_mass.forward_pass import (
-    LENGTHENING,
-    LONGEST_REACH,
-    SHORTEST_REACH,
-)
-from pymc_statespace_filters.filters.point_mass.recursion import (
-    TOO_COARSE,
-    TOO_SHORT,
-    initial_moments,
-    is_known,
-    truncation_of,
-)
-from pymc_statespace_filters.filters.point_mass.segments import POINTS, mixture
+from ...compiler.native.jit import inline_always, njit_internal
+from ..outcomes import NO_FINITE_MEMBER, NONE, TOO_FAR, is_missing
+from .bisection import Accuracy, Step, known_point, resolved_segments
+from .forward_pass import LENGTHENING, LONGEST_REACH, SHORTEST_REACH
+from .recursion import TOO_COARSE, TOO_SHORT, initial_moments, is_known, truncation_of
+from .segments import POINTS, mixture
 
 # Relative to the tolerance: a segment's share of the error, and a mass that need not be resolved.
 _SHARE, _NEGLIGIBLE = 0.1, 1e-5

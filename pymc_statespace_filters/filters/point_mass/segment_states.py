@@ -4,25 +4,16 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.filters.outcomes import NONE
-from pymc_statespace_filters.filters.point_mass.bisection import empty_segments
-from pymc_statespace_filters.filters.point_mass.forward_pass import LONGEST_REACH
-from pymc_statespace_filters.filters.point_mass.recursion import TOO_COARSE, TOO_SHORT
-from pymc_statespace_filters.filters.point_mass.rows import PREDICTED, SMOOTHED
-from pymc_statespace_filters.filters.point_mass.segment_pass import (
-    first_accuracy,
-    next_accuracy,
-    pass_from,
-)
-from pymc_statespace_filters.filters.point_mass.segments import (
-    POINTS,
-    draw,
-    mean_over_gaussian,
-    moments,
-)
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.philox import STATES, uniform_at
+from ...compiler.numerics.restricted_domain import exp
+from ..outcomes import NONE
+from .bisection import empty_segments
+from .forward_pass import LONGEST_REACH
+from .recursion import TOO_COARSE, TOO_SHORT
+from .rows import PREDICTED, SMOOTHED
+from .segment_pass import first_accuracy, next_accuracy, pass_from
+from .segments import POINTS, draw, mean_over_gaussian, moments
 
 _FINER = 1e-10  # the next floor, where smoothed mass lies on segments that were not resolved
 

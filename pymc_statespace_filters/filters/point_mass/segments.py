@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import eval_legendre, roots_jacobi
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.restricted_domain import exp
 
 POINTS = 16  # of a segment
 MAX_SEGMENTS = 512

@@ -18,31 +18,14 @@ import math
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inline_always, njit_internal
-from pymc_statespace_filters.compiler.native.plan import (
-    HEALTH_SIZE,
-    RECORD,
-    REQUEST,
-    RESULTS,
-    plan_entry,
-)
-from pymc_statespace_filters.compiler.numerics.philox import STATES, uniform_at
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp
-from pymc_statespace_filters.filters.calls import (
-    OK,
-    opened,
-    reals_at,
-    single_record,
-    wanted_rows,
-)
-from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NONE,
-    OUT_OF_MEMORY,
-    is_missing,
-)
-from pymc_statespace_filters.filters.plan import log_density, read_system, settings_of
-from pymc_statespace_filters.filters.point_mass.forward_pass import (
+from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ...compiler.numerics.philox import STATES, uniform_at
+from ...compiler.numerics.restricted_domain import exp
+from ..calls import OK, opened, reals_at, single_record, wanted_rows
+from ..outcomes import COVARIANCE_NOT_POSITIVE, NONE, OUT_OF_MEMORY, is_missing
+from ..plan import log_density, read_system, settings_of
+from .forward_pass import (
     END,
     ON_GRID,
     ON_SEGMENTS,
@@ -51,22 +34,12 @@ from pymc_statespace_filters.filters.point_mass.forward_pass import (
     next_attempt,
     write_outcome,
 )
-from pymc_statespace_filters.filters.point_mass.grid import gather, grid_points
-from pymc_statespace_filters.filters.point_mass.moments import draw, mean_and_sd, total_mass
-from pymc_statespace_filters.filters.point_mass.recursion import (
-    TOO_SHORT,
-    empty_table,
-    has_valid_covariances,
-    transition_at,
-    with_sources,
-)
-from pymc_statespace_filters.filters.point_mass.rows import (
-    PREDICTED,
-    SMOOTHED,
-    Rows,
-)
-from pymc_statespace_filters.filters.point_mass.segment_states import states_on_segments
-from pymc_statespace_filters.filters.point_mass.tiles import LANES, block_of, multiply
+from .grid import gather, grid_points
+from .moments import draw, mean_and_sd, total_mass
+from .recursion import TOO_SHORT, empty_table, has_valid_covariances, transition_at, with_sources
+from .rows import PREDICTED, SMOOTHED, Rows
+from .segment_states import states_on_segments
+from .tiles import LANES, block_of, multiply
 
 
 @njit_internal

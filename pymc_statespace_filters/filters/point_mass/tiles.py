@@ -16,8 +16,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.filters.point_mass.grid import add_gaussian
+from ...compiler.native.jit import njit_internal
+from .grid import add_gaussian
 
 LANES = 8
 _SUMS = 4  # side by side, as one addition waits for the one before

@@ -20,14 +20,10 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.journal import ChainJournal, sync_folder
-from pymc_statespace_filters.sampling.checkpoint.lease import (
-    FolderLease,
-    becomes_visible,
-    check_held,
-)
-from pymc_statespace_filters.sampling.checkpoint.manifest import canonical, write_or_compare
+from ...errors import ModelError
+from .journal import ChainJournal, sync_folder
+from .lease import FolderLease, becomes_visible, check_held
+from .manifest import canonical, write_or_compare
 
 _MAX_READABLE = 40  # characters of a name
 

@@ -10,7 +10,7 @@ from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.random.type import RandomType
 
-from pymc_statespace_filters.system.graph_digest import described, digest, graph_digest
+from ...system.graph_digest import described, digest, graph_digest
 
 
 def model_fingerprint(model: pm.Model) -> str:

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.errors import CheckpointError, CheckpointWarning
+from ...errors import CheckpointError, CheckpointWarning
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -23,7 +23,7 @@ from uuid import uuid4
 
 from filelock import SoftFileLease
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 PREFIX = "lease."
 

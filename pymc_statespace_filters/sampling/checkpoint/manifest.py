@@ -7,9 +7,9 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling.checkpoint.journal import sync_folder
-from pymc_statespace_filters.sampling.checkpoint.lease import PREFIX
+from ...errors import DataMismatchError, ModelError
+from .journal import sync_folder
+from .lease import PREFIX
 
 _FORMAT = "pymc_statespace_filters checkpoint"
 _VERSION = 2

@@ -38,8 +38,8 @@ A. Gelman, G. Roberts and W. Gilks (1996). Efficient Metropolis jumping rules. B
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import linked
-from pymc_statespace_filters.sampling.kernel.adaptation_state import (
+from ...compiler.native.jit import linked
+from .adaptation_state import (
     FIRST,
     MOVED,
     N_BLOCKS,

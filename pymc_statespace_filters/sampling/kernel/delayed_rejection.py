@@ -29,7 +29,7 @@ P. J. Green and A. Mira (2001). Delayed rejection in reversible jump Metropolis-
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import linked
+from ...compiler.native.jit import linked
 
 
 @linked()

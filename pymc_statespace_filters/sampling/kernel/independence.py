@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from pymc_statespace_filters.compiler.native.jit import linked
-from pymc_statespace_filters.student_mixture import DEGREES_OF_FREEDOM
+from ...compiler.native.jit import linked
+from ...student_mixture import DEGREES_OF_FREEDOM
 
 MOST_COMPONENTS = 9
 

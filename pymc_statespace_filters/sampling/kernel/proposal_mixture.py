@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from pymc_statespace_filters.sampling.kernel.independence import (
+from ...student_mixture import (
+    DEGREES_OF_FREEDOM,
+    StudentMixture,
+    fit_mixture,
+    place_components,
+    standardised,
+)
+from .independence import (
     CUMULATIVE,
     LOG_FACTOR,
     MEAN,
@@ -24,20 +31,7 @@ from pymc_statespace_filters.sampling.kernel.independence import (
     no_mixture,
     unpack_mixture,
 )
-from pymc_statespace_filters.sampling.kernel.state import (
-    INDEPENDENT,
-    N_EVALUATIONS,
-    N_SCREENED,
-    STAGE,
-    Draws,
-)
-from pymc_statespace_filters.student_mixture import (
-    DEGREES_OF_FREEDOM,
-    StudentMixture,
-    fit_mixture,
-    place_components,
-    standardised,
-)
+from .state import INDEPENDENT, N_EVALUATIONS, N_SCREENED, STAGE, Draws
 
 FIRST_SHARE = 0.5  # of a mixture not tried yet
 LEAST_SHARE, MOST_SHARE = 0.2, 0.65  # the least while tuning, so that it goes on being tried

@@ -7,8 +7,8 @@ any iteration, on any rank.
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.kernel.state import RandomBlock
-from pymc_statespace_filters.student_mixture import DEGREES_OF_FREEDOM
+from ...student_mixture import DEGREES_OF_FREEDOM
+from .state import RandomBlock
 
 BLOCK = 256
 

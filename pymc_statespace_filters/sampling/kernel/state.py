@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.pytensor_function import Call
-from pymc_statespace_filters.filters.outcomes import FAILURES
-from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
+from ...compiler.native.pytensor_function import Call
+from ...filters.outcomes import FAILURES
+from .adaptation_state import unpack
 
 HEALTH_SIZE = 3
 # Failure codes that no filter reports: a log-density of NaN or plus infinity, an exception.

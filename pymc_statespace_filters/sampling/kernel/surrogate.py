@@ -16,7 +16,7 @@ J. S. Liu (2001). Monte Carlo Strategies in Scientific Computing. Springer.
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import linked
+from ...compiler.native.jit import linked
 
 
 @linked()

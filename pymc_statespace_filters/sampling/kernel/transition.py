@@ -20,20 +20,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import njit_cached
-from pymc_statespace_filters.compiler.native.jit import copy_into, linked
-from pymc_statespace_filters.compiler.native.pytensor_function import make_call
-from pymc_statespace_filters.sampling.kernel.adaptation import learn
-from pymc_statespace_filters.sampling.kernel.adaptation_state import unpack
-from pymc_statespace_filters.sampling.kernel.delayed_rejection import gaussian_log_acceptance
-from pymc_statespace_filters.sampling.kernel.independence import (
+from ...compiler.native.entry_point import njit_cached
+from ...compiler.native.jit import copy_into, linked
+from ...compiler.native.pytensor_function import make_call
+from .adaptation import learn
+from .adaptation_state import unpack
+from .delayed_rejection import gaussian_log_acceptance
+from .independence import (
     SHARE,
     ProposalMixture,
     draw_from_mixture,
     log_mixture_density,
     unpack_mixture,
 )
-from pymc_statespace_filters.sampling.kernel.state import (
+from .state import (
     ACCEPTANCE,
     FAILURE,
     HEALTH_SIZE,
@@ -53,7 +53,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
     STAGE,
     Evaluation,
 )
-from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acceptance
+from .surrogate import log_surrogate_acceptance
 
 
 class _Move(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from arviz_stats.base import array_stats
 
-from pymc_statespace_filters.sampling.output.datatree import most_iterations
+from .datatree import most_iterations
 
 # Above this R-hat the chains disagree: the limit of `pm.sample` and of Vehtari and others (2021).
 MAX_RHAT = 1.01

@@ -15,9 +15,9 @@ from pymc.backends.base import IBaseTrace, MultiTrace
 from pymc.model import Model
 from xarray import DataTree
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.output.deterministics import Deterministics
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from ...errors import ModelError
+from ..target.variables import RaveledVariables
+from .deterministics import Deterministics
 
 # Groups with draws, and those with statistics of them.
 SAMPLE_STATS = {"sample_stats", "warmup_sample_stats"}

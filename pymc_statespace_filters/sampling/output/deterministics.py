@@ -37,10 +37,10 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.type import TensorType
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
-from pymc_statespace_filters.compiler.native.rows import Rows, at_points
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from ...compiler.native.pytensor_function import NativeFunction
+from ...compiler.native.rows import Rows, at_points
+from ...pymc_model.compilation import compile_raveled
+from ..target.variables import RaveledVariables
 
 # Positions in a block, whose intermediate results stay in the processor's cache.
 BLOCK = 4096

@@ -25,10 +25,10 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning
 from scipy.stats import t as student_t
 
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds, side_generator
-from pymc_statespace_filters.sampling.kernel.state import LOG_DENSITY, Draws, Evaluation
-from pymc_statespace_filters.sampling.output.warnings import sampler_warning
-from pymc_statespace_filters.sampling.target.sampled_model import SampledModel
+from ..kernel.random_numbers import draw_seeds, side_generator
+from ..kernel.state import LOG_DENSITY, Draws, Evaluation
+from ..target.sampled_model import SampledModel
+from .warnings import sampler_warning
 
 # The variances between which a chain gains most per unit of time, and their geometric mean.
 TARGET = (1.0, 3.3)

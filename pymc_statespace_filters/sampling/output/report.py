@@ -7,16 +7,13 @@ import numpy as np
 from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning
 
-from pymc_statespace_filters.lower_chains import LowerChain
-from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
-from pymc_statespace_filters.sampling.kernel.state import failure_reason
-from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, Convergence
-from pymc_statespace_filters.sampling.output.datatree import most_iterations
-from pymc_statespace_filters.sampling.output.warnings import (
-    PhaseStatistics,
-    sampler_warning,
-)
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from ...lower_chains import LowerChain
+from ...progress import MIN_ACCEPT_RATE
+from ..kernel.state import failure_reason
+from ..target.variables import RaveledVariables
+from .convergence import MAX_RHAT, Convergence
+from .datatree import most_iterations
+from .warnings import PhaseStatistics, sampler_warning
 
 # Effective draws of each chain below which PyMC takes neither diagnostic for reliable.
 _ENOUGH_PER_CHAIN = 100

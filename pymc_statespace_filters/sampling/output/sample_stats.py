@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
-from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
-from pymc_statespace_filters.sampling.kernel.state import (
+from ..kernel.records.arrays import N_POPULATION_MOVES
+from ..kernel.state import (
     ACCEPTANCE,
     FAILURE,
     INDEPENDENT,
@@ -23,8 +23,8 @@ from pymc_statespace_filters.sampling.kernel.state import (
     Draws,
     has_moved,
 )
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
-from pymc_statespace_filters.sampling.target.target import Target
+from ..target.record_target import RecordTarget
+from ..target.target import Target
 
 # PyMC's names: it renames the first to "lp", and logs and removes the second.
 MODEL_LOGP, WARNING = "model_logp", "warning"

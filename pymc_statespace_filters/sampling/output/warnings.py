@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
-from pymc_statespace_filters.filters.outcomes import COLLAPSED
-from pymc_statespace_filters.lower_chains import LowerChain, lower_chains
-from pymc_statespace_filters.progress import MIN_ACCEPT_RATE
-from pymc_statespace_filters.sampling.kernel.records.arrays import N_POPULATION_MOVES
-from pymc_statespace_filters.sampling.kernel.state import (
+from ...filters.outcomes import COLLAPSED
+from ...lower_chains import LowerChain, lower_chains
+from ...progress import MIN_ACCEPT_RATE
+from ..kernel.records.arrays import N_POPULATION_MOVES
+from ..kernel.state import (
     FAILURE,
     LOG_DENSITY,
     N_COMMON_BLOCKS,
@@ -28,9 +28,9 @@ from pymc_statespace_filters.sampling.kernel.state import (
     failure_reason,
     has_moved,
 )
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
-from pymc_statespace_filters.sampling.target.sampled_model import Growth
-from pymc_statespace_filters.sampling.target.target import Target
+from ..target.record_target import RecordTarget
+from ..target.sampled_model import Growth
+from ..target.target import Target
 
 # Fraction of evaluations after warm-up that may fail without a warning: a chain that touches the
 # edge of the region where its filter works is normal.

@@ -4,20 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.filters.recommendation import short_form
-from pymc_statespace_filters.pymc_model.inspection import resized
-from pymc_statespace_filters.sampling.particle_number.effort import Effort, OutOfTimeError
-from pymc_statespace_filters.sampling.particle_number.noisiest import (
-    describe,
-    is_concentrated,
-    noisiest_terms,
-)
-from pymc_statespace_filters.sampling.particle_number.noisy_likelihood import (
-    Estimates,
-    NoisyLikelihood,
-)
-from pymc_statespace_filters.sampling.particle_number.search import Row
+from ...filters.protocol import Filter
+from ...filters.recommendation import short_form
+from ...pymc_model.inspection import resized
+from .effort import Effort, OutOfTimeError
+from .noisiest import describe, is_concentrated, noisiest_terms
+from .noisy_likelihood import Estimates, NoisyLikelihood
+from .search import Row
 
 # Evaluations at a point: in a first estimate, at the centre, and at each point of the tail.
 _FIRST, _CENTRE, _TAIL = 25, 100, 30

@@ -6,37 +6,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymc.model import Model
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.protocol import Filter
-from pymc_statespace_filters.pymc_model.aligned_axes import records_of_rows
-from pymc_statespace_filters.pymc_model.density import RowFunction
-from pymc_statespace_filters.pymc_model.graph_rewrites import likelihood_terms, with_filter
-from pymc_statespace_filters.pymc_model.inspection import (
+from ...errors import ModelError
+from ...filters.protocol import Filter
+from ...pymc_model.aligned_axes import records_of_rows
+from ...pymc_model.density import RowFunction
+from ...pymc_model.graph_rewrites import likelihood_terms, with_filter
+from ...pymc_model.inspection import (
     noise_seeds,
     noisy_filters,
     quieter_filter,
     resized,
     state_space_nodes,
 )
-from pymc_statespace_filters.pymc_model.panel_structure import panel_structure
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.output.likelihood_variance import (
-    TOO_NOISY,
-    SeedSpread,
-    spread_of,
-)
-from pymc_statespace_filters.sampling.particle_number.effort import Effort
-from pymc_statespace_filters.sampling.particle_number.pilot_chain import (
-    SETTINGS,
-    Pilot,
-    pilot_chains,
-    run_pilot,
-)
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.sampling.target.variables import (
-    RaveledVariables,
-    continuous_value_vars,
-)
+from ...pymc_model.panel_structure import panel_structure
+from ..kernel.random_numbers import draw_seeds
+from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_of
+from ..target.target import Target
+from ..target.variables import RaveledVariables, continuous_value_vars
+from .effort import Effort
+from .pilot_chain import SETTINGS, Pilot, pilot_chains, run_pilot
 
 # The tail points among the pilot's draws: fractions of the draws of lower density.
 _TAIL_FRACTIONS = (0.01, 0.02, 0.03, 0.04, 0.05)

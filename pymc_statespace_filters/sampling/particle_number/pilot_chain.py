@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.parallel.cpu_affinity import available_cores
-from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.state import LOG_DENSITY
-from pymc_statespace_filters.sampling.particle_number.effort import Effort
-from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target.target import Target
+from ...parallel.cpu_affinity import available_cores
+from ..kernel.independence import no_mixture
+from ..kernel.state import LOG_DENSITY
+from ..run.chain_task import ChainTask
+from ..run.thread_pool import ChainPool
+from ..target.settings import DRAMSettings
+from ..target.target import Target
+from .effort import Effort
 
 N_CHAINS, N_TUNE, N_DRAWS = 2, 300, 200
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from pymc_statespace_filters.sampling.output.likelihood_variance import TOO_NOISY, SeedSpread
+from ..output.likelihood_variance import TOO_NOISY, SeedSpread
 
 # Numbers tried have two digits at most, and each is at most a sixth above the one before.
 _MANTISSAS = (1, 1.1, 1.2, 1.4, 1.6, 1.8, 2, 2.2, 2.5, 2.8, 3, 3.5, 4, 4.5, 5, 5.5, 6, 7, 8, 9, 10)

@@ -8,20 +8,14 @@ import numpy as np
 import pandas as pd
 from pymc.model import Model
 
-from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.sampling.output.likelihood_variance import TARGET, acceptance_share
-from pymc_statespace_filters.sampling.particle_number.effort import Effort, OutOfTimeError
-from pymc_statespace_filters.sampling.particle_number.measurement import Measurement
-from pymc_statespace_filters.sampling.particle_number.noisy_likelihood import NoisyLikelihood
-from pymc_statespace_filters.sampling.particle_number.search import (
-    Row,
-    best_guess,
-    choose,
-    nearest_row,
-    search,
-)
-from pymc_statespace_filters.system.checks import check_positive, check_random_seed
+from ...errors import FilterWarning, ModelError
+from ...progress import row_progress
+from ...system.checks import check_positive, check_random_seed
+from ..output.likelihood_variance import TARGET, acceptance_share
+from .effort import Effort, OutOfTimeError
+from .measurement import Measurement
+from .noisy_likelihood import NoisyLikelihood
+from .search import Row, best_guess, choose, nearest_row, search
 
 
 class _Suggestion(NamedTuple):

@@ -5,28 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.kernel.adaptation_state import (
-    pack,
-    packed_size,
-    start_adaptation,
-)
-from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.kernel.state import (
-    N_COUNTS,
-    ChainState,
-    Evaluation,
-    PhaseSettings,
-    RandomBlock,
-)
-from pymc_statespace_filters.sampling.kernel.transition import advance
-from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread, seed_spread
-from pymc_statespace_filters.sampling.run.chain_arrays import ChainArrays
-from pymc_statespace_filters.sampling.target.initial_points import (
-    EvaluatedPoint,
-    best_initial_point,
-)
-from pymc_statespace_filters.sampling.target.target import Target
+from ..kernel.adaptation_state import pack, packed_size, start_adaptation
+from ..kernel.independence import no_mixture
+from ..kernel.random_numbers import draw_seeds
+from ..kernel.state import N_COUNTS, ChainState, Evaluation, PhaseSettings, RandomBlock
+from ..kernel.transition import advance
+from ..output.likelihood_variance import SeedSpread, seed_spread
+from ..target.initial_points import EvaluatedPoint, best_initial_point
+from ..target.target import Target
+from .chain_arrays import ChainArrays
 
 
 class Chain(ChainArrays):

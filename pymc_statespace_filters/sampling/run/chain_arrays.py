@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.sampling.kernel.random_numbers import BLOCK
-from pymc_statespace_filters.sampling.kernel.state import (
+from ...parallel.signals import held_interrupts
+from ..kernel.random_numbers import BLOCK
+from ..kernel.state import (
     ACCEPTANCE,
     FAILURE,
     N_DONE,
@@ -25,8 +25,8 @@ from pymc_statespace_filters.sampling.kernel.state import (
     Draws,
     PhaseSettings,
 )
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
-from pymc_statespace_filters.sampling.target.target import Target
+from ..target.record_target import RecordTarget
+from ..target.target import Target
 
 
 class StopRequested(Exception):

@@ -12,26 +12,14 @@ from threading import Event
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, log_warnings
 
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key, draw_seeds
-from pymc_statespace_filters.sampling.kernel.state import (
-    N_DONE,
-    N_FAILED,
-    PAUSE_REQUESTED,
-    STAGE,
-    ChainState,
-    Draws,
-    has_moved,
-)
-from pymc_statespace_filters.sampling.output.likelihood_variance import (
-    N_SEEDS,
-    N_STUCK,
-    start_warning,
-)
-from pymc_statespace_filters.sampling.run.chain_arrays import StopRequested
-from pymc_statespace_filters.sampling.run.record_chain import chain_of
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
-from pymc_statespace_filters.sampling.target.target import Target
+from ..checkpoint.checkpoint import Checkpoint
+from ..kernel.random_numbers import draw_key, draw_seeds
+from ..kernel.state import N_DONE, N_FAILED, PAUSE_REQUESTED, STAGE, ChainState, Draws, has_moved
+from ..output.likelihood_variance import N_SEEDS, N_STUCK, start_warning
+from ..target.record_target import RecordTarget
+from ..target.target import Target
+from .chain_arrays import StopRequested
+from .record_chain import chain_of
 
 CHECKPOINT_SECONDS = 5.0
 

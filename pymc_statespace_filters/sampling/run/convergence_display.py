@@ -3,9 +3,9 @@
 import time
 from collections.abc import Mapping, Sequence
 
-from pymc_statespace_filters.progress import ChainProgress
-from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.run.model_task import ModelTask
+from ...progress import ChainProgress
+from .chain_task import ChainTask
+from .model_task import ModelTask
 
 # Seconds between two computations, and the part of the time that they may take.
 _SECONDS, _SHARE = 2.0, 0.01

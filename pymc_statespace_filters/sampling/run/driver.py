@@ -22,16 +22,16 @@ from pymc.model import Model
 from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
-from pymc_statespace_filters.compiler.native.compilation import COMPILATION
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.parallel.communicator import Communicator, communicator_of
-from pymc_statespace_filters.parallel.cpu_affinity import allowed_cores, cores_per_process
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import join_checkpoint, open_checkpoint
-from pymc_statespace_filters.sampling.output.report import no_draws_warning
-from pymc_statespace_filters.sampling.run.model_task import ModelTask
-from pymc_statespace_filters.sampling.run.request import ExecutionOptions, SamplingRequest
-from pymc_statespace_filters.sampling.run.scheduler import run_chains
-from pymc_statespace_filters.sampling.target.leader_follower import follow, release_followers
+from ...compiler.native.compilation import COMPILATION
+from ...errors import DataMismatchError, ModelError
+from ...parallel.communicator import Communicator, communicator_of
+from ...parallel.cpu_affinity import allowed_cores, cores_per_process
+from ..checkpoint.checkpoint import join_checkpoint, open_checkpoint
+from ..output.report import no_draws_warning
+from ..target.leader_follower import follow, release_followers
+from .model_task import ModelTask
+from .request import ExecutionOptions, SamplingRequest
+from .scheduler import run_chains
 
 _SEED_ADVICE = (
     ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "

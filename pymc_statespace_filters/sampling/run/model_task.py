@@ -16,37 +16,25 @@ from pymc.stats.convergence import (
 )
 from xarray import DataTree
 
-from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.pymc_model.inspection import filters_used
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
-from pymc_statespace_filters.sampling.output.convergence import Convergence, convergence
-from pymc_statespace_filters.sampling.output.datatree import to_datatree
-from pymc_statespace_filters.sampling.output.likelihood_variance import (
-    is_measured,
-    spread_at_highest_draw,
-)
-from pymc_statespace_filters.sampling.output.report import (
-    closing_report,
-    element_names,
-    left_out_warnings,
-    until_ess_warning,
-)
-from pymc_statespace_filters.sampling.output.sample_stats import stat_dims, whole_chain
-from pymc_statespace_filters.sampling.output.warnings import (
-    PhaseStatistics,
-    chain_warnings,
-    lower_chains_of,
-)
-from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.run.population_search import search_population, searched_cov
-from pymc_statespace_filters.sampling.run.record_chain import chain_of
-from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.run.warm_up import WarmUp, stops_of
-from pymc_statespace_filters.sampling.target.initial_points import chain_candidates
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget, target_of
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.sampling.target.variables import check_no_generators
+from ...parallel.communicator import Communicator
+from ...pymc_model.inspection import filters_used
+from ..checkpoint.checkpoint import Checkpoint
+from ..kernel.state import ChainState, Draws
+from ..output.convergence import Convergence, convergence
+from ..output.datatree import to_datatree
+from ..output.likelihood_variance import is_measured, spread_at_highest_draw
+from ..output.report import closing_report, element_names, left_out_warnings, until_ess_warning
+from ..output.sample_stats import stat_dims, whole_chain
+from ..output.warnings import PhaseStatistics, chain_warnings, lower_chains_of
+from ..target.initial_points import chain_candidates
+from ..target.record_target import RecordTarget, target_of
+from ..target.target import Target
+from ..target.variables import check_no_generators
+from .chain_task import ChainTask
+from .population_search import search_population, searched_cov
+from .record_chain import chain_of
+from .request import SamplingRequest
+from .warm_up import WarmUp, stops_of
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.

@@ -6,14 +6,14 @@ import numpy as np
 from pymc.model import Model
 from pymc.stats.convergence import log_warnings
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.checkpoint import Checkpoint
-from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.run.warm_up import generator_of
-from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
-from pymc_statespace_filters.sampling.starts.population import N_POINTS, find_population
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.student_mixture import standardised
+from ...errors import ModelError
+from ...student_mixture import standardised
+from ..checkpoint.checkpoint import Checkpoint
+from ..starts.modes import modes_message, modes_warning
+from ..starts.population import N_POINTS, find_population
+from ..target.target import Target
+from .request import SamplingRequest
+from .warm_up import generator_of
 
 _UNUSABLE_PILOT = (
     "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "

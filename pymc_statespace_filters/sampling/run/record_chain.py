@@ -5,17 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.kernel.records.arrays import (
-    FIRST_ACCEPTED,
-    FIRST_ESTIMATE,
-    RecordRandomBlock,
-)
-from pymc_statespace_filters.sampling.kernel.records.evaluation import RecordEvaluation
-from pymc_statespace_filters.sampling.kernel.records.moves import advance_records
-from pymc_statespace_filters.sampling.kernel.state import (
+from ...errors import ModelError
+from ..kernel.independence import no_mixture
+from ..kernel.random_numbers import draw_seeds
+from ..kernel.records.arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, RecordRandomBlock
+from ..kernel.records.evaluation import RecordEvaluation
+from ..kernel.records.moves import advance_records
+from ..kernel.state import (
     LOG_DENSITY,
     N_COMMON_BLOCKS,
     N_EFFECTIVE,
@@ -23,12 +19,12 @@ from pymc_statespace_filters.sampling.kernel.state import (
     PhaseSettings,
     failure_reason,
 )
-from pymc_statespace_filters.sampling.output.likelihood_variance import SeedSpread, spread_of
-from pymc_statespace_filters.sampling.run.chain import Chain
-from pymc_statespace_filters.sampling.run.chain_arrays import ChainArrays
-from pymc_statespace_filters.sampling.target.initial_points import N_COMPARED
-from pymc_statespace_filters.sampling.target.record_target import RecordTarget
-from pymc_statespace_filters.sampling.target.target import Target
+from ..output.likelihood_variance import SeedSpread, spread_of
+from ..target.initial_points import N_COMPARED
+from ..target.record_target import RecordTarget
+from ..target.target import Target
+from .chain import Chain
+from .chain_arrays import ChainArrays
 
 # Draws of the prior of which each record starts at the likeliest.
 N_TRIED = 50

@@ -13,18 +13,10 @@ import numpy as np
 from pymc.model import Model
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
-    model_data_fingerprint,
-    model_fingerprint,
-)
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.system.checks import (
-    check_count,
-    check_flag,
-    check_positive,
-    is_integer,
-)
+from ...errors import ModelError
+from ...system.checks import check_count, check_flag, check_positive, is_integer
+from ..checkpoint.fingerprint import model_data_fingerprint, model_fingerprint
+from ..target.settings import DRAMSettings
 
 _GATHER = ("root", "all")
 _MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory

@@ -21,19 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ParallelError
-from pymc_statespace_filters.parallel.communicator import (
-    ABORT_GRACE_SECONDS,
-    Communicator,
-    describe_error,
-)
-from pymc_statespace_filters.parallel.signals import deferred_interrupts, ignored_interrupts
-from pymc_statespace_filters.progress import ChainProgress
-from pymc_statespace_filters.sampling.kernel.state import ChainState, Draws
-from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.run.convergence_display import ConvergenceDisplay
-from pymc_statespace_filters.sampling.run.model_task import ModelTask
-from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from ...errors import ParallelError
+from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, describe_error
+from ...parallel.signals import deferred_interrupts, ignored_interrupts
+from ...progress import ChainProgress
+from ..kernel.state import ChainState, Draws
+from .chain_task import ChainTask
+from .convergence_display import ConvergenceDisplay
+from .model_task import ModelTask
+from .thread_pool import ChainPool
 
 # Kinds of messages: to rank 0, ...
 _IDLE, _PROGRESS, _RESULT, _FAILED, _LEAVING = "idle", "progress", "result", "failed", "leaving"

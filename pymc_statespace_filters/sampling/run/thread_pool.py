@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from .chain_task import ChainTask
 
 _REFRESH_SECONDS = 0.1
 

@@ -13,10 +13,10 @@ import scipy.linalg
 import xarray as xr
 from pymc.model import Model
 
-from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.pymc_model.posterior_draws import posterior_group, unconstrained_draws
-from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.target.variables import continuous_value_vars
+from ...errors import DataMismatchError, ModelError
+from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from ..target.variables import continuous_value_vars
+from .request import SamplingRequest
 
 # Least eigenvalue of the draws' correlation matrix, below which they lie in a hyperplane.
 SINGULAR = 1e-10

@@ -4,15 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pymc_statespace_filters.sampling.kernel.independence import no_mixture
-from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
-    fitted_mixture,
-    improved_mixture,
-    warmup_parts,
-)
-from pymc_statespace_filters.sampling.kernel.state import Draws
-from pymc_statespace_filters.sampling.run.request import SamplingRequest
-from pymc_statespace_filters.sampling.starts.annealing import N_SWEEPS
+from ..kernel.independence import no_mixture
+from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
+from ..kernel.state import Draws
+from ..starts.annealing import N_SWEEPS
+from .request import SamplingRequest
 
 _NO_CHAIN = 2**32 - 1
 

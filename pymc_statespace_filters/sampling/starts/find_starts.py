@@ -4,11 +4,11 @@ import numpy as np
 from pymc.model import Model, modelcontext
 from pymc.stats.convergence import log_warnings
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
-from pymc_statespace_filters.sampling.starts.modes import modes_message, modes_warning
-from pymc_statespace_filters.sampling.starts.population import N_POINTS, population_of
-from pymc_statespace_filters.system.checks import check_count, check_flag, check_random_seed
+from ...errors import ModelError
+from ...pymc_model.constrained_values import ConstrainedValues
+from ...system.checks import check_count, check_flag, check_random_seed
+from .modes import modes_message, modes_warning
+from .population import N_POINTS, population_of
 
 
 def find_starts(

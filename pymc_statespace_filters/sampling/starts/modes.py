@@ -15,9 +15,9 @@ from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
 from scipy.spatial.distance import cdist
 
-from pymc_statespace_filters.pymc_model.constrained_values import ConstrainedValues
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
-from pymc_statespace_filters.student_mixture import fit_mixture, place_components, standardised
+from ...pymc_model.constrained_values import ConstrainedValues
+from ...student_mixture import fit_mixture, place_components, standardised
+from ..target.variables import RaveledVariables
 
 # With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
 _N_GROUPS = 4

@@ -8,13 +8,8 @@ component covers the prior of all variables, as the posterior may lie far from t
 import numpy as np
 from numpy.typing import NDArray
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.student_mixture import (
-    StudentMixture,
-    fit_mixture,
-    place_components,
-    standardised,
-)
+from ...errors import ModelError
+from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 
 _N_COMPONENTS = 4  # of the known draws, which may have several modes
 _PRIOR_WEIGHT = 0.2

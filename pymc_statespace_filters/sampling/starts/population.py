@@ -16,18 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
 
-from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.progress import row_progress
-from pymc_statespace_filters.pymc_model.support import can_sample
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_seeds
-from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
-from pymc_statespace_filters.sampling.starts.modes import Points, find_modes
-from pymc_statespace_filters.sampling.starts.nested import nested_reference
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
-from pymc_statespace_filters.student_mixture import StudentMixture
+from ...compiler.native.rows import Rows
+from ...errors import ModelError
+from ...progress import row_progress
+from ...pymc_model.support import can_sample
+from ...student_mixture import StudentMixture
+from ..kernel.random_numbers import draw_seeds
+from ..target.settings import DRAMSettings
+from ..target.target import Target
+from ..target.variables import RaveledVariables
+from .annealing import Population, anneal
+from .modes import Points, find_modes
+from .nested import nested_reference
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar

@@ -14,9 +14,9 @@ from pymc.initial_point import make_initial_point_fn, make_initial_point_fns_per
 from pymc.model import Model
 from pytensor.graph.basic import Variable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.kernel.state import failure_reason
-from pymc_statespace_filters.sampling.target.variables import RaveledVariables
+from ...errors import ModelError
+from ..kernel.state import failure_reason
+from .variables import RaveledVariables
 
 N_DRAWS = 200
 # Number of prior draws with finite log-density of which a chain starts at the best.

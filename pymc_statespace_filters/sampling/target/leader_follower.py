@@ -16,25 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymc.model import Model
 
-from pymc_statespace_filters.errors import ModelError, ParallelError
-from pymc_statespace_filters.ops.distributed import (
-    PythonCallback,
-    check_ranks,
-    distributed_evaluator,
-)
-from pymc_statespace_filters.parallel.communicator import (
-    ABORT_GRACE_SECONDS,
-    Communicator,
-    Message,
-    describe_error,
-)
-from pymc_statespace_filters.parallel.signals import (
-    deferred_interrupts,
-    held_interrupts,
-    ignored_interrupts,
-)
-from pymc_statespace_filters.pymc_model.inspection import noisy_filters, panel_variables
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from ...errors import ModelError, ParallelError
+from ...ops.distributed import PythonCallback, check_ranks, distributed_evaluator
+from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, Message, describe_error
+from ...parallel.signals import deferred_interrupts, held_interrupts, ignored_interrupts
+from ...pymc_model.inspection import noisy_filters, panel_variables
+from .settings import DRAMSettings
 
 # Messages of the leader: a likelihood with its record, an evaluation of it, the end.
 _RECORD, _EVALUATE, _END = "record", "evaluate", "end"

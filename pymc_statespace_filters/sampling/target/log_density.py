@@ -18,25 +18,17 @@ from pymc.model import Model
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
-from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.pymc_model.compilation import compile_density, compile_raveled
-from pymc_statespace_filters.pymc_model.graph_rewrites import (
-    autoregressive_noise,
-    with_filter,
-    with_likelihood_callback,
-)
-from pymc_statespace_filters.pymc_model.inspection import (
-    health_outputs,
-    log_density_terms,
-    state_space_nodes,
-)
-from pymc_statespace_filters.sampling.kernel.state import RAISED, Evaluation, NativeLogDensity
-from pymc_statespace_filters.sampling.kernel.transition import evaluate
-from pymc_statespace_filters.sampling.target.leader_follower import Leader, leader_errors
+from ...compiler.native.pytensor_function import NativeFunction
+from ...compiler.native.rows import Rows
+from ...errors import ModelError
+from ...parallel.communicator import Communicator
+from ...parallel.signals import held_interrupts
+from ...pymc_model.compilation import compile_density, compile_raveled
+from ...pymc_model.graph_rewrites import autoregressive_noise, with_filter, with_likelihood_callback
+from ...pymc_model.inspection import health_outputs, log_density_terms, state_space_nodes
+from ..kernel.state import RAISED, Evaluation, NativeLogDensity
+from ..kernel.transition import evaluate
+from .leader_follower import Leader, leader_errors
 
 
 class LogDensity:

@@ -12,18 +12,14 @@ import pytensor.tensor as pt
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
-from pymc_statespace_filters.pymc_model.inspection import health_outputs
-from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure
-from pymc_statespace_filters.sampling.kernel.records.arrays import NativeRecordDensities
-from pymc_statespace_filters.sampling.kernel.records.evaluation import (
-    RecordEvaluation,
-    evaluate_likelihoods,
-    evaluate_priors,
-)
-from pymc_statespace_filters.sampling.kernel.state import RAISED
+from ...compiler.native.pytensor_function import NativeFunction
+from ...parallel.signals import held_interrupts
+from ...pymc_model.compilation import compile_raveled
+from ...pymc_model.inspection import health_outputs
+from ...pymc_model.panel_structure import PanelStructure
+from ..kernel.records.arrays import NativeRecordDensities
+from ..kernel.records.evaluation import RecordEvaluation, evaluate_likelihoods, evaluate_priors
+from ..kernel.state import RAISED
 
 
 class RecordDensities:

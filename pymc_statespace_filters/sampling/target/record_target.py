@@ -6,20 +6,16 @@ import numpy as np
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.pymc_model.inspection import panel_variables
-from pymc_statespace_filters.pymc_model.panel_structure import PanelStructure, panel_structure
-from pymc_statespace_filters.sampling.kernel.records.arrays import (
-    RecordLayout,
-    RecordRandomBlock,
-    record_random_block,
-)
-from pymc_statespace_filters.sampling.kernel.state import ChainState
-from pymc_statespace_filters.sampling.target.record_densities import RecordDensities
-from pymc_statespace_filters.sampling.target.sampled_model import Growth, SampledModel
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
-from pymc_statespace_filters.sampling.target.target import Target
+from ...errors import ModelError
+from ...parallel.communicator import Communicator
+from ...pymc_model.inspection import panel_variables
+from ...pymc_model.panel_structure import PanelStructure, panel_structure
+from ..kernel.records.arrays import RecordLayout, RecordRandomBlock, record_random_block
+from ..kernel.state import ChainState
+from .record_densities import RecordDensities
+from .sampled_model import Growth, SampledModel
+from .settings import DRAMSettings, checked_proposal_cov
+from .target import Target
 
 
 class RecordTarget(SampledModel):

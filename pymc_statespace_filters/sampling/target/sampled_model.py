@@ -8,19 +8,11 @@ import numpy as np
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.inspection import (
-    collapse_remedies,
-    exactness,
-    noise_seeds,
-)
-from pymc_statespace_filters.sampling.target.initial_points import PriorDraws
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
-from pymc_statespace_filters.sampling.target.variables import (
-    RaveledVariables,
-    check_noise_dependencies,
-    continuous_value_vars,
-)
+from ...errors import ModelError
+from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds
+from .initial_points import PriorDraws
+from .settings import DRAMSettings
+from .variables import RaveledVariables, check_noise_dependencies, continuous_value_vars
 
 
 class Growth(NamedTuple):

@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.inspection import is_filter
-from pymc_statespace_filters.system.checks import check_count, is_integer
+from ...errors import ModelError
+from ...pymc_model.inspection import is_filter
+from ...system.checks import check_count, is_integer
 
 ADAPTATIONS = ("chain", "continuous")
 

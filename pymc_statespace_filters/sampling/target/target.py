@@ -12,22 +12,18 @@ import numpy as np
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.parallel.communicator import Communicator
-from pymc_statespace_filters.parallel.signals import held_interrupts
-from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
-from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
-from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
-from pymc_statespace_filters.sampling.kernel.state import ChainState, RandomBlock
-from pymc_statespace_filters.sampling.kernel.transition import evaluate
-from pymc_statespace_filters.sampling.target.leader_follower import check_group
-from pymc_statespace_filters.sampling.target.log_density import (
-    LogDensity,
-    screening_density,
-    tempered_density,
-)
-from pymc_statespace_filters.sampling.target.sampled_model import Growth, SampledModel
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings, checked_proposal_cov
+from ...errors import ModelError
+from ...parallel.communicator import Communicator
+from ...parallel.signals import held_interrupts
+from ...pymc_model.graph_rewrites import expensive_variables, pilot_filters
+from ...pymc_model.inspection import state_space_nodes
+from ..kernel.random_numbers import random_block
+from ..kernel.state import ChainState, RandomBlock
+from ..kernel.transition import evaluate
+from .leader_follower import check_group
+from .log_density import LogDensity, screening_density, tempered_density
+from .sampled_model import Growth, SampledModel
+from .settings import DRAMSettings, checked_proposal_cov
 
 PILOT_POWER = 0.5
 

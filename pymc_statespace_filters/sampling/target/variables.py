@@ -10,8 +10,8 @@ from pytensor.graph.traversal import ancestors, graph_inputs
 from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.inspection import log_density_terms
+from ...errors import ModelError
+from ...pymc_model.inspection import log_density_terms
 
 
 class RaveledVariables:

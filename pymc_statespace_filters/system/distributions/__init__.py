@@ -4,12 +4,8 @@ import pytensor.tensor.random.basic as ptr
 from pytensor.graph.basic import Apply
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.distributions.scalar import SCALAR_LAWS, ScalarLaw
-from pymc_statespace_filters.system.distributions.vector import (
-    CategoricalLaw,
-    MultinomialLaw,
-    MvNormalLaw,
-)
+from .scalar import SCALAR_LAWS, ScalarLaw
+from .vector import CategoricalLaw, MultinomialLaw, MvNormalLaw
 
 type Law = ScalarLaw | CategoricalLaw | MultinomialLaw | MvNormalLaw
 

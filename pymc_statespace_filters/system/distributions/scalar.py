@@ -16,7 +16,7 @@ from pymc.distributions.continuous import WeibullBetaRV
 from pymc.distributions.discrete import DiscreteUniformRV
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.quantiles import (
+from ..quantiles import (
     bernoulli_quantile,
     binomial_quantile,
     gamma_quantile,

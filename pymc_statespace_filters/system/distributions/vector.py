@@ -9,15 +9,8 @@ import pytensor.tensor.random.basic as ptr
 from pytensor.tensor.linalg import cholesky
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.distributions.scalar import (
-    COUNT,
-    PROBABILITY,
-    REAL,
-    SCALAR_LAWS,
-    Domain,
-    root,
-)
-from pymc_statespace_filters.system.quantiles import normal_probability
+from ..quantiles import normal_probability
+from .scalar import COUNT, PROBABILITY, REAL, SCALAR_LAWS, Domain, root
 
 
 class CategoricalLaw:

@@ -3,13 +3,13 @@
 Each is one file with its equation, its order and where it is stable. `protocol` holds the contract.
 """
 
-from pymc_statespace_filters.system.integrators.euler_maruyama import EulerMaruyama
-from pymc_statespace_filters.system.integrators.exact_linear import ExactLinear
-from pymc_statespace_filters.system.integrators.local_linearization import LocalLinearization
-from pymc_statespace_filters.system.integrators.milstein import Milstein
-from pymc_statespace_filters.system.integrators.protocol import Integrator
-from pymc_statespace_filters.system.integrators.runge_kutta import RungeKutta4
-from pymc_statespace_filters.system.integrators.semi_implicit_euler import SemiImplicitEuler
+from .euler_maruyama import EulerMaruyama
+from .exact_linear import ExactLinear
+from .local_linearization import LocalLinearization
+from .milstein import Milstein
+from .protocol import Integrator
+from .runge_kutta import RungeKutta4
+from .semi_implicit_euler import SemiImplicitEuler
 
 __all__ = [
     "EulerMaruyama",

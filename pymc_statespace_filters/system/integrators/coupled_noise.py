@@ -8,9 +8,9 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.equations import Equation
-from pymc_statespace_filters.system.integrators.protocol import Integrator, bound_to_states
-from pymc_statespace_filters.system.integrators.substeps import Values
+from ..equations import Equation
+from .protocol import Integrator, bound_to_states
+from .substeps import Values
 
 
 @dataclass(frozen=True)

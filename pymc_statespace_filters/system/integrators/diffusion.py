@@ -6,7 +6,7 @@ import numpy as np
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
+from ...errors import ModelError
 
 
 def constant_diffusion(value: Any) -> tuple[tuple[float, ...], ...]:

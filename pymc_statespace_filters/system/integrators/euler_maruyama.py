@@ -8,11 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.integrators.substeps import (
-    SubstepIntegrator,
-    Values,
-    check_needed,
-)
+from .substeps import SubstepIntegrator, Values, check_needed
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.equations import (
-    Equation,
-    as_matrix,
-    as_vector,
-    read_equation,
-)
-from pymc_statespace_filters.system.integrators.substeps import Values
-from pymc_statespace_filters.system.linear_step import linear_step
+from ...errors import ModelError
+from ..equations import Equation, as_matrix, as_vector, read_equation
+from ..linear_step import linear_step
+from .substeps import Values
 
 
 @dataclass(frozen=True)

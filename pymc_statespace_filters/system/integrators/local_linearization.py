@@ -10,8 +10,8 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.integrators.diffusion import check_additive
-from pymc_statespace_filters.system.integrators.substeps import SubstepIntegrator, Values
+from .diffusion import check_additive
+from .substeps import SubstepIntegrator, Values
 
 N_TERMS = 9  # of the series for a 1/64 of a step
 DOUBLINGS = 6

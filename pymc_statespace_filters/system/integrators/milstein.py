@@ -13,13 +13,9 @@ from pytensor.graph.basic import Constant
 from pytensor.graph.traversal import ancestors, graph_inputs
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.integrators.euler_maruyama import EulerMaruyama
-from pymc_statespace_filters.system.integrators.substeps import (
-    SubstepIntegrator,
-    Values,
-    check_needed,
-)
+from ...errors import ModelError
+from .euler_maruyama import EulerMaruyama
+from .substeps import SubstepIntegrator, Values, check_needed
 
 N_TRIALS = 6
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.equations import Equation
+from ..equations import Equation
 
 
 @runtime_checkable

@@ -9,9 +9,9 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.system.integrators.diffusion import check_additive
-from pymc_statespace_filters.system.integrators.euler_maruyama import EulerMaruyama
-from pymc_statespace_filters.system.integrators.substeps import SubstepIntegrator, Values
+from .diffusion import check_additive
+from .euler_maruyama import EulerMaruyama
+from .substeps import SubstepIntegrator, Values
 
 LARGEST_Z = 1.6
 

@@ -9,9 +9,9 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import is_integer
-from pymc_statespace_filters.system.integrators.substeps import SubstepIntegrator, Values
+from ...errors import ModelError
+from ..checks import is_integer
+from .substeps import SubstepIntegrator, Values
 
 
 @dataclass(frozen=True)

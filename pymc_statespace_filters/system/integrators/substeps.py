@@ -8,15 +8,10 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.checks import check_count
-from pymc_statespace_filters.system.equations import (
-    Equation,
-    as_matrix,
-    as_vector,
-    read_equation,
-)
-from pymc_statespace_filters.system.integrators.diffusion import constant_diffusion
+from ...errors import ModelError
+from ..checks import check_count
+from ..equations import Equation, as_matrix, as_vector, read_equation
+from .diffusion import constant_diffusion
 
 MOST_SUBSTEPS = 1000  # 400 take most of a minute to compile
 

@@ -5,10 +5,10 @@ By the methods of `poisson`, for the rarer of success and failure.
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
-from pymc_statespace_filters.compiler.numerics.exponential import exp, log1p
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial, sqrt
-from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+from ...native.jit import inlined, njit_internal
+from ..exponential import exp, log1p
+from ..intrinsics import fma, polynomial, sqrt
+from .bottom_up import (
     RARE,
     SMALL,
     UNDECIDED,
@@ -19,15 +19,10 @@ from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
     small_quantile,
     start,
 )
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
-from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
-    TWO_PI,
-    deviance,
-    smallest_reached,
-    stirling_error,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
-from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import ONE, TWO
+from .normal import limited, tail
+from .saddle_point import TWO_PI, deviance, smallest_reached, stirling_error
+from .series import series, short_series
+from .single_precision import ONE, TWO
 
 _LARGE = 1e6
 # artanh(s) / s in s**2 for s <= 1/3: Taylor, truncation 1.4e-8

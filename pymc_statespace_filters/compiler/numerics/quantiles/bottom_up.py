@@ -11,20 +11,11 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal, njit_reassoc
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import normal_probability
-from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import (
-    FOUR,
-    ONE,
-    THREE,
-    TWO,
-    ZERO,
-    exp,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import (
-    normal_probability as single_normal_probability,
-)
+from ...native.jit import inlined, njit_internal, njit_reassoc
+from ..intrinsics import fma
+from .normal import normal_probability
+from .single_precision import FOUR, ONE, THREE, TWO, ZERO, exp
+from .single_precision import normal_probability as single_normal_probability
 
 SMALL = 8.0
 """Means below are small."""

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
-from pymc_statespace_filters.compiler.numerics.exponential import (
+from ...native.jit import inlined, njit_internal
+from ..exponential import (
     EXPONENT_BITS,
     LN2_HIGH,
     LN2_LOW,
@@ -33,27 +33,13 @@ from pymc_statespace_filters.compiler.numerics.exponential import (
     log,
     log1p,
 )
-from pymc_statespace_filters.compiler.numerics.intrinsics import (
-    bits_of,
-    float_of,
-    fma,
-    polynomial,
-    sqrt,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.gamma_tables import (
-    LARGE,
-    MEDIUM,
-    SMALL,
-    Fit,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
-from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
-    deviance,
-    stirling_error,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.series import in_variables
-from pymc_statespace_filters.compiler.numerics.restricted_domain import exp as normal_exp
-from pymc_statespace_filters.compiler.numerics.restricted_domain import log as normal_log
+from ..intrinsics import bits_of, float_of, fma, polynomial, sqrt
+from ..restricted_domain import exp as normal_exp
+from ..restricted_domain import log as normal_log
+from .gamma_tables import LARGE, MEDIUM, SMALL, Fit
+from .normal import limited, tail
+from .saddle_point import deviance, stirling_error
+from .series import in_variables
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 # As `normal._RATIO`, in t = (x - 4) / (x + 4), to 1.3e-12

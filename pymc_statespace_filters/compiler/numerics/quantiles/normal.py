@@ -1,8 +1,8 @@
 """The standard normal distribution function, both tails alike."""
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.exponential import exp
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
+from ...native.jit import inlined
+from ..exponential import exp
+from ..intrinsics import fma, polynomial
 
 FARTHEST = 37.0
 """Standard deviations beyond which a normal counts as if it were there."""

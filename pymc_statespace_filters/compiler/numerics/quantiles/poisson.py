@@ -8,10 +8,10 @@ compared. From a mean of 1e6 on, the longer series errs less than the rounding o
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import inlined, njit_internal
-from pymc_statespace_filters.compiler.numerics.exponential import exp
-from pymc_statespace_filters.compiler.numerics.intrinsics import sqrt
-from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
+from ...native.jit import inlined, njit_internal
+from ..exponential import exp
+from ..intrinsics import sqrt
+from .bottom_up import (
     RARE,
     SMALL,
     UNDECIDED,
@@ -22,15 +22,10 @@ from pymc_statespace_filters.compiler.numerics.quantiles.bottom_up import (
     small_quantile,
     start,
 )
-from pymc_statespace_filters.compiler.numerics.quantiles.normal import limited, tail
-from pymc_statespace_filters.compiler.numerics.quantiles.saddle_point import (
-    TWO_PI,
-    deviance,
-    smallest_reached,
-    stirling_error,
-)
-from pymc_statespace_filters.compiler.numerics.quantiles.series import series, short_series
-from pymc_statespace_filters.compiler.numerics.quantiles.single_precision import ZERO
+from .normal import limited, tail
+from .saddle_point import TWO_PI, deviance, smallest_reached, stirling_error
+from .series import series, short_series
+from .single_precision import ZERO
 
 _LARGE = 1e6
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.jit import njit_internal
-from pymc_statespace_filters.compiler.numerics.exponential import log
+from ...native.jit import njit_internal
+from ..exponential import log
 
 TWO_PI = 2.0 * math.pi
 

@@ -20,7 +20,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import inlined
+from ...native.jit import inlined
 
 # A_0 ... A_3 and B_0 ... B_2: rows are powers of z**2, columns powers of d**2.
 _EVEN = (

@@ -11,8 +11,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from pymc_statespace_filters.compiler.native.jit import inlined
-from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial
+from ...native.jit import inlined
+from ..intrinsics import fma, polynomial
 
 ZERO, HALF, ONE, TWO, THREE, FOUR = map(np.float32, (0.0, 0.5, 1.0, 2.0, 3.0, 4.0))
 _ROUND = np.float32(1.5 * 2.0**23)  # adding it rounds to an integer, held in the lowest bits

@@ -11,19 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.pytensor_function import Call
-from pymc_statespace_filters.sampling.kernel.adaptation_state import (
-    pack,
-    packed_size,
-    start_adaptation,
-    unpack,
-)
-from pymc_statespace_filters.sampling.kernel.random_numbers import (
-    BLOCK,
-    draw_seeds,
-    generator_of_block,
-)
-from pymc_statespace_filters.sampling.kernel.state import N_COUNTS
+from ....compiler.native.pytensor_function import Call
+from ..adaptation_state import pack, packed_size, start_adaptation, unpack
+from ..random_numbers import BLOCK, draw_seeds, generator_of_block
+from ..state import N_COUNTS
 
 # Of a chain's numbers, the first estimate: G of the records, then that of other data.
 FIRST_ESTIMATE = 3

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import njit_cached
-from pymc_statespace_filters.compiler.native.jit import linked
-from pymc_statespace_filters.compiler.native.pytensor_function import make_call
-from pymc_statespace_filters.sampling.kernel.state import HEALTH_SIZE, NOT_A_NUMBER, RAISED
+from ....compiler.native.entry_point import njit_cached
+from ....compiler.native.jit import linked
+from ....compiler.native.pytensor_function import make_call
+from ..state import HEALTH_SIZE, NOT_A_NUMBER, RAISED
 
 _internal = linked()
 

@@ -29,17 +29,12 @@ computations. Annals of Statistics 37, 697-725.
 
 import numpy as np
 
-from pymc_statespace_filters.compiler.native.entry_point import njit_cached
-from pymc_statespace_filters.compiler.native.jit import copy_into, linked
-from pymc_statespace_filters.sampling.kernel.adaptation import learn
-from pymc_statespace_filters.sampling.kernel.adaptation_state import packed_size, unpack
-from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_ratio_to_one
-from pymc_statespace_filters.sampling.kernel.records.arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
-from pymc_statespace_filters.sampling.kernel.records.evaluation import (
-    evaluate_likelihoods,
-    evaluate_priors,
-)
-from pymc_statespace_filters.sampling.kernel.state import (
+from ....compiler.native.entry_point import njit_cached
+from ....compiler.native.jit import copy_into, linked
+from ..adaptation import learn
+from ..adaptation_state import packed_size, unpack
+from ..delayed_rejection import log_ratio_to_one
+from ..state import (
     ACCEPTANCE,
     FAILURE,
     LOG_DENSITY,
@@ -52,6 +47,8 @@ from pymc_statespace_filters.sampling.kernel.state import (
     SCALING,
     STAGE,
 )
+from .arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
+from .evaluation import evaluate_likelihoods, evaluate_priors
 
 _internal = linked()
 
