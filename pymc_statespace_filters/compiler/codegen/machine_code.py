@@ -187,11 +187,11 @@ def kept(key: str | None, make: Callable[[], bytes]) -> bytes:
         return found
     found = make()
     part = path.with_suffix(f".{uuid4().hex}")
-    part.write_bytes(hashlib.sha256(found).digest() + found)
     try:
+        part.write_bytes(hashlib.sha256(found).digest() + found)
         part.replace(path)  # at once: other processes read it
-    except PermissionError:  # on Windows, while one does
-        part.unlink()
+    except OSError:  # a full disk; on Windows, another process that reads it now
+        part.unlink(missing_ok=True)
     return found
 
 
