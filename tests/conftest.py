@@ -26,27 +26,28 @@ gc.set_threshold(50_000, 20, 10)
 # Pictures are drawn without a screen.
 os.environ.setdefault("MPLBACKEND", "agg")
 
-# Files that compile for longest, which come first: at the end one process would wait for the other.
+# Files that take longest, which come first: at the end one process would wait for the other.
 # Neighbours share no system, so that the two processes do not compile the same code at once.
 LONGEST = (
-    "filters/test_outside_filters.py",
-    "filters/test_sigma_points.py",
-    "filters/test_iplf_distributions.py",
-    "filters/test_guided_page.py",
-    "filters/test_truth_guided.py",
     "filters/test_ensemble_states.py",
-    "compiler/test_large_states.py",
-    "sampling/test_noisy_chains.py",
-    "ops/test_batch.py",
-    "evaluation/test_run_filter.py",
-    "filters/test_truth_ekf.py",
-    "pymc_model/test_in_pymc.py",
-    "diagnostics/test_filter_health.py",
-    "test_processes.py",
+    "point_estimation/test_maximum_likelihood.py",
+    "filters/test_outside_filters.py",
+    "sampling/test_sample_dram.py",
+    "filters/test_sigma_points.py",
     "sampling/test_checkpoint_resume.py",
-    "evaluation/test_explosions.py",
-    "compiler/test_unroll.py",
-    "sampling/test_lockstep.py",
+    "filters/test_iplf_distributions.py",
+    "system/test_integrators.py",
+    "filters/test_guided_page.py",
+    "sampling/test_starts.py",
+    "diagnostics/test_panels.py",
+    "test_processes.py",
+    "compiler/test_large_states.py",
+    "pymc_model/test_in_pymc.py",
+    "sampling/test_dram.py",
+    "filters/test_truth_guided.py",
+    "sampling/test_noisy_chains.py",
+    "sampling/test_particle_budget.py",
+    "sampling/test_one_chain_on_ranks.py",
 )
 
 
