@@ -9,6 +9,10 @@ import pytest
 from numba import types
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.codegen.function_types import (
+    MEMBER_ARGUMENTS,
+    MemberArguments,
+)
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, EntryPoint
@@ -194,3 +198,10 @@ def test_swapped_arguments_of_an_entry_point_are_an_error():
     )
     with pytest.raises(TypeError, match=message):
         EntryPoint(function, swapped, "function")
+
+
+def test_arguments_are_given_by_name():
+    given = {name: place for place, name in enumerate(MEMBER_ARGUMENTS)}
+    assert MemberArguments(**dict(reversed(given.items()))) == tuple(range(len(given)))
+    with pytest.raises(TypeError):
+        MemberArguments(**given | {"members": 1})
