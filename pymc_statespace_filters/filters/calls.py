@@ -31,6 +31,7 @@ from ..compiler.numerics.record_noise import seed_of_record
 from ..system import panel
 from .outcomes import NONE, OUT_OF_MEMORY
 from .plan import PLAN, VERSION
+from .records import include_health
 
 OK = np.int64(0)
 ALL_STEPS = np.int64(np.iinfo(np.int64).max)
@@ -211,14 +212,6 @@ def _seed(call, first):
     return seed_of_record(seed, rows[first * given[RECORD.row_width] + panel.RECORD])
 
 
-@njit_internal
-def _include_health(health, of_record, first):
-    """Include the health of a record whose first row is ``first`` in that of its panel."""
-    health[0] = min(health[0], of_record[0])
-    if health[1] == NONE and of_record[1] != NONE:
-        health[1], health[2] = of_record[1], first + of_record[2]
-
-
 def likelihood_entry(
     name: str,
     evaluate: Callable,
@@ -260,7 +253,7 @@ def likelihood_entry(
             if status != OK:
                 return status
             if is_panel:
-                _include_health(healths[0], health, first)
+                include_health(healths[0], health, first)
                 first = last
             else:
                 before += n_rows

@@ -76,7 +76,7 @@ def lane_functions(
     }
     known: dict[str, dict[Value, int]] = {first: {}}
     for name in others:
-        constants = _constants(values[name], functions[name].graph)
+        constants = constants_of(values[name], functions[name].graph)
         known[name] = {v: n_rows + i for i, v in enumerate(constants)}
         n_rows += len(constants)
     entries = {}
@@ -111,7 +111,7 @@ def _targets(
     ]
 
 
-def _constants(values: Sequence[Value], graph: Graph) -> list[Expression]:
+def constants_of(values: Sequence[Value], graph: Graph) -> list[Expression]:
     """Expressions of theta alone that are results, or are used by others."""
     elements = _elements(graph)
     of_theta = frozenset(name for name in elements if name.partition(".")[0] == PARAMETERS)

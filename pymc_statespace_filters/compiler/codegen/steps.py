@@ -15,15 +15,15 @@ from numba import carray
 from ..native.entry_point import EntryPoint
 from ..native.jit import njit_internal
 from .array_fallback import array_code, used_inputs
-from .emitter import Emitter, depends_on
-from .expressions import FLOAT, Value
-from .function_types import Graph, function_of
+from .emitter import Emitter
+from .expressions import Value
+from .function_types import function_of
 from .functions import log_choice, unrolled
 from .machine_code import Module, ModuleEntryPoint, constant
-from .members import LLVM_TYPES, sorted_by_number
+from .members import LLVM_TYPES
 from .record_loops import ALONG_ARGUMENTS, Part, Sizes, backward_loop, forward_loop
 from .scalarize import NotUnrollableError
-from .simd import INPUTS, LANE_ARGUMENTS, PARAMETERS, STATE, TIME, LaneFunction
+from .simd import INPUTS, LANE_ARGUMENTS, STATE, TIME, LaneFunction, constants_of
 
 NOISE = "z"
 
@@ -62,7 +62,7 @@ def step_functions(
     n_rows = places.n_rows
     if written[first] is not None:
         for name in others:
-            for value in _constants(written[name] or [], functions[name].graph):
+            for value in constants_of(written[name] or [], functions[name].graph):
                 known[name][value] = n_rows
                 n_rows += 1
     entries: dict[str, EntryPoint] = {}
@@ -111,10 +111,6 @@ def _length(variable: Any) -> int:
     return variable.type.shape[0] if variable.type.ndim else 1
 
 
-def _elements(graph: Graph) -> list[str]:
-    return [f"{name}.{i}" for name, v in graph.inputs.items() for i in range(_length(v))]
-
-
 def _sizes(function: LaneFunction) -> list[tuple[str, int]]:
     """Names and lengths of the outputs."""
     outputs = function.graph.outputs
@@ -129,17 +125,6 @@ def _targets(function: LaneFunction, places: Places) -> list[tuple[str, int]]:
         first += places.state_size if name == STATE else 0  # the next state
         found += [(array, first + i) for i in range(length)]
     return found
-
-
-def _constants(values: Sequence[Value], graph: Graph) -> Sequence[Value]:
-    """Expressions of theta alone that are results, or are used by others."""
-    elements = _elements(graph)
-    of_theta = frozenset(name for name in elements if name.partition(".")[0] == PARAMETERS)
-    varying = depends_on(values, frozenset(elements) - of_theta)
-    constant = depends_on(values, of_theta) - varying
-    used = [*values, *(a for e in varying for a in e.args)]
-    kept = {v for v in used if v in constant and v.op is not None and v.kind == FLOAT}
-    return sorted_by_number(kept)
 
 
 def _in_scalars(
