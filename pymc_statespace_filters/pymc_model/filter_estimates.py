@@ -1,0 +1,112 @@
+"""The log-likelihood of a StateSpace variable at points of its model, under any filter and seeds.
+
+Parameters and inputs at the points are computed once, and each filter is evaluated by its own
+machine code, so that another filter compiles what is new about it alone and not the model again.
+"""
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
+
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_system_and_filter
+from ..ops.base import evaluator
+from ..ops.likelihood import LogLikelihood
+from ..ops.panel import PanelLogLikelihood
+from ..parallel.cpu_affinity import available_cores
+from .compilation import compile_raveled
+from .density import check_free_variables
+from .inspection import scored_rows, state_space_nodes
+
+Array = NDArray[np.float64]
+
+
+class VariableAtPoints:
+    """An observed StateSpace variable, or all records of a panel, at points of its model.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        With continuous free variables.
+    name : str
+        Of the variable.
+    x : ndarray, shape (m, k)
+        Points of the unconstrained space, in the order of `unconstrained_draws`.
+    """
+
+    def __init__(self, model: pm.Model, name: str, x: Array) -> None:
+        check_free_variables(model)
+        node = state_space_nodes(model)[name]
+        self.name, self.system, self.filter = name, node.op.system, node.op.filter
+        theta, steps, inputs, t0, _ = node.inputs[-5:]
+        given = [steps, model.rvs_to_values[node.outputs[1]], inputs, t0]
+        free = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        graphs = model.replace_rvs_by_values([theta, *given])
+        varying = [i for i, graph in enumerate(graphs) if set(ancestors([graph])) & set(free)]
+        constant = _values_at(model, graphs, x[:1])[0]
+        at_points = _values_at(model, [graphs[i] for i in varying], x)
+        self._arguments = [
+            [values[varying.index(i)] if i in varying else constant[i] for i in range(len(graphs))]
+            for values in at_points
+        ]
+        self._kind = PanelLogLikelihood if steps.type.ndim == 2 else LogLikelihood
+        self._scored = scored_rows(node)
+
+    def __len__(self) -> int:
+        """The number of points."""
+        return len(self._arguments)
+
+    def log_likelihood(self, filter: Filter, seeds: NDArray[np.int64]) -> Array:
+        """The log-likelihood by a filter at every point for every seed, (m, r); -inf if it fails.
+
+        ``seeds`` (m, r) are those of the noise, which a deterministic filter ignores: it needs one.
+
+        Raises
+        ------
+        ModelError
+            If the filter cannot treat the system.
+        """
+        return self.at(range(len(self)), filter, seeds)
+
+    def at(
+        self,
+        points: Iterable[int],
+        filter: Filter,
+        seeds: NDArray[np.int64],
+        *,
+        scored: bool = True,
+    ) -> Array:
+        """The same at the points with these numbers, one for each row of ``seeds``.
+
+        Without ``scored`` the sum has the terms of all rows, those before ``score_from`` too, of
+        which the exponential of an unbiased estimate is right in the mean.
+        """
+        rows = self._scored if scored else ...
+        check_system_and_filter(self.system, filter)
+        evaluate = evaluator(self._kind(self.system, filter))
+
+        def total(i: int, seed: np.int64) -> float:
+            terms = evaluate(*self._arguments[i], np.asarray(seed))[0]
+            found = float(terms[rows].sum())
+            return -np.inf if np.isnan(found) else found
+
+        calls = [(i, seed) for i, row in zip(points, seeds, strict=True) for seed in row]
+        with ThreadPoolExecutor(min(available_cores(), max(1, len(calls)))) as pool:
+            try:
+                found = list(pool.map(lambda call: total(*call), calls))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return np.reshape(found, seeds.shape)
+
+
+def _values_at(model: pm.Model, graphs: list[Variable], x: Array) -> list[list[np.ndarray]]:
+    """The values of graphs at every point; machine code would take longer to compile."""
+    free = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    function, _ = compile_raveled(model.initial_point(), graphs, free, mode="FAST_COMPILE")
+    return [[np.array(value) for value in function(point)] for point in x]
