@@ -1,15 +1,9 @@
 """The extended Kalman filter, thesis Eqs. 4.3-4.14: the equations as linear around the mean."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-import pytensor.tensor as pt
-from pytensor.tensor.variable import TensorVariable
-
-from ..compiler.lowering.symbols import call, jacobian_of, observation_moments, process_noise_cov
-from ..system.model import StateSpaceModel
 from .gaussian.base import GaussianFilterBase
-from .gaussian.linearization import GaussianState, Linear, Seen, Symbols, seen
+from .gaussian.tangent import Tangent
 from .protocol import System
 
 
@@ -45,7 +39,7 @@ class EKF(GaussianFilterBase):
     """
 
     @property
-    def linearization(self) -> "Tangent":
+    def linearization(self) -> Tangent:
         """Tangents at the mean."""
         return Tangent()
 
@@ -53,27 +47,3 @@ class EKF(GaussianFilterBase):
         """Raise, unless the system is deterministic, if an update would not be a Kalman update."""
         self._check_gaussian(system)
         self._check_not_carried(system)
-
-
-@dataclass(frozen=True)
-class Tangent:
-    """Linearisation at the mean of the state, by exact Jacobians."""
-
-    has_short_rows: ClassVar[bool] = True
-
-    def state(self, mean: TensorVariable, cov: TensorVariable) -> GaussianState:
-        """The state itself."""
-        return GaussianState(mean, None, cov)
-
-    def transition(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Linear:
-        """Eqs. 4.8-4.10: A and B at the analysis of this step."""
-        q = pt.zeros((system.m,))
-        forecast = call(system.equations.transition, system, {**values, "x": state.mean, "q": q})
-        noise_jac = jacobian_of(forecast, q)
-        noise_cov = process_noise_cov(system, values, noise_jac) if system.m else None
-        return Linear(forecast, jacobian_of(forecast, state.mean), noise_cov, noise_jac)
-
-    def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
-        """Eq. 4.4: C and D at the forecast."""
-        expected, noise_cov = observation_moments(system, {**values, "x": state.mean})
-        return seen(values["d"], Linear(expected, jacobian_of(expected, state.mean), noise_cov))

@@ -44,8 +44,9 @@ class UKF(GaussianFilterBase):
 
     Notes
     -----
-    Process noise need not be additive, but enters by its Jacobian at zero noise, taken at every
-    sigma point; so does ``e`` of the observation. Where a state is known exactly, the gradient by a
+    An equation that is linear in state and noise needs no points: its tangent is exact. Process
+    noise need not be additive, but enters by its Jacobian at zero noise, taken at every sigma
+    point; so does ``e`` of the observation. Where a state is known exactly, the gradient by a
     parameter that would give it spread is that at no spread.
 
     Examples

@@ -1,5 +1,6 @@
 """UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
 
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -11,7 +12,9 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.filters.gaussian.linearization import Linearizations
 from pymc_statespace_filters.filters.gaussian.sigma_points import SigmaPoints
+from pymc_statespace_filters.filters.gaussian.tangent import Tangent, linearizations_of
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.test_ekf_states import (
     FORCE,
@@ -36,6 +39,14 @@ from tests.systems import DUFFING, linear_system
 RECORD = (STEPS, OBSERVED, FORCE, T0, 0)
 FILTERS = [psf.UKF(), psf.IPLF(n_iterations=2)]
 BOTH = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
+
+
+@dataclass(frozen=True)
+class RegressedUKF(psf.UKF):
+    """Regressions for all equations, also for those that are linear."""
+
+    def _linearizations(self, system):
+        return Linearizations(self.linearization, self.linearization)
 
 
 def theta_of(params):
@@ -95,7 +106,7 @@ def test_linear_systems_are_exact(filter, params):
     np.testing.assert_array_equal(found.health, [np.inf, 0.0, -1.0])
 
 
-@BOTH
+@pytest.mark.parametrize("filter", [RegressedUKF(), *FILTERS], ids=lambda f: type(f).__name__)
 def test_three_states_without_a_weight_at_the_mean_are_exact(filter):
     """With singular noise, a start known in one direction, and steps before the first datum."""
     steps, observed = gappy_record(len(CHAIN.C), first_step=2)
@@ -364,6 +375,28 @@ def test_the_gradient_is_exact_with_a_known_start_and_noise_on_the_velocity(filt
     np.testing.assert_allclose(at(theta).gradient[:-1], slopes, rtol=1e-8, atol=1e-9)
 
 
+def test_linear_equations_take_their_tangent():
+    """With the likelihood of the regression, which is exact there too."""
+    points, tangent = psf.UKF().linearization, Tangent()
+    assert linearizations_of(linear_system(CHAIN), points) == (tangent, tangent)
+    assert linearizations_of(SQUARE, points) == (tangent, points)
+    steps, observed = np.array([0, 3, 4]), np.array([0.8, np.nan, -0.3])
+    sine = psf.StateSpaceModel(
+        transition=lambda x, q: [pt.sin(2.0 * x[0]) + q[0]],
+        process_noise=[[0.3]],
+        observation=lambda x, e, u: [x[0] + u[0] * e[0]],
+        observation_noise=[[0.2]],
+        initial_mean=[0.4],
+        initial_cov=[[0.5]],
+        inputs=["gain"],
+    )
+    assert linearizations_of(sine, points) == (points, tangent)
+    record = {"observed": observed, "steps": steps, "inputs": np.linspace(0.5, 2.0, 5)}
+    terms = psf.log_likelihood(sine, psf.UKF(), {}, **record)
+    regressed = psf.log_likelihood(sine, RegressedUKF(), {}, **record)
+    np.testing.assert_allclose(terms, regressed, rtol=1e-13)
+
+
 @BOTH
 def test_impossible_settings_and_systems_are_refused(filter):
     name = type(filter).__name__
@@ -390,7 +423,7 @@ def test_systems_too_large_to_be_written_out_run_on_arrays():
     )
     observed = np.random.default_rng(20).normal(size=(3, 3))
     observed[1, 1] = np.nan
-    found = psf.log_likelihood(ring, psf.UKF(), {"a": 0.9}, observed, steps=steps)
+    found = psf.log_likelihood(ring, RegressedUKF(), {"a": 0.9}, observed, steps=steps)
     truth = kalman_log_likelihood(
         0.9 * A, B @ B.T, C, 0.2 * np.eye(3), np.ones(n), start, steps=steps, observed=observed
     )

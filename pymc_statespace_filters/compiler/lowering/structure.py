@@ -59,16 +59,28 @@ def is_deterministic(system: StateSpaceModel) -> bool:
 
 def is_linear(system: StateSpaceModel) -> bool:
     """Whether state and noise, which is Gaussian, enter transition and observation linearly."""
+    return (
+        system.gaussian is system
+        and has_linear_observation(system)
+        and has_linear_transition(system)
+    )
+
+
+def has_linear_transition(system: StateSpaceModel) -> bool:
+    """Whether state and noise enter the transition linearly; False where that is undecided."""
+    return _is_linear(system, system.equations.transition, "xq")
+
+
+def has_linear_observation(system: StateSpaceModel) -> bool:
+    """Whether an observation with noise is linear in state and noise; False where undecided."""
+    observation = system.equations.observation
+    return observation is not None and _is_linear(system, observation, "xe")
+
+
+def _is_linear(system: StateSpaceModel, graph: FrozenFunctionGraph, names: str) -> bool:
     symbols = symbols_of(system)
-    equations, variables = system.equations, ("x", "q", "e")
-    if equations.observation is None or system.gaussian is not system:
-        return False
-    jacobians = [
-        jacobian_of(call(graph, system, symbols), symbols[name])
-        for graph, names in ((equations.transition, "xq"), (equations.observation, "xe"))
-        for name in names
-    ]
-    return all(is_free_of(variables, jac, symbols) for jac in jacobians)
+    value = call(graph, system, symbols)
+    return all(is_free_of(names, jacobian_of(value, symbols[name]), symbols) for name in names)
 
 
 def has_additive_process_noise(system: StateSpaceModel) -> bool:

@@ -19,9 +19,10 @@ from . import deterministic
 from .backward import BACKWARD
 from .forward import FORWARD
 from .functions import filter_plan
-from .linearization import Linearization, predict, start, state_size, update
+from .linearization import Linearization, Linearizations, predict, start, state_size, update
 from .recursion import GaussianFilterFunctions
 from .states import RUN, states_plan
+from .tangent import linearizations_of
 
 
 class GaussianFilterBase:
@@ -85,7 +86,9 @@ class GaussianFilterBase:
         if system.is_deterministic:
             return functions.states(self._plan(system, RUN))
         recursion = self._functions(system)
-        return functions.states(states_plan(system, recursion, self.linearization, moment))
+        return functions.states(
+            states_plan(system, recursion, self._linearizations(system), moment)
+        )
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
@@ -106,7 +109,10 @@ class GaussianFilterBase:
     def _functions(self, system: System) -> GaussianFilterFunctions:
         if system.is_deterministic:
             return _of_deterministic(system.model.gaussian)
-        return _functions(self.linearization, system.model.gaussian)
+        return _functions(self._linearizations(system), system.model.gaussian)
+
+    def _linearizations(self, system: System) -> Linearizations:
+        return linearizations_of(system.model.gaussian, self.linearization)
 
     def _check_gaussian(self, system: System) -> None:
         """Raise if the observation of an uncertain state is not Gaussian."""
@@ -129,7 +135,7 @@ _of_deterministic = lru_cache(maxsize=256)(deterministic.filter_functions)
 
 
 @lru_cache(maxsize=256)
-def _functions(linearization: Linearization, system: StateSpaceModel) -> GaussianFilterFunctions:
+def _functions(by: Linearizations, system: StateSpaceModel) -> GaussianFilterFunctions:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
     s = pt.tensor("s", shape=(state_size(system.n),), dtype="float64")
     values = symbols_of(system) | {"s": s}
@@ -137,11 +143,11 @@ def _functions(linearization: Linearization, system: StateSpaceModel) -> Gaussia
     def function(inputs: str, *outputs: TensorVariable) -> Graph:
         return Graph({name: values[name] for name in inputs.split()}, outputs)
 
-    analysis, term = update(linearization, system, values)
-    forecast = predict(linearization, system, values)
+    analysis, term = update(by.observation, system, values)
+    forecast = predict(by.transition, system, values)
     return GaussianFilterFunctions(
         system,
-        linearization.has_short_rows,
+        by.transition.has_short_rows,
         function("theta", start(system, values)),
         function("theta u t s", forecast),
         function("theta u t d s", analysis, pt.atleast_1d(term)),

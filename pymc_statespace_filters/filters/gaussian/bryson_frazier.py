@@ -40,7 +40,7 @@ from ...compiler.codegen.function_types import Graph
 from ...compiler.codegen.semidefinite import semidefinite_root
 from ...compiler.codegen.simd import LaneFunction
 from .functions import covariances_at
-from .linearization import Linearization, Symbols, innovation_of, pack, unpack
+from .linearization import Linearizations, Symbols, innovation_of, pack, unpack
 from .recursion import GaussianFilterFunctions
 
 
@@ -53,7 +53,7 @@ class BrysonFrazier:
     check, and those of the initial state and of q, if it is drawn.
     """
 
-    def __init__(self, recursion: GaussianFilterFunctions, linearization: Linearization) -> None:
+    def __init__(self, recursion: GaussianFilterFunctions, by: Linearizations) -> None:
         self.recursion = recursion
         system, size = recursion.system, recursion.size
         graphs = (recursion.start, recursion.predict, recursion.update)
@@ -62,13 +62,13 @@ class BrysonFrazier:
         vector = {"dtype": "float64", "shape": (self.size,)}
         self._whole, self._adjoint = pt.tensor("s", **vector), pt.tensor("s_bar", **vector)
         self._error = pt.tensor("error", dtype="float64", shape=(system.n,))
-        state = linearization.state(*self._moments())
-        self._step = linearization.transition(system, self._symbols, state)
-        self._seen = linearization.observation(system, self._symbols, state)
-        self._state_jac, self._observation_jac = map(
-            state.by_state, (self._step.jac, self._seen.jac)
-        )
-        self._innovation = innovation_of(state, self._seen)
+        before = by.transition.state(*self._moments())
+        self._step = by.transition.transition(system, self._symbols, before)
+        self._state_jac = before.by_state(self._step.jac)
+        forecast = by.observation.state(*self._moments())
+        self._seen = by.observation.observation(system, self._symbols, forecast)
+        self._observation_jac = forecast.by_state(self._seen.jac)
+        self._innovation = innovation_of(forecast, self._seen)
         self._update_jac = pt.eye(system.n) - self._innovation.gain @ self._observation_jac
         self.draws_q = self._step.noise_jac is not None
         self.n_noises = system.m if self.draws_q else system.n

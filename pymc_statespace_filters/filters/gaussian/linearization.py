@@ -106,6 +106,13 @@ class Linearization(Protocol):
         """The observation ``values["d"]``."""
 
 
+class Linearizations(NamedTuple):
+    """How the two equations of a system are linearised."""
+
+    transition: Linearization
+    observation: Linearization
+
+
 class Innovation(NamedTuple):
     """Kalman's gain K for a linearised observation.
 

@@ -31,7 +31,7 @@ from .group import (
     set_all,
     table_of,
 )
-from .linearization import Linearization
+from .linearization import Linearizations
 from .machine import call, read_machine, workspace
 from .recursion import GaussianFilterFunctions
 
@@ -46,20 +46,20 @@ _NO_COVARIANCE = -1
 
 @lru_cache(maxsize=256)
 def _smoother(
-    recursion: GaussianFilterFunctions, linearization: Linearization
+    recursion: GaussianFilterFunctions, by: Linearizations
 ) -> tuple[BrysonFrazier, Functions]:
     """The smoother of a filter, and its functions, used for all moments."""
-    smoother = BrysonFrazier(recursion, linearization)
+    smoother = BrysonFrazier(recursion, by)
     n_cov, n_noises = smoother.covariances.values.type.shape[0], smoother.n_noises
     places = places_of(recursion, smoother.size, n_cov, n_noises + recursion.system.p)
     return smoother, compiled(smoother.functions(), places, ALONG, in_lanes=False)
 
 
 def states_plan(
-    system: System, recursion: GaussianFilterFunctions, linearization: Linearization, moment: str
+    system: System, recursion: GaussianFilterFunctions, by: Linearizations, moment: str
 ) -> Plan:
     """The plan of "predicted", "filtered" or "smoothed" states."""
-    smoother, functions = _smoother(recursion, linearization)
+    smoother, functions = _smoother(recursion, by)
     back = ("predict_back", "update_back", "smooth")
     used = [n for n in functions.entries if n not in back or moment == "smoothed"]
     covs, n_theta = smoother.covariances, recursion.start.inputs["theta"].type.shape[0]
