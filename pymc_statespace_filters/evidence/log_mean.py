@@ -3,8 +3,8 @@
 import math
 from typing import NamedTuple
 
-import arviz as az
 import numpy as np
+from arviz_stats import mcse
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
@@ -43,7 +43,7 @@ def mcse_of_chains(terms: Array) -> float:
     ArviZ's, from Geyer's initial monotone sequence over split chains: it includes the disagreement
     between chains as well as the autocorrelation within them.
     """
-    return float(az.mcse(terms, method="mean"))
+    return float(mcse(terms, method="mean"))
 
 
 def mcse_of_walkers(terms: Array) -> float:

@@ -3,9 +3,9 @@
 import math
 from collections.abc import Iterator
 
-import arviz as az
 import numpy as np
 import xarray as xr
+from arviz_stats import ess, rhat
 
 from ...lower_chains import lower_chains
 from ..posterior.draws import Posterior
@@ -24,22 +24,23 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     """
     parameters = np.moveaxis(posterior.draws, -1, 0)
     with np.errstate(invalid="ignore"):  # R-hat of a constant parameter is 0 / 0
-        rhats = [float(az.rhat(values)) for values in parameters]
-    rhat = max((one for one in rhats if not np.isnan(one)), default=1.0)
-    if rhat <= MAX_RHAT:
+        rhats = [float(rhat(values)) for values in parameters]
+    largest = max((one for one in rhats if not np.isnan(one)), default=1.0)
+    if largest <= MAX_RHAT:
         return
-    found = f"the chains disagree (R-hat {rhat:.2f})"
+    found = f"the chains disagree (R-hat {largest:.2f})"
     if low := lower_chains(dict(enumerate(posterior.log_density)), len(parameters)):
         lowest = max(low, key=lambda chain: chain.nats)
         yield f"{found}: {lowest}: start it where the others are (initvals), or tune longer"
         return
-    ess = min(float(az.ess(v)) for v, one in zip(parameters, rhats, strict=True) if one > MAX_RHAT)
-    factor = max(2, math.ceil(ENOUGH_EFFECTIVE / max(ess, 1.0)))
+    poor = [v for v, one in zip(parameters, rhats, strict=True) if one > MAX_RHAT]
+    effective = min(float(ess(v)) for v in poor)
+    factor = max(2, math.ceil(ENOUGH_EFFECTIVE / max(effective, 1.0)))
     how = f" (until_ess={ENOUGH_EFFECTIVE} of sample_dram)" if _drawn_by_us(idata) else ""
     yield (
-        f"{found}: their effective sample size is {ess:.0f}; about {factor} times as many draws "
-        f"would give {ENOUGH_EFFECTIVE}{how}. If R-hat stays above {MAX_RHAT}, start the chains "
-        "elsewhere (initvals) or tune longer"
+        f"{found}: their effective sample size is {effective:.0f}; about {factor} times as many "
+        f"draws would give {ENOUGH_EFFECTIVE}{how}. If R-hat stays above {MAX_RHAT}, start the "
+        "chains elsewhere (initvals) or tune longer"
     )
 
 

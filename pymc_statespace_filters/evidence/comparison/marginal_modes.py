@@ -2,12 +2,12 @@
 
 from collections.abc import Hashable, Iterable, Mapping
 
-import arviz as az
 import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_base.labels import BaseLabeller
 from arviz_base.sel_utils import xarray_sel_iter
+from arviz_stats import ess, kde
 from numpy.typing import NDArray
 
 from ...errors import ModelError
@@ -107,8 +107,8 @@ def _mode(draws: Array) -> float:
     if np.ptp(draws) == 0:
         return float(draws.flat[0])
     # Bandwidth rules assume independent draws.
-    n_eff = max(MIN_INDEPENDENT, float(az.ess(draws))) if draws.size > MIN_INDEPENDENT else np.inf
+    n_eff = max(MIN_INDEPENDENT, float(ess(draws))) if draws.size > MIN_INDEPENDENT else np.inf
     with np.errstate(divide="ignore"):  # a flat density has no curvature
-        _, _, bandwidth = az.kde(draws.ravel()[:: max(1, int(draws.size // n_eff))])
-    grid, density, _ = az.kde(draws.ravel(), bw=float(bandwidth))
+        _, _, bandwidth = kde(draws.ravel()[:: max(1, int(draws.size // n_eff))])
+    grid, density, _ = kde(draws.ravel(), bw=float(bandwidth))
     return float(grid[np.argmax(density)])

@@ -43,8 +43,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import arviz as az
 import numpy as np
+from arviz_stats import ess, mcse
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, log_expit, logsumexp
@@ -250,14 +250,14 @@ def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _F
     log_odds = math.log(at_draws.size / at_proposals.size)
     shift = log_odds - _fixed_point(at_draws, at_proposals, log_odds)
     # One fixed-point step suffices: the effective sample size depends only weakly on itself.
-    n_effective = float(az.ess(expit(-at_draws - shift), method="mean"))
+    n_effective = float(ess(expit(-at_draws - shift), method="mean"))
     log_odds = math.log(n_effective / at_proposals.size)
     log_evidence = _fixed_point(at_draws, at_proposals, log_odds)
     shift = log_odds - log_evidence
 
     terms = expit(-at_draws - shift)
     draws = log_mean_of_chains(log_expit(-at_draws - shift))
-    moved = float(az.mcse(terms - expit(-pooled - shift), method="mean") / terms.mean())
+    moved = float(mcse(terms - expit(-pooled - shift), method="mean") / terms.mean())
     return _Fold(
         log_evidence,
         draws=draws,

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-import arviz as az
 import numpy as np
+from arviz_stats import mcse
 from numpy.typing import NDArray
 
 from ...errors import ModelError
@@ -138,7 +138,7 @@ def _check(posterior: Posterior, at_mode: float, log_dets: tuple[float, float]) 
     # Draws of a Gaussian lie k / 2 below the mode on average; heavy tails or further modes, lower.
     depth = at_mode - posterior.log_density
     expected = 0.5 * posterior.draws.shape[-1]
-    error = float(az.mcse(depth, method="mean"))
+    error = float(mcse(depth, method="mean"))
     if abs(depth.mean() - expected) > MAX_EXCESS + 3 * error:
         yield (
             f"the draws lie {depth.mean():.2f} nats below the mode on average where those of a "
