@@ -1,4 +1,5 @@
 from .diagnostics import (
+    check_filter,
     compute_log_likelihood,
     filter_diagnostics,
     leave_future_out,
@@ -97,6 +98,7 @@ __all__ = [
     "StateSpaceFiltersError",
     "StateSpaceModel",
     "average_models",
+    "check_filter",
     "chib_jeliazkov",
     "compare_evidence",
     "compute_log_likelihood",

@@ -1,11 +1,15 @@
 """Filter diagnostics: one-step-ahead predictions compared with the observations."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
+from ..errors import FilterWarning
+from ..filter_checks.checks import stored
+from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
 from ..filters.protocol import HealthFilter
 from ..pymc_model.state_graphs import StateSpaceVariable
@@ -112,7 +116,8 @@ def filter_diagnostics(
     Warns
     -----
     FilterWarning
-        If the filter failed, or its particles collapsed, at some draws.
+        If the filter failed, or its particles collapsed, at some draws; or if `check_filter` or the
+        end of the run found it off.
 
     References
     ----------
@@ -160,6 +165,8 @@ def filter_diagnostics(
         healths = [one.health for one in found]
         at_draws.warn_about([one.health for one in healths], [one.seeds for one in healths])
     attrs = {"predictions": PREDICTION_NOTE}
+    for verdict in stored(idata, model, OFF) if filter is None else ():
+        warnings.warn(verdict, FilterWarning, stacklevel=2)
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 

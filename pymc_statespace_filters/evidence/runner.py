@@ -11,6 +11,8 @@ import pymc as pm
 import xarray as xr
 
 from ..errors import EvidenceWarning, ModelError
+from ..filter_checks.checks import stored
+from ..filter_checks.finding import OFF
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
@@ -55,7 +57,11 @@ def run_estimators(
     density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
     posterior, noise = build_posterior(idata, density)
     support = Support.of(density.model)
-    common = (*support.check(), *check_discretisation(density.model, idata, posterior.draws))
+    common = (
+        *support.check(),
+        *check_discretisation(density.model, idata, posterior.draws),
+        *stored(idata, density.model, OFF),
+    )
     of_chains = tuple(check_convergence(posterior, idata))
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))

@@ -61,6 +61,12 @@ class VariableAtPoints:
         """The number of points."""
         return len(self._arguments)
 
+    @property
+    def n_steps(self) -> int:
+        """Steps of one evaluation, of all records."""
+        op = self._kind(self.system, self.filter)
+        return op.n_steps(self._arguments[0]) if self._arguments else 0
+
     def log_likelihood(self, filter: Filter, seeds: NDArray[np.int64]) -> Array:
         """The log-likelihood by a filter at every point for every seed, (m, r); -inf if it fails.
 

@@ -61,6 +61,19 @@ def log_density_terms(model: pm.Model) -> list[tuple[str, TensorVariable]]:
     return list(zip(names, model.logp(sum=False), strict=True))
 
 
+def element_names(model: pm.Model, values: Sequence[TensorVariable] | None = None) -> list[str]:
+    """Name each element of the flat vector of some values, such as "theta[1]".
+
+    Default: those of the free variables, in their order.
+    """
+    point = model.initial_point()
+    return [
+        model.values_to_rvs[value].name + (f"[{', '.join(map(str, index))}]" if index else "")
+        for value in values or [model.rvs_to_values[rv] for rv in model.free_RVs]
+        for index in np.ndindex(point[value.name].shape)
+    ]
+
+
 def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:
     """The shared noise seed of every variable whose likelihood is a random estimate."""
     seeds = {}

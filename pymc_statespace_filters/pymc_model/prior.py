@@ -23,11 +23,10 @@ class ModelPrior:
 
     def __init__(self, model: pm.Model) -> None:
         self._model = model
-        self._log_density = RowFunction(model, model.logp(vars=model.free_RVs))
 
     def log_density(self, x: Array) -> Array:
         """Log-density of points x (m, k), Jacobians included; NaN becomes -inf."""
-        return self._log_density.evaluate(x)
+        return self._density.evaluate(x)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent draws, shape (count, k), in the order of `log_density`.
@@ -64,6 +63,10 @@ class ModelPrior:
                 "there"
             )
         return found
+
+    @cached_property
+    def _density(self) -> RowFunction:
+        return RowFunction(self._model, self._model.logp(vars=self._model.free_RVs))
 
     @cached_property
     def _draw(self) -> tuple[Any, list[SharedVariable]]:

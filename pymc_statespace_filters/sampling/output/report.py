@@ -3,30 +3,17 @@
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning
 
 from ...lower_chains import LowerChain
 from ...progress import MIN_ACCEPT_RATE
 from ..kernel.state import failure_reason
-from ..target.variables import RaveledVariables
 from .convergence import MAX_RHAT, Convergence
 from .datatree import most_iterations
 from .warnings import PhaseStatistics, sampler_warning
 
 # Effective draws of each chain below which PyMC takes neither diagnostic for reliable.
 _ENOUGH_PER_CHAIN = 100
-
-
-def element_names(model: Model, raveled: RaveledVariables) -> list[str]:
-    """Name each element of a position after its variable in the model, such as "theta[1]"."""
-    point = raveled.unravel(np.zeros(raveled.dim))
-    return [
-        model.values_to_rvs[v].name + (f"[{', '.join(map(str, index))}]" if index else "")
-        for v in raveled.variables
-        for index in np.ndindex(point[v.name].shape)
-    ]
 
 
 def closing_report(

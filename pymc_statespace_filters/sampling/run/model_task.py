@@ -17,13 +17,13 @@ from pymc.stats.convergence import (
 from xarray import DataTree
 
 from ...parallel.communicator import Communicator
-from ...pymc_model.inspection import filters_used
+from ...pymc_model.inspection import element_names, filters_used
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
 from ..output.datatree import to_datatree
 from ..output.likelihood_variance import is_measured, spread_at_highest_draw
-from ..output.report import closing_report, element_names, left_out_warnings, until_ess_warning
+from ..output.report import closing_report, left_out_warnings, until_ess_warning
 from ..output.sample_stats import stat_dims, whole_chain
 from ..output.warnings import PhaseStatistics, chain_warnings, lower_chains_of
 from ..target.initial_points import chain_candidates
@@ -299,7 +299,7 @@ class ModelTask:
 
     def _closing_messages(self, check_convergence: bool, report_level: str) -> list[SamplerWarning]:
         """The report, and a warning if ``max_draws`` ended the run."""
-        request, names = self.request, element_names(self.model, self.prepare().raveled)
+        request, names = self.request, element_names(self.model, self.prepare().raveled.variables)
         draws = [self._results[i][0] for i in range(request.chains)]
         statistics = {
             i: PhaseStatistics.from_draws(of_chain, request.tune, len(of_chain.positions))

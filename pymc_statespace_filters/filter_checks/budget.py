@@ -1,0 +1,29 @@
+"""How much a check may compute: the work that is planned, and the time after which it ends."""
+
+import time
+
+# Nanoseconds of a particle for a step, for each of its states and as much again, as measured.
+_PLAIN_NS = 5.0
+# The number of particles of the plain filter, at least and at most.
+_LEAST, _MOST = 200, 20_000
+# Of the time, for the estimates of plain particles; the rest is for compilation and other filters.
+_SHARE = 0.35
+
+
+class Budget:
+    """CPU seconds of this process, counted from now on."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._began = seconds, time.process_time()
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether the time is up."""
+        return time.process_time() - self._began > self._seconds
+
+    def n_particles(self, n_estimates: int, n_steps: int, n_states: int) -> int:
+        """Particles with which so many estimates of a record fit the budget, of one digit."""
+        work = n_estimates * max(n_steps, 1) * (1 + n_states) * _PLAIN_NS * 1e-9
+        number = min(max(_SHARE * self._seconds / work, _LEAST), _MOST)
+        digit = 10 ** (len(str(int(number))) - 1)
+        return int(number // digit * digit)

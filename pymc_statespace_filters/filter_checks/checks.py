@@ -1,0 +1,175 @@
+"""The checks of all StateSpace variables of a model at draws of its posterior."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import ModelError
+from ..filters.bootstrap import BootstrapPF
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_system_and_filter, short_form
+from ..pymc_model.compilation import compile_raveled
+from ..pymc_model.filter_estimates import VariableAtPoints
+from ..pymc_model.inspection import element_names, log_density_terms, state_space_nodes
+from ..pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from .bias import bias_at_draws, bias_elsewhere
+from .budget import Budget
+from .estimates import Comparison, compare, is_unbiased
+from .finding import EXACT, FINE, OFF, UNDECIDED, Finding
+from .low import low_at
+from .points import Points, choose_points
+
+Array = NDArray[np.float64]
+
+# The attribute of results that holds the outcome for each variable.
+ATTRIBUTE = "filter_check"
+# Worst first.
+_ORDER = (OFF, UNDECIDED, FINE, EXACT)
+# Nats by which a point may be less likely than the draws, beside the volume where it lies.
+_SLACK = 3.0
+_MOST_DRAWS = 500  # of each chain, from which mean and spread are taken
+
+
+def needs_check(system: Any, filter: Filter) -> bool:
+    """Whether the likelihood of a filter may be off for reasons that its noise does not show."""
+    compiled = compile_system(system)
+    if isinstance(filter, BootstrapPF):
+        return False
+    return not filter.is_exact_for(compiled) or (filter.noisy and not compiled.is_linear)
+
+
+def draws_to_check(idata: xr.DataTree, model: pm.Model) -> Array:
+    """Draws (n, k) on the unconstrained space, all or some hundred of each chain."""
+    posterior = posterior_group(idata)
+    every = max(1, posterior.sizes["draw"] // _MOST_DRAWS)
+    thinned = xr.DataTree.from_dict({"posterior": posterior.isel(draw=slice(None, None, every))})
+    draws = unconstrained_draws(thinned, model)
+    return draws.reshape(-1, draws.shape[-1])
+
+
+def check_model(
+    model: pm.Model,
+    draws: Array,
+    *,
+    filter: Filter | None,
+    n_points: int,
+    seconds: float,
+    rng: np.random.Generator,
+) -> pd.DataFrame:
+    """Check the filters of all observed StateSpace variables, at draws (n, k) unconstrained.
+
+    ``filter`` is checked in their place; None: their own. ``seconds`` of CPU time are for all
+    variables together.
+    """
+    nodes = state_space_nodes(model)
+    chosen = {
+        name: filter or node.op.filter
+        for name, node in nodes.items()
+        if node.outputs[1] in model.observed_RVs
+    }
+    if not chosen:
+        raise ModelError("model must have an observed StateSpace variable, got none")
+    for name, one in chosen.items():
+        check_system_and_filter(nodes[name].op.system, one)
+    rows = []
+    n_checked = sum(needs_check(nodes[name].op.system, one) for name, one in chosen.items())
+    for name, one in chosen.items():
+        if needs_check(nodes[name].op.system, one):
+            budget = Budget(seconds / n_checked)
+            findings = _check_variable(model, name, one, draws, n_points, budget, rng)
+        else:
+            findings = [_plain_row(one)]
+        rows += [{"variable": name, "filter": short_form(one)} | f._asdict() for f in findings]
+    return pd.DataFrame(rows)
+
+
+def _plain_row(filter: Filter) -> Finding:
+    name = short_form(filter)
+    if isinstance(filter, BootstrapPF):
+        verdict = (
+            f"{name} is unbiased and has no guide; how much its estimates scatter, "
+            "suggest_particles measures"
+        )
+    else:
+        verdict = f"{name} is exact for this system"
+    return Finding("exact", 0.0, 0.0, np.nan, 0.0, EXACT, verdict)
+
+
+def _check_variable(
+    model: pm.Model,
+    name: str,
+    filter: Filter,
+    draws: Array,
+    n_points: int,
+    budget: Budget,
+    rng: np.random.Generator,
+) -> list[Finding]:
+    points = choose_points(model, draws, n_points, rng)
+    found = compare(VariableAtPoints(model, name, points.x), filter, budget, rng)
+    points = Points(*(part[: len(found.checked.logs)] for part in points))
+    at_draws = found.at(points.spread == 1.0)
+    others = found.at(_is_relevant(model, name, points, found))
+    if is_unbiased(filter):
+        findings = [low_at(at_draws, "at draws")]
+        return [*findings, low_at(others, "elsewhere")] if len(others.checked.logs) else findings
+    findings = bias_at_draws(found, points, element_names(model))
+    if len(others.checked.logs):
+        elsewhere = bias_elsewhere(others, at_draws)
+        findings += [elsewhere] if elsewhere is not None else []
+    return findings
+
+
+def _is_relevant(
+    model: pm.Model, name: str, points: Points, found: Comparison
+) -> NDArray[np.bool_]:
+    """Which other points the posterior would hold, by the highest of all estimates there."""
+    estimates = [found.checked, *found.unbiased, *([found.exact] if found.exact else [])]
+    highest = np.max([one.mean for one in estimates], axis=0)
+    density = highest + _density_of_others(model, name, points.x)
+    factor = np.where(points.spread == 0.0, points.spread.max(), points.spread)
+    allowed = _SLACK + points.x.shape[1] * np.log(factor)
+    is_draw = points.spread == 1.0
+    return ~is_draw & (density >= density[is_draw].min() - allowed)
+
+
+def _density_of_others(model: pm.Model, name: str, x: Array) -> Array:
+    """The log-density of all variables and Potentials but one, (m,)."""
+    others = [term.sum() for variable, term in log_density_terms(model) if variable != name]
+    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    function, _ = compile_raveled(model.initial_point(), others, values, mode="FAST_COMPILE")
+    found = np.array([np.sum(function(point)) for point in x])
+    return np.where(np.isnan(found), -np.inf, found)
+
+
+def outcomes_of(table: pd.DataFrame) -> dict[str, dict[str, str]]:
+    """The worst finding of every variable: filter, outcome and verdict."""
+    worst = {}
+    for name, rows in table.groupby("variable", sort=False):
+        row = min(rows.to_dict("records"), key=lambda one: _ORDER.index(one["outcome"]))
+        worst[str(name)] = {key: row[key] for key in ("filter", "outcome", "verdict")}
+    return worst
+
+
+def store(idata: xr.DataTree, outcomes: Mapping[str, Mapping[str, str]]) -> None:
+    """Keep the outcomes with the draws; files of netCDF and Zarr store no mappings."""
+    idata.attrs[ATTRIBUTE] = json.dumps(outcomes)
+
+
+def stored(idata: xr.DataTree, model: pm.Model, outcome: str) -> list[str]:
+    """The verdicts, stored with the draws, on filters that the model has and have this outcome."""
+    found = json.loads(idata.attrs.get(ATTRIBUTE, "{}"))
+    nodes = state_space_nodes(model)
+    return [
+        one["verdict"]
+        for name, one in found.items()
+        if one["outcome"] == outcome
+        and name in nodes
+        and one["filter"] == short_form(nodes[name].op.filter)
+    ]

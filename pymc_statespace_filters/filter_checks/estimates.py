@@ -1,0 +1,151 @@
+"""Estimates of the likelihood at the points of a check, by the model's filter and by witnesses.
+
+The witnesses are filters whose estimate is unbiased or exact. Plain particles know nothing of what
+a guided filter assumes; both are unbiased, and only where both agree is a difference from them
+trusted that does not follow from unbiasedness alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ..compiler.lowering.compiled_system import compile_system
+from ..filters.bootstrap import BootstrapPF
+from ..filters.guided_pf import GuidedPF
+from ..filters.protocol import Filter, System
+from ..filters.recommendation import exact_filter, filters_for
+from ..pymc_model.filter_estimates import VariableAtPoints
+from ..pymc_model.inspection import resized
+from .budget import Budget
+
+Array = NDArray[np.float64]
+
+N_SEEDS, N_GUIDED_SEEDS = 4, 8  # of noisy filters at each point; guided ones take less time
+_AT_ONCE = 4  # points, after which the time is looked at
+_MORE = 4  # times as many particles has the second guided witness
+# Standard deviation of the logs of estimates, in nats, above which their mean is not trusted.
+USABLE = 2.0
+
+
+class Estimates(NamedTuple):
+    """Logs of estimates by one filter, (m, r): one column if it has no noise."""
+
+    filter: Filter
+    logs: Array
+
+    @property
+    def mean(self) -> Array:
+        """The log of the mean over seeds, (m,)."""
+        return np.asarray(logsumexp(self.logs, axis=1) - np.log(self.logs.shape[1]))
+
+    @property
+    def error(self) -> Array:
+        """The standard error of `mean` (m,), by that of the mean of the estimates."""
+        n = self.logs.shape[1]
+        if n == 1:
+            return np.zeros(len(self.logs))
+        with np.errstate(invalid="ignore"):
+            ratios = np.exp(self.logs - self.mean[:, None])
+        return ratios.std(axis=1, ddof=1) / np.sqrt(n)
+
+    @property
+    def scatter(self) -> float:
+        """The standard deviation of the logs over seeds, in the median of the points."""
+        if self.logs.shape[1] == 1:
+            return 0.0 if np.isfinite(self.logs).all() else np.inf
+        finite = np.isfinite(self.logs).all(axis=1)
+        if 2 * finite.sum() <= len(self.logs):
+            return np.inf
+        return float(np.median(np.sqrt(self.logs[finite].var(axis=1, ddof=1))))
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the log of the mean is close to the log-likelihood."""
+        return self.scatter <= USABLE
+
+    def at(self, rows: NDArray[np.bool_]) -> "Estimates":
+        """Those of some of the points."""
+        return Estimates(self.filter, self.logs[rows])
+
+
+class Comparison(NamedTuple):
+    """The filter that is checked and its witnesses at the first points, as far as time allowed."""
+
+    checked: Estimates
+    exact: Estimates | None
+    plain: Estimates | None
+    guided: tuple[Estimates, ...]
+
+    @property
+    def unbiased(self) -> tuple[Estimates, ...]:
+        """The witnesses with noise."""
+        return (*((self.plain,) if self.plain else ()), *self.guided)
+
+    def at(self, rows: NDArray[np.bool_]) -> "Comparison":
+        """The same at some of the points."""
+        return Comparison(
+            self.checked.at(rows),
+            None if self.exact is None else self.exact.at(rows),
+            None if self.plain is None else self.plain.at(rows),
+            tuple(one.at(rows) for one in self.guided),
+        )
+
+
+def compare(
+    variable: VariableAtPoints, filter: Filter, budget: Budget, rng: np.random.Generator
+) -> Comparison:
+    """Evaluate the filter and its witnesses, point by point until the budget is spent."""
+    system = compile_system(variable.system)
+    n_particles = budget.n_particles(N_SEEDS * len(variable), variable.n_steps, system.n)
+    filters = [filter, *(_exact(variable, filter) or _unbiased(system, filter, n_particles))]
+    found: list[list[Array]] = [[] for _ in filters]
+    scored = not is_unbiased(filter)
+    for first in range(0, len(variable), _AT_ONCE):
+        points = range(first, min(first + _AT_ONCE, len(variable)))
+        for one, logs in zip(filters, found, strict=True):
+            seeds = rng.integers(2**62, size=(len(points), _n_seeds(one)))
+            logs.append(variable.at(points, one, seeds, scored=scored))
+        if budget.is_spent:
+            break
+    estimates = [Estimates(f, np.concatenate(logs)) for f, logs in zip(filters, found, strict=True)]
+    checked, *others = estimates
+    return Comparison(
+        checked,
+        next((one for one in others if not one.filter.noisy), None),
+        next((one for one in others if isinstance(one.filter, BootstrapPF)), None),
+        tuple(one for one in others if isinstance(one.filter, GuidedPF)),
+    )
+
+
+def _n_seeds(filter: Filter) -> int:
+    if not filter.noisy:
+        return 1
+    return N_GUIDED_SEEDS if isinstance(filter, GuidedPF) else N_SEEDS
+
+
+def _exact(variable: VariableAtPoints, filter: Filter) -> list[Filter]:
+    """A filter without noise or bias, if there is one and it works at the first point."""
+    found = exact_filter(compile_system(variable.system), without=filter)
+    if found is None:
+        return []
+    works = np.isfinite(variable.at([0], found, np.zeros((1, 1), dtype=np.int64)))
+    return [found] if works.all() else []
+
+
+def is_unbiased(filter: Filter) -> bool:
+    """Whether a filter with noise is known to be unbiased."""
+    return filter.noisy and bool(getattr(filter, "unbiased", False))
+
+
+def _unbiased(system: System, filter: Filter, n_particles: int) -> list[Filter]:
+    """Plain particles, and guided ones unless an equation jumps, which misleads them."""
+    taken = filters_for(system)
+    found: list[Filter] = [
+        resized(one, n_particles) for one in taken if isinstance(one, BootstrapPF)
+    ]
+    if isinstance(filter, GuidedPF):
+        return [*found, resized(filter, _MORE * filter.n_particles)]
+    guided = [one for one in taken if isinstance(one, GuidedPF) and not system.jumping_equations]
+    return [*found, *guided]

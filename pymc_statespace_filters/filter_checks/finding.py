@@ -1,0 +1,69 @@
+"""What a check finds: a row of its table."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..filters.bootstrap import BootstrapPF
+from ..filters.guided_pf import GuidedPF
+from ..filters.recommendation import short_form
+from ..pymc_model.inspection import resized
+from .estimates import Comparison, Estimates
+
+# The probability at most with which a filter that is right is found to be off.
+ALPHA = 0.01
+# Nats: a filter is off if it is proved to be so by more than the first; it passes if it would have
+# been found to be off by the second.
+TOLERATED, VISIBLE = 1.0, 3.0
+
+EXACT, FINE, OFF, UNDECIDED = "exact", "no sign", "off", "undecided"
+
+# The variance of an estimated log-likelihood with which a chain works well.
+_GOOD_VARIANCE = 1.8
+
+
+class Finding(NamedTuple):
+    """One check: its name, what was estimated, and what that means."""
+
+    check: str
+    statistic: float
+    se: float
+    alpha: float
+    visible: float  # a difference that would have been seen
+    outcome: str
+    verdict: str
+
+
+def nats(value: float) -> str:
+    """A number of nats, with a digit below ten."""
+    return f"{value:.1f}" if abs(value) < 10.0 else f"{value:.0f}"
+
+
+def cure(found: Comparison) -> str:
+    """Name a filter that works at these points; a sentence."""
+    if found.exact is not None:
+        return f"Use {short_form(found.exact.filter)}, which computes this likelihood."
+    plain = found.plain if found.plain is not None and found.plain.is_usable else None
+    for one in found.guided:
+        agrees = plain is None or abs(np.median(one.mean - plain.mean)) <= TOLERATED
+        if not isinstance(found.checked.filter, GuidedPF) and one.is_usable and agrees:
+            others = "" if plain is None else " and agree with those of plain particles"
+            return (
+                f"Use {short_form(one.filter)}: its estimates are unbiased, scatter by "
+                f"{nats(one.scatter)} nats here{others}."
+            )
+    if plain is not None:
+        return f"Use {_enough(plain)}, whose estimates are unbiased."
+    return (
+        "No filter is known to work here: BootstrapPF and GuidedPF are unbiased with any number of "
+        "particles, but these were too few."
+    )
+
+
+def _enough(plain: Estimates) -> str:
+    """Plain particles in a number that suits a chain."""
+    assert isinstance(plain.filter, BootstrapPF)
+    number = max(plain.filter.n_particles * plain.scatter**2 / _GOOD_VARIANCE, 100.0)
+    digit = 10 ** math.floor(math.log10(number))
+    return short_form(resized(plain.filter, digit * math.ceil(number / digit)))

@@ -1,0 +1,94 @@
+"""Whether an unbiased filter is far too low, with a spread over seeds that looks small.
+
+So it is where guided particles follow one of several explanations of the data: once in very many
+seeds an estimate is far too high, and makes up for all others. Plain particles do not follow the
+guide. Their estimates are unbiased too, and prove the guided ones too low whatever their tails.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..filters.recommendation import short_form
+from .e_values import proved_shortfall, visible_shortfall
+from .estimates import Comparison
+from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
+
+_N_ERRORS = 3.0  # standard errors, where the other filter has none
+
+
+def shortfall(found: Comparison, bounds: NDArray[np.float64]) -> float:
+    """The nats by which some log-likelihood is proved to be above its bound, at level `ALPHA`."""
+    known = np.isfinite(bounds)
+    if not known.any():
+        return -np.inf
+    if found.exact is not None:
+        return float((found.exact.mean - bounds)[known].max())
+    witnesses = found.unbiased
+    return max(
+        (
+            proved_shortfall(one.logs[known], bounds[known], ALPHA / len(witnesses))
+            for one in witnesses
+        ),
+        default=-np.inf,
+    )
+
+
+def low_at(found: Comparison, where: str) -> Finding:
+    """Test the estimates of an unbiased filter at some points, ``where`` in words."""
+    checked, name = found.checked, short_form(found.checked.filter)
+    error = float(np.median(checked.error))
+    proved = shortfall(found, checked.mean) - _N_ERRORS * error
+    statistic, se = _difference(found)
+    visible = _visible(found)
+    check = f"low {where}"
+    if proved > TOLERATED:
+        verdict = (
+            f"{name} is too low {where}, by {nats(proved)} nats at least, although its estimates "
+            f"scatter by only {nats(checked.scatter)} nats over seeds. {cure(found)}"
+        )
+        return Finding(check, statistic, se, ALPHA, visible, OFF, verdict)
+    if visible <= VISIBLE:
+        verdict = (
+            f"no sign that {name} is too low {where}; {nats(max(visible, 0.1))} nats would have "
+            "been seen"
+        )
+        return Finding(check, statistic, se, ALPHA, visible, FINE, verdict)
+    verdict = (
+        f"undecided whether {name} is too low {where}: {_why(found)}, too much to prove less than "
+        f"{nats(visible)} nats"
+    )
+    return Finding(check, statistic, se, ALPHA, visible, UNDECIDED, verdict)
+
+
+def _difference(found: Comparison) -> tuple[float, float]:
+    """Mean of the checked estimates minus those of exact or plain particles, with its error."""
+    other = found.exact or found.plain
+    if other is None:
+        return np.nan, np.nan
+    difference = found.checked.mean - other.mean
+    difference = difference[np.isfinite(difference)]
+    if difference.size < 2:
+        return np.nan, np.nan
+    return float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(difference.size))
+
+
+def _visible(found: Comparison) -> float:
+    if found.exact is not None:
+        return _N_ERRORS * float(np.median(found.checked.error)) + TOLERATED
+    known = np.isfinite(found.checked.mean)
+    if found.plain is None or not found.plain.is_usable or not known.any():
+        return np.inf
+    n_witnesses = len(found.unbiased)
+    seen = visible_shortfall(
+        found.plain.logs[known], found.checked.mean[known], ALPHA / n_witnesses
+    )
+    return seen + _N_ERRORS * float(np.median(found.checked.error))
+
+
+def _why(found: Comparison) -> str:
+    if found.plain is None:
+        return "no filter without a guide takes this system"
+    return (
+        f"plain particles, {short_form(found.plain.filter)}, scatter by "
+        f"{nats(found.plain.scatter)} nats"
+    )

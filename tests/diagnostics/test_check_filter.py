@@ -1,0 +1,165 @@
+"""`check_filter` on systems whose likelihood is known: linear ones, and those of one state."""
+
+import json
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filter_checks import checks, estimates
+from tests.systems import FREE, autoregression
+
+pytestmark = pytest.mark.usefixtures("interpreted")
+
+N = 40
+SQUARE = autoregression(spread=0.5, observation=lambda x: [x[0] ** 2], observation_noise=0.04)
+# With a second state that is seen by itself, so that no filter without noise or bias takes it.
+SQUARE_AND_LINE = psf.StateSpaceModel(
+    transition=lambda x, q, phi: [phi * x[0] + q[0], 0.8 * x[1] + q[1]],
+    process_noise=np.diag([0.25, 0.5]),
+    observation=lambda x: [x[0] ** 2, x[1]],
+    observation_noise=np.diag([0.04, 0.3]),
+    initial_mean=[0.0, 0.0],
+    initial_cov=np.eye(2),
+)
+
+
+def record_of(system, **given):
+    return psf.simulate(system, given, steps=range(N), random_seed=1)["observations"].values
+
+
+def model_of(system, filter, observed, name="phi"):
+    with pm.Model() as model:
+        pm.Normal(name, 0.8, 0.3)
+        psf.StateSpace("d", system, filter, steps=range(N), observed=observed)
+    return model
+
+
+def draws_of(name="phi", seed=1):
+    rng = np.random.default_rng(seed)
+    return az.from_dict({"posterior": {name: rng.normal(0.8, 0.05, (2, 100))}})
+
+
+def exact_filters_left_out(monkeypatch):
+    monkeypatch.setattr(estimates, "_exact", lambda variable, filter: [])
+
+
+def test_exact_and_plain_filters_are_not_compared(monkeypatch):
+    monkeypatch.setattr(checks, "compare", None)
+    observed = record_of(FREE, a=0.8)
+    for filter in (psf.EKF(), psf.IPLF(), psf.GuidedPF(10), psf.GridFilter(), psf.BootstrapPF(50)):
+        idata = draws_of("a")
+        table = psf.check_filter(idata, model_of(FREE, filter, observed, "a"))
+        assert table["outcome"].tolist() == ["exact"]
+        (stored,) = json.loads(idata.attrs["filter_check"]).values()
+        assert stored["outcome"] == "exact"
+
+
+def test_an_approximation_of_a_linear_system_differs_by_its_noise_from_kalman():
+    observed = record_of(FREE, a=0.8)
+    model = model_of(FREE, psf.EnKF(4000, likelihood="gaussian"), observed, "a")
+    table = psf.check_filter(draws_of("a"), model, random_seed=1).set_index("check")
+    assert table["outcome"].unique().tolist() == ["no sign"]
+    assert abs(table.loc["bias", "statistic"]) < 0.5
+
+
+def test_a_sensor_that_squares_is_compared_with_the_grid_filter():
+    observed = record_of(SQUARE, phi=0.8)
+    model, idata = model_of(SQUARE, psf.EKF(), observed), draws_of()
+    table = psf.check_filter(idata, model, random_seed=1)
+    bias = table.set_index("check").loc["bias"]
+    at = idata["posterior"]["phi"].values.ravel()[np.linspace(0, 199, 10).round().astype(int)]
+    ekf, grid = (
+        psf.log_likelihood(SQUARE, f, {"phi": at}, observed, steps=range(N)).sum(axis=-1)
+        for f in (psf.EKF(), psf.GridFilter())
+    )
+    assert bias["statistic"] == pytest.approx((ekf - grid).mean(), rel=1e-6)
+    assert bias["outcome"] == "off"
+    assert "Use GridFilter()" in bias["verdict"]
+    assert "off" in idata.attrs["filter_check"]
+
+
+def test_particles_find_the_same_difference_as_the_grid_filter(monkeypatch):
+    observed = record_of(SQUARE, phi=0.8)
+    model = model_of(SQUARE, psf.EKF(), observed)
+    exact = psf.check_filter(draws_of(), model, random_seed=1).set_index("check").loc["bias"]
+    exact_filters_left_out(monkeypatch)
+    found = psf.check_filter(draws_of(), model, random_seed=1).set_index("check").loc["bias"]
+    assert found["outcome"] == "off"
+    assert "BootstrapPF(" in found["verdict"]
+    assert found["statistic"] == pytest.approx(exact["statistic"], abs=2.0)
+
+
+def test_another_filter_in_place_of_the_models():
+    observed = record_of(SQUARE_AND_LINE, phi=0.8)
+    model, idata = model_of(SQUARE_AND_LINE, psf.EKF(), observed), draws_of()
+    of_model = psf.check_filter(idata, model, random_seed=1).set_index("check")
+    stored = idata.attrs["filter_check"]
+    other = psf.check_filter(idata, model, filter=psf.BootstrapPF(1000), random_seed=1)
+    assert of_model.loc["bias", "outcome"] == "off"
+    assert of_model.loc["bias", "filter"] == "EKF()"
+    assert other["outcome"].tolist() == ["exact"]
+    assert idata.attrs["filter_check"] == stored
+
+
+def test_a_doubt_goes_with_the_draws():
+    """What `check_filter` stores, the diagnostics and the evidence repeat for the same filter."""
+    observed = record_of(SQUARE, phi=0.8)
+    model, idata = model_of(SQUARE, psf.EKF(), observed), draws_of()
+    psf.check_filter(idata, model, random_seed=1)
+    with pytest.warns(psf.FilterWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"):
+        psf.filter_diagnostics(idata, model, n_draws=4, random_seed=1, progressbar=False)
+    with pytest.warns(psf.EvidenceWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"):
+        found = psf.estimate_evidence(idata, model, estimators="bridge", progressbar=False)
+    assert "nats below GridFilter()" in found["bridge"].doubts
+    with_another_filter = model_of(SQUARE, psf.GridFilter(), observed)
+    assert checks.stored(idata, with_another_filter, "off") == []
+
+
+def test_a_seed_fixes_the_numbers():
+    observed = record_of(SQUARE_AND_LINE, phi=0.8)
+    model = model_of(SQUARE_AND_LINE, psf.EKF(), observed)
+    a, b = (psf.check_filter(draws_of(), model, n_draws=8, random_seed=3) for _ in range(2))
+    assert a.equals(b)
+
+
+def test_nothing_is_decided_where_plain_particles_collapse(monkeypatch):
+    """A sensor so fine that few of a thousand particles see an observation."""
+    exact_filters_left_out(monkeypatch)
+    fine = autoregression(
+        spread=0.5, observation_noise=1e-8, observation=lambda x: [x[0] + 0.1 * x[0] ** 3]
+    )
+    monkeypatch.setattr(estimates.Budget, "n_particles", lambda *_: 1000)
+    observed = record_of(fine, phi=0.8)
+    for filter in (psf.GuidedPF(50), psf.EKF()):
+        table = psf.check_filter(
+            draws_of(), model_of(fine, filter, observed), n_draws=8, random_seed=1
+        )
+        assert table["outcome"][0] == "undecided"
+        assert "BootstrapPF(1000)" in table["verdict"][0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_draws": 7}, "n_draws must be an integer of at least 8, got 7"),
+        ({"filter": "EKF"}, "filter must be a filter"),
+        ({"filter": psf.GridFilter()}, "GridFilter"),
+        ({"random_seed": "x"}, "random_seed"),
+    ],
+)
+def test_wrong_arguments_are_named(changes, message):
+    observed = np.zeros((N, 2))
+    model = model_of(SQUARE_AND_LINE, psf.EKF(), observed)
+    with pytest.raises(ModelError, match=message):
+        psf.check_filter(draws_of(), model, **changes)
+
+
+def test_a_model_without_such_a_variable_is_refused():
+    with pm.Model() as model:
+        pm.Normal("phi")
+    with pytest.raises(ModelError, match="observed StateSpace variable"):
+        psf.check_filter(draws_of(), model)

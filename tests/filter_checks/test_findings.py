@@ -1,0 +1,134 @@
+"""The verdicts on estimates that are made up: no filter is run."""
+
+import numpy as np
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.filter_checks.bias import bias_at_draws, bias_elsewhere
+from pymc_statespace_filters.filter_checks.estimates import Comparison, Estimates
+from pymc_statespace_filters.filter_checks.finding import FINE, OFF, UNDECIDED
+from pymc_statespace_filters.filter_checks.low import low_at
+from pymc_statespace_filters.filter_checks.points import Points
+
+PLAIN, GUIDED, MORE = psf.BootstrapPF(1000), psf.GuidedPF(100), psf.GuidedPF(400)
+
+
+def noisy(filter, mean, scatter, n_seeds=4, n_points=20, seed=1):
+    """Estimates that are unbiased for exp(mean)."""
+    rng = np.random.default_rng(seed)
+    centre = np.broadcast_to(np.reshape(mean, (-1, 1)), (n_points, 1)) - scatter**2 / 2
+    return Estimates(filter, centre + scatter * rng.standard_normal((n_points, n_seeds)))
+
+
+def exactly(filter, values):
+    return Estimates(filter, np.broadcast_to(np.reshape(values, (-1, 1)), (20, 1)).copy())
+
+
+def points(seed=2, n=20):
+    rng = np.random.default_rng(seed)
+    spread = np.tile([1.0, 2.0], n // 2)
+    z = rng.standard_normal((n, 2)) * spread[:, None]
+    return Points(z, z, spread)
+
+
+@pytest.mark.parametrize(
+    ("shortfall", "scatter", "outcome"),
+    [(0.0, 0.5, FINE), (8.0, 0.5, OFF), (0.0, 6.0, UNDECIDED), (8.0, 6.0, UNDECIDED)],
+)
+def test_a_guided_filter_that_looks_exact(shortfall, scatter, outcome):
+    guided, more = noisy(GUIDED, -shortfall, 0.1, 8, seed=3), noisy(MORE, -shortfall, 0.05, 8)
+    found = low_at(Comparison(guided, None, noisy(PLAIN, 0.0, scatter), (more,)), "at draws")
+    assert found.outcome == outcome
+    if outcome == OFF:
+        assert "BootstrapPF(" in found.verdict
+        assert found.statistic == pytest.approx(-8.0, abs=5 * found.se)
+    if outcome == FINE:
+        assert 0.1 < found.visible < 3.0
+
+
+def test_more_guided_particles_prove_the_others_too_low_where_plain_ones_collapse():
+    guided = noisy(GUIDED, -8.0, 0.1, 8, seed=3)
+    found = Comparison(guided, None, noisy(PLAIN, 0.0, 6.0), (noisy(MORE, 0.0, 0.1, 8),))
+    assert low_at(found, "at draws").outcome == OFF
+
+
+@pytest.mark.parametrize("collapsed", [False, True])
+def test_guided_filters_that_are_right_are_rarely_found_low(collapsed):
+    """Of 200, at most 9: one test in ten thousand would fail at a rate of one per cent."""
+    scatter = 5.0 if collapsed else 0.8
+    found = [
+        low_at(
+            Comparison(
+                noisy(GUIDED, 0.0, 0.8, 8, seed=i),
+                None,
+                noisy(PLAIN, 0.0, scatter, seed=1000 + i),
+                (noisy(MORE, 0.0, 0.4, 8, seed=2000 + i),),
+            ),
+            "at draws",
+        ).outcome
+        for i in range(200)
+    ]
+    assert found.count(OFF) <= 9
+    assert (found.count(UNDECIDED) > 150) == collapsed
+
+
+def test_the_mean_difference_and_the_shift_of_a_parameter():
+    at = points(n=200)
+    bias = -4.0 + 1.5 * at.z[:, 0]
+    truth = np.random.default_rng(5).normal(0.0, 3.0, 200)
+    plain = noisy(PLAIN, truth, 0.4, n_points=200)
+    checked = Estimates(psf.EKF(), (truth + bias)[:, None])
+    found = bias_at_draws(Comparison(checked, None, plain, ()), at, ["a", "b"])
+    by_name = {one.check: one for one in found}
+    assert by_name["bias"].outcome == OFF
+    assert by_name["bias"].statistic == pytest.approx(-4.0, abs=4 * by_name["bias"].se)
+    # The posterior under the exact likelihood is tilted by the difference, its slope per sd.
+    assert by_name["shift of a"].statistic == pytest.approx(-1.5, abs=0.3)
+    assert by_name["shift of a"].outcome == OFF
+    assert by_name["shift of b"].outcome == FINE
+    assert "a moves by -1." in by_name["bias"].verdict
+
+
+def test_a_filter_that_is_right_passes():
+    truth = np.linspace(-5.0, 0.0, 20)
+    plain = noisy(PLAIN, truth, 0.4)
+    found = Comparison(exactly(psf.EKF(), truth), None, plain, ())
+    rows = bias_at_draws(found, points(), ["a", "b"])
+    assert [one.outcome for one in rows] == [FINE] * 3
+    assert bias_elsewhere(found, found).outcome == FINE
+
+
+def test_a_filter_that_is_low_away_from_the_draws():
+    at, truth = points(), np.zeros(20)
+    low = np.where(at.spread == 1.0, 0.0, -9.0)
+    found = Comparison(exactly(psf.EKF(), low), None, noisy(PLAIN, truth, 0.4), ())
+    draws, others = found.at(at.spread == 1.0), found.at(at.spread == 2.0)
+    assert bias_at_draws(found, at, [])[0].outcome == FINE
+    assert bias_elsewhere(others, draws).outcome == OFF
+
+
+def test_guided_particles_alone_prove_a_filter_too_low_but_not_right():
+    collapsed = noisy(PLAIN, -40.0, 7.0)
+    guided = (noisy(GUIDED, 0.0, 0.1, 8),)
+    for low, outcome in ((-20.0, OFF), (0.0, UNDECIDED), (20.0, UNDECIDED)):
+        found = Comparison(exactly(psf.EKF(), low), None, collapsed, guided)
+        (row,) = bias_at_draws(found, points(), ["a", "b"])
+        assert row.outcome == outcome
+        assert "GuidedPF(100)" in row.verdict
+        assert bias_elsewhere(found, found) is None
+
+
+def test_without_a_witness_nothing_is_decided():
+    found = Comparison(exactly(psf.EKF(), 0.0), None, None, ())
+    (row,) = bias_at_draws(found, points(), ["a"])
+    assert row.outcome == UNDECIDED
+    assert "no unbiased filter" in row.verdict
+
+
+def test_an_exact_filter_is_the_reference():
+    found = Comparison(exactly(psf.EKF(), -30.0), exactly(psf.GridFilter(), 0.0), None, ())
+    row, *_ = bias_at_draws(found, points(), ["a", "b"])
+    assert (row.outcome, row.statistic) == (OFF, -30.0)
+    assert "Use GridFilter()" in row.verdict
+    guided = Comparison(noisy(GUIDED, -5.0, 0.1, 8), exactly(psf.GridFilter(), 0.0), None, ())
+    assert low_at(guided, "at draws").outcome == OFF
