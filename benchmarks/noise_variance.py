@@ -15,7 +15,7 @@ import numpy as np
 import pymc_statespace_filters as psf
 from benchmarks.systems import DOUBLE_WELL, DOUBLE_WELL_TRUTH, simulated, theta_of
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 
 CORRELATIONS = (0.0, 0.9, 0.99, 0.999)
 RECORD_LENGTHS = (25, 100, 400)

@@ -11,8 +11,7 @@ from pytensor.graph.replace import vectorize_graph
 
 from benchmarks.systems import STEPS, SYSTEMS, simulated, theta_of
 from benchmarks.timing import Timed
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.system.record import check_inputs
 
 

@@ -16,7 +16,8 @@ from benchmarks.ours import machine_code
 from benchmarks.systems import SYSTEMS, theta_of
 from benchmarks.timing import Timed
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
+from pymc_statespace_filters.filters import signatures
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
 N_RECORDS = 100
 STEPS = np.arange(0, 1000, 20)
@@ -50,7 +51,7 @@ class Panel:
         """The compiled function of a PyMC model."""
         theta = pt.dmatrix("theta")
         table = [pytensor.shared(a) for a in (self.rows, self.observed, self.inputs)]
-        terms, _ = PanelLogLikelihood(self.system, self.filter)(theta, *table, 0.0, 0)
+        terms, _ = LogLikelihood(self.system, self.filter, signatures.PANEL)(theta, *table, 0.0, 0)
         total = terms.sum()
         outputs = [total, pytensor.grad(total, theta)] if gradient else [total]
         run = machine_code([theta], outputs)

@@ -16,7 +16,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.ops.base import cache_key
+from pymc_statespace_filters.ops.unplanned import cache_key
 from tests.systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
 from tests.waiting import LIMIT
 
@@ -79,7 +79,7 @@ import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native import entry_point as entries
-from pymc_statespace_filters.ops.base import cache_key
+from pymc_statespace_filters.ops.unplanned import cache_key
 from tests.systems import FORCE, FORCED_DATA, STEPS, forced
 
 results = []

@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.mpi.watched import many_exchanges
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import RankLayout
 from pymc_statespace_filters.parallel.communicator import communicator_of
 
 ROWS, COLUMNS = 4, (2, 16, 157, 1563, 10_000, 100_000)  # as in the filters

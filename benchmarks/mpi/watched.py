@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.mpi.cases import Case, Ranks, evaluation
-from pymc_statespace_filters.filters.ensemble.partition import BLOCKS, RankLayout, allgather
+from pymc_statespace_filters.filters.ensemble.reductions import BLOCKS, RankLayout, allgather
 from tests.ranks import FakeRank, on_ranks
 
 N_TOLLS = 200

@@ -19,8 +19,8 @@ from ..filters.recommendation import (
     short_form,
 )
 from ..ops.base import evaluator
-from ..ops.diagnostics import TermHealth
 from ..ops.likelihood import LogLikelihood
+from ..ops.states import TermHealth
 from ..system.model import StateSpaceModel
 
 type Arguments = tuple[Any, ...]

@@ -7,22 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from ..compiler.numerics.philox import seeds_of_records
 from ..errors import DataMismatchError, ModelError
 from ..filters.outcomes import COLLAPSED, NONE
-from ..filters.protocol import Filter
+from ..filters.protocol import BatchFilter, Filter
 from ..filters.recommendation import check_system_and_filter
-from ..filters.records import single_records
+from ..filters.signatures import PANEL, POINTS
 from ..ops.base import HEALTH_SIZE, evaluator
-from ..ops.batch import BatchLogLikelihood, has_batch
 from ..ops.distributed import check_ranks, distributed_evaluator
 from ..ops.likelihood import LogLikelihood
-from ..ops.panel import PanelLogLikelihood
 from ..parallel.communicator import Communicator, communicator_of
 from ..system.checks import check_count
 from ..system.model import StateSpaceModel
 from ..system.panel import CheckedPanel, checked_panel
-from ..system.panel_parameters import panel_parameters
-from ..system.parameters import flat_parameters
+from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_seed, checked_record
 from .filter_warnings import warn_about, warn_of_choice
 
@@ -155,7 +153,7 @@ def _of_panel(
     seeds = check_seed("seed", seed)
     if seeds.ndim:
         raise ModelError(f"seed must be one number for a panel, got shape {seeds.shape}")
-    evaluate = evaluator(PanelLogLikelihood(system, filter))
+    evaluate = evaluator(LogLikelihood(system, filter, PANEL))
     starts = table.records.starts
 
     def part(first: int, last: int) -> tuple:
@@ -180,7 +178,9 @@ def _warn_of_records(
 ) -> None:
     """Repeat every record alone, and warn of those that failed or collapsed."""
     evaluate = evaluator(LogLikelihood(system, filter))
-    arguments = [(theta[g], *record) for g, record in enumerate(single_records(table, seed))]
+    seeds = seeds_of_records(seed, table.records.codes)
+    parts = zip(theta, table.single_records(), seeds, strict=True)
+    arguments = [(own, *record, own_seed) for own, record, own_seed in parts]
     health = np.array([evaluate(*each)[1] for each in arguments])
     labels = table.records.labels
     warn_about(system, filter, health, lambda g: arguments[g], labels=labels, stacklevel=5)
@@ -210,9 +210,9 @@ def _evaluate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Terms and health of every point: as a batch if the filter has one, else one by one."""
     check_ranks(filter, ranks.size)
-    if len(points) > 1 and has_batch(LogLikelihood(system, filter)):
+    if len(points) > 1 and isinstance(filter, BatchFilter):
         # A filter with batches is deterministic: any seed will do.
-        return evaluator(BatchLogLikelihood(system, filter))(points, *record, seeds[0])
+        return evaluator(LogLikelihood(system, filter, POINTS))(points, *record, seeds[0])
     evaluate = distributed_evaluator(system, filter, ranks)
     terms = np.empty((len(points), record[0].size))
     health = np.empty((len(points), HEALTH_SIZE))

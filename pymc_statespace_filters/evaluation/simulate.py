@@ -7,24 +7,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from ..compiler.codegen.function_types import CompiledFunction, MemberArguments, jit
+from ..compiler.codegen.arguments import MemberArguments
+from ..compiler.codegen.function_types import CompiledFunction, jit
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.lowering.entry_points import entry_point
-from ..compiler.lowering.observation_sampler import distribution_sampler
+from ..compiler.lowering.observation import distribution_sampler
 from ..compiler.native.cache_key import key_of
 from ..compiler.native.entry_point import address_of, cached_on_disk, call_address
 from ..compiler.native.jit import copy_into
 from ..compiler.native.python_call import call_in_thread, call_machine_code
-from ..compiler.numerics.record_noise import generators_of_records
+from ..compiler.numerics.philox import generators_of_records
 from ..errors import ModelError
-from ..filters.records import single_records
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.checks import check_finite, check_flag, check_random_seed
 from ..system.model import StateSpaceModel
 from ..system.panel import checked_panel, row_coords
-from ..system.panel_parameters import panel_parameters
-from ..system.parameters import flat_parameters
+from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_inputs, check_system
 from ..system.steps import steps_of
 
@@ -166,7 +164,7 @@ def _simulator(system: StateSpaceModel, make: Callable, noise: bool = True) -> S
         names.append("")
     else:
         names.append("observe" if noise else "expect")
-    entries = [entry_point(compiled, name) if name else None for name in names]
+    entries = [compiled.entry_point(name) if name else None for name in names]
     for entry in filter(None, entries):
         entry.compile()
     sizes = (
@@ -348,10 +346,10 @@ def _simulate_panel(
     theta = panel_parameters(system, params, table.records)
     run = simulator(system, check_flag("noise", noise)).function
     generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
-    records = single_records(table, 0)
+    records = table.single_records()
     simulated = [
         _run(run, rng, own, steps, inputs, float(t0))
-        for rng, own, (steps, _, inputs, t0, _) in zip(generators, theta, records, strict=True)
+        for rng, own, (steps, _, inputs, t0) in zip(generators, theta, records, strict=True)
     ]
     states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
     n_steps = [np.arange(len(path)) for path, _ in simulated]

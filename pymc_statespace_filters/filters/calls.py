@@ -7,7 +7,7 @@ import numpy as np
 from numba import carray
 
 from ..compiler.native.entry_point import EntryPoint, pointer
-from ..compiler.native.jit import njit_internal
+from ..compiler.native.jit import njit_callable, njit_internal
 from ..compiler.native.plan import (
     DAMAGED,
     HEALTH_SIZE,
@@ -27,11 +27,10 @@ from ..compiler.native.plan import (
     plan_entry,
     plan_words,
 )
-from ..compiler.numerics.record_noise import seed_of_record
-from ..system import panel
+from ..compiler.numerics.philox import seed_of_record
+from ..system import panel_records as panel
 from .outcomes import NONE, OUT_OF_MEMORY
 from .plan import PLAN, VERSION
-from .records import include_health
 
 OK = np.int64(0)
 ALL_STEPS = np.int64(np.iinfo(np.int64).max)
@@ -210,6 +209,14 @@ def _seed(call, first):
         return seed
     rows = integers_at(given[RECORD.rows], given[RECORD.n_rows] * given[RECORD.row_width])
     return seed_of_record(seed, rows[first * given[RECORD.row_width] + panel.RECORD])
+
+
+@njit_callable
+def include_health(health, of_record, first):
+    """Include the health of a record whose first row is ``first`` in that of its panel."""
+    health[0] = min(health[0], of_record[0])
+    if health[1] == NONE and of_record[1] != NONE:
+        health[1], health[2] = of_record[1], first + of_record[2]
 
 
 def likelihood_entry(

@@ -13,7 +13,7 @@ from ..compiler.native.plan import Plan
 from ..compiler.numerics.small_cholesky import log_gaussian
 from ..errors import ModelError
 from .ensemble.ancestral_smoother import CARRY_PAST, NO_LAG, SMOOTH
-from .ensemble.base import EnsembleFilterBase
+from .ensemble.base import EnsembleFilterBase, check_choice, check_count
 from .ensemble.kalman_update import (
     Moments,
     check_simulated_observations,
@@ -28,7 +28,6 @@ from .ensemble.noise import NoiseSizes, observation_normals
 from .outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from .plan import log_density, observe
 from .protocol import System
-from .settings import check_choice, check_count
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0

@@ -23,7 +23,6 @@ from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from .calls import OK, likelihood_entry
-from .functions import likelihood, predictions, run, states
 from .outcomes import COVARIANCE_NOT_POSITIVE
 from .plan import make_plan, read_system, settings_of
 from .point_mass.forward_pass import (
@@ -36,12 +35,13 @@ from .point_mass.forward_pass import (
     next_attempt,
     write_outcome,
 )
+from .point_mass.moments import FILTERED, MOMENTS
 from .point_mass.predictions import GRID_PREDICTIONS
 from .point_mass.recursion import has_valid_covariances
-from .point_mass.rows import FILTERED, MOMENTS
 from .point_mass.segment_pass import discard_segments, pass_on_segments
 from .point_mass.states import GRID_RUN, GRID_STATES
 from .protocol import System
+from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
 _WITH_KINKS = 1e-5
@@ -148,22 +148,23 @@ class GridFilter:
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return likelihood(self._plan(system, POINT_MASS))
+        return PlannedFunction(self._plan(system, POINT_MASS), *LIKELIHOOD_OF_NOISE)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states.
 
         The draws of one ``draw_seed`` are independent; if smoothed, they are a path.
         """
-        return states(self._plan(system, GRID_STATES, MOMENTS[moment]))
+        return PlannedFunction(self._plan(system, GRID_STATES, MOMENTS[moment]), *STATES)
 
     def compile_predictions(self, system: System) -> PlannedFunction:
         """Compile the law of every observation given those before it."""
-        return predictions(self._plan(system, GRID_PREDICTIONS, others=("observe",)))
+        plan = self._plan(system, GRID_PREDICTIONS, others=("observe",))
+        return PlannedFunction(plan, *PREDICTIONS)
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        return run(self._plan(system, GRID_RUN, FILTERED))
+        return PlannedFunction(self._plan(system, GRID_RUN, FILTERED), *RUN)
 
     def _plan(
         self, system: System, run: EntryPoint, *settings: int, others: Sequence[str] = ()

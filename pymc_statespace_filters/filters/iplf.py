@@ -16,8 +16,11 @@ from pytensor.gradient import disconnected_grad
 from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
-from ..compiler.lowering.conditional_moments import conditional_moments, unknown_moments
-from ..compiler.lowering.gaussian import differentiable_log_density
+from ..compiler.lowering.observation import (
+    conditional_moments,
+    differentiable_log_density,
+    unknown_moments,
+)
 from ..errors import ModelError
 from ..system.checks import check_count
 from ..system.distributions import SCALAR_LAWS, law_name

@@ -9,6 +9,7 @@ from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import njit_internal
 from ..errors import ModelError
 from .bootstrap import BootstrapPF
+from .ensemble.base import check_choice
 from .ensemble.kalman_update import (
     copy_members,
     forecast_covariances,
@@ -21,12 +22,10 @@ from .ensemble.noise import observation_normals
 from .ensemble.particle_filter import ParticleFilter, particle_filter
 from .ensemble.reductions import count
 from .ensemble.weights import log_sum, normalise_weights
-from .kernel_density.density import density_method
-from .kernel_density.importance_weights import importance_workspace, reweight
+from .kernel_density.density import density_method, importance_workspace, reweight
 from .outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
 from .plan import log_density, observe
 from .protocol import System
-from .settings import check_choice
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 

@@ -9,9 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compiler.codegen.function_types import MemberArguments
-from ..compiler.lowering.entry_points import entry_point
-from ..compiler.lowering.guide_loops import FollowArguments, LookBackArguments
+from ..compiler.codegen.arguments import FollowArguments, LookBackArguments, MemberArguments
 from ..compiler.native.cache_key import key_of
 from ..compiler.native.entry_point import EntryPoint, call_address
 from ..compiler.native.jit import njit_internal
@@ -112,7 +110,7 @@ def make_plan(
     **others : int or EntryPoint
         Values of further slots.
     """
-    used = {n: entry_point(system, n) for n in (("prepare", *functions) if functions else ())}
+    used = {n: system.entry_point(n) for n in (("prepare", *functions) if functions else ())}
     numbers = {name: value for name, value in others.items() if isinstance(value, int)}
     entries = {name: value for name, value in others.items() if isinstance(value, EntryPoint)}
     words = np.zeros(N_WORDS + system.free.size + len(settings), np.int64)

@@ -14,132 +14,25 @@ effective number of particles behind a term (inf without particles), a failure c
 `filters.outcomes`, and the index of the failing observation or -1.
 """
 
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compiler.codegen.function_types import CompiledFunction, MemberFunction, ParameterFunction
+from ..compiler.codegen.function_types import CompiledFunction
+from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
+
+if TYPE_CHECKING:
+    from ..compiler.lowering.compiled_system import CompiledSystem
 
 type Array = NDArray[np.float64]
 type Integers = NDArray[np.int64]
 type Compiled[F] = CompiledFunction[F] | PlannedFunction
 """A function that numba compiles for one system, or one of a plan, which needs no compilation."""
-
-
-class System(Protocol):
-    """One system as a filter sees it: `compiler.lowering.compiled_system.CompiledSystem`.
-
-    Each function is compiled when first asked for, and its ``function`` is called with arrays.
-    Members of an ensemble, or other points, are the N columns of ``X`` (n, N). ``c`` are the
-    constants of an evaluation, ``k`` the step and ``t`` its time, ``Z`` standard normals with a
-    column for each member (more are allowed), ``D`` (p, N) observations, ``M`` (2, N) a mean and a
-    variance for each column. Arrays are contiguous, in C order.
-
-    ``m`` counts the normals of one step, which may be fewer than ``model.m``: noises with constant
-    gains are merged. ``n_start`` counts those of a start. ``free`` are the states that an update
-    may move.
-    """
-
-    model: Any
-    n: int
-    n_start: int
-    m: int
-    p: int
-    r: int
-    n_inputs: int  # columns of `inputs`, with that of resets if the system has accumulators
-    n_theta: int
-    n_constants: int
-    dt: float
-    free: Integers
-    states: tuple[str, ...]
-    carried: tuple[str, ...]
-    gaussian_observation: bool
-    additive_noise: bool
-    observation_uses_inputs: bool
-
-    def __hash__(self) -> int: ...
-
-    @property
-    def extend(self) -> Any:
-        """Entry point from the user's parameters to the ``n_theta`` that ``model`` reads, or None.
-
-        Those behind the user's are linear algebra of parameters alone, done once per evaluation.
-        """
-
-    @property
-    def extend_back(self) -> Any:
-        """Entry point of its pullback."""
-
-    @property
-    def prepare(self) -> ParameterFunction:
-        """Function (theta) -> c, the constants of one evaluation."""
-
-    @property
-    def initialise(self) -> MemberFunction:
-        """Function (c, Z, X) that draws the state at step 0."""
-
-    @property
-    def propagate(self) -> MemberFunction:
-        """Function (c, inputs, k, t, Z, X) that moves every member one step, in place."""
-
-    @property
-    def observe(self) -> MemberFunction:
-        """Function (c, inputs, k, t, Z, X, D) that simulates observations."""
-
-    @property
-    def log_density(self) -> MemberFunction:
-        """Function (c, inputs, k, t, d, X, out) that writes log p(d | x)."""
-
-    @property
-    def step_moments(self) -> MemberFunction:
-        """Function (c, inputs, k, t, X, M): mean and variance of the next state, one state."""
-
-    @property
-    def is_deterministic(self) -> bool:
-        """Whether the state is known to be a function of the parameters alone."""
-
-    @property
-    def with_gaussian_steps(self) -> "System":
-        """The system with normal variables in place of others in ``process_dist``."""
-
-    @property
-    def gaussian(self) -> "System":
-        """The same with a Gaussian start; the system itself where all noise is Gaussian."""
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether the system is known to be linear."""
-
-    @property
-    def has_additive_process_noise(self) -> bool:
-        """Whether the transition is known to be g(x, 0) + G(x) q."""
-
-    @property
-    def has_smooth_transition(self) -> bool:
-        """Whether the transition is known to have no kink and no jump."""
-
-    @property
-    def jumping_equations(self) -> tuple[str, ...]:
-        """Those of "transition" and "observation" that are known to jump in the state."""
-
-    @property
-    def is_time_invariant(self) -> bool:
-        """Whether `step_moments` is known to depend on neither inputs nor time."""
-
-    @property
-    def has_transition_density(self) -> bool:
-        """Whether one step is known to have a Gaussian density given the state before."""
-
-    @property
-    def has_smooth_sensor(self) -> bool:
-        """Whether no observable has a kink as a function of the state."""
-
-    @property
-    def has_exact_observation_density(self) -> bool:
-        """Whether `log_density` is exact, not a linearization."""
+type System = CompiledSystem
+"""One system as a filter sees it: sizes, properties, and functions compiled when asked for."""
 
 
 class LogLikelihoodFunction(Protocol):
@@ -282,14 +175,6 @@ class PredictionFilter(Filter, Protocol):
 
 
 @runtime_checkable
-class BatchFilter(Filter, Protocol):
-    """A filter that evaluates many parameter points side by side."""
-
-    def compile_batch(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood of theta (B, k): terms (B, J), health (B, 3)."""
-
-
-@runtime_checkable
 class DifferentiableFilter(Filter, Protocol):
     """A filter whose likelihood has a gradient.
 
@@ -311,25 +196,19 @@ class DifferentiableFilter(Filter, Protocol):
 
 
 @runtime_checkable
-class PanelFilter(DifferentiableFilter, Protocol):
-    """A filter that evaluates the records of a panel side by side.
+class BatchFilter(DifferentiableFilter, Protocol):
+    """A filter that evaluates many parameter points, or the records of a panel, side by side.
 
-    ``theta`` (G, k) has a row for each record, and ``rows`` (J, 3), see `system.panel`, take the
-    place of the steps. Every record has the terms that it has alone. Health is that of the panel:
-    inf, the code of the first failing record, and the index of its failing row.
+    Every point and record has the terms that it has alone, see `filters.signatures`.
     """
 
-    def compile_panel(self, system: System) -> PlannedFunction:
-        """Compile terms and health: (theta, rows, observed, inputs, t0, seed)."""
+    def plan_of_many(
+        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+    ) -> Plan:
+        """Plan the forward pass, with a tape or without one, or the pass back along a tape.
 
-    def compile_panel_gradient(self, system: System) -> PlannedFunction:
-        """Compile both passes as one function: (theta .. seed, terms_bar) -> theta_bar (G, k)."""
-
-    def compile_panel_taped(self, system: System) -> PlannedFunction:
-        """Compile the forward pass: terms, health and a tape of two dimensions."""
-
-    def compile_panel_pullback(self, system: System) -> PlannedFunction:
-        """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar (G, k)."""
+        One that leaves a tape and goes back along it is the gradient.
+        """
 
 
 @runtime_checkable

@@ -8,8 +8,8 @@ with and without it.
 """
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +26,15 @@ from ..compiler.native.plan import (
 from ..errors import ModelError
 from ..filters.protocol import EnsembleFilter, Filter
 from ..filters.recommendation import short_form
+from ..filters.signatures import LIKELIHOOD, SEEDED, Signature
 from ..parallel.communicator import Communicator
 from ..system.model import StateSpaceModel
-from .base import RECORD_INPUTS, evaluator
+from .base import evaluator
 from .likelihood import LogLikelihood
 
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
-_CALLBACK = (("number", "int64", 0), ("replacement", "int64", 0))
+_CALLBACK = (("number", 0), ("replacement", 0))
 
 
 class DistributedLogLikelihood(LogLikelihood):
@@ -43,10 +44,9 @@ class DistributedLogLikelihood(LogLikelihood):
     """
 
     filter: EnsembleFilter
-    input_types = (
-        *RECORD_INPUTS, ("rank", "int64", 0), ("n_ranks", "int64", 0), ("exchange", "int64", 0),
-    )  # fmt: skip
-    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),(),()->(j),(h)"
+    signature = Signature(
+        (*SEEDED, ("rank", 0), ("n_ranks", 0), ("exchange", 0)), LIKELIHOOD.results
+    )
     is_collective = True
 
 
@@ -91,12 +91,7 @@ class CallbackLogLikelihood(LogLikelihood):
     Two more inputs: a ``number``, by which the callback identifies the record, and its address.
     """
 
-    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (*RECORD_INPUTS, *_CALLBACK)
-    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(),()->(j),(h)"
-    # A filter without a plan is never replaced.
-    argument_code: ClassVar[Mapping[str, str | None]] = {
-        "seed": "(seed.item(), no_normals.copy())", "number": None, "replacement": None,
-    }  # fmt: skip
+    signature = Signature((*SEEDED, *_CALLBACK), LIKELIHOOD.results)
 
 
 class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
@@ -105,12 +100,7 @@ class CallbackLogLikelihoodOfNoise(CallbackLogLikelihood):
     The callback receives the seed only.
     """
 
-    input_types = (*RECORD_INPUTS, ("normals", "float64", 1), *_CALLBACK)
-    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(z),(),()->(j),(h)"
-    argument_code: ClassVar[Mapping[str, str | None]] = {
-        "seed": "(seed.item(), np.ascontiguousarray(normals))", "normals": None, "number": None,
-        "replacement": None,
-    }  # fmt: skip
+    signature = Signature((*SEEDED, ("normals", 1), *_CALLBACK), LIKELIHOOD.results)
 
 
 class PythonCallback:

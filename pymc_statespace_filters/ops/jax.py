@@ -3,7 +3,7 @@
 JAX calls the machine code of the package on the processor, through Python. An evaluation is one
 call for the value and one for the gradient, and so are all evaluations of a `jax.vmap` together.
 
-This is the only module that imports JAX. `jax_graphs` imports it when JAX is asked for.
+This is the only module that imports JAX. It is imported when JAX is asked for, see `ops`.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,8 +18,8 @@ from jax.experimental.buffer_callback import buffer_callback
 from pytensor.link.jax.dispatch import jax_funcify
 
 from ..errors import GradientUnavailableError, ModelError
+from ..filters.signatures import POINTS
 from .base import HEALTH_SIZE
-from .batch import BatchLogLikelihood
 from .likelihood import (
     LogLikelihood,
     LogLikelihoodGradient,
@@ -28,12 +28,6 @@ from .likelihood import (
     check_has_gradient,
 )
 from .many_points import gradients, values
-from .panel import (
-    PanelLogLikelihood,
-    PanelLogLikelihoodGradient,
-    PanelTapePullback,
-    TapedPanelLogLikelihood,
-)
 
 type Shapes = Sequence[tuple[int, ...]]
 
@@ -41,6 +35,9 @@ type Shapes = Sequence[tuple[int, ...]]
 @jax_funcify.register(LogLikelihood)
 def _likelihood(op: LogLikelihood, **_: Any) -> Callable:
     """Terms and health; JAX takes their derivative by theta from the machine code."""
+    if op.form is POINTS:
+        of_point = _likelihood(LogLikelihood(op.system, op.filter))
+        return jax.vmap(of_point, in_axes=(0, *[None] * (len(op.arguments) - 1)))
 
     @jax.custom_vjp
     def likelihood(*inputs):
@@ -70,13 +67,6 @@ def _likelihood(op: LogLikelihood, **_: Any) -> Callable:
     return likelihood
 
 
-@jax_funcify.register(BatchLogLikelihood)
-def _batch(op: BatchLogLikelihood, **_: Any) -> Callable:
-    n_shared = len(op.input_types) - 1
-    likelihood = _likelihood(LogLikelihood(op.system, op.filter))
-    return jax.vmap(likelihood, in_axes=(0, *[None] * n_shared))
-
-
 @jax_funcify.register(LogLikelihoodGradient)
 def _gradient(op: LogLikelihoodGradient, **_: Any) -> Callable:
     def gradient(*inputs):
@@ -90,16 +80,13 @@ def _gradient(op: LogLikelihoodGradient, **_: Any) -> Callable:
 
 @jax_funcify.register(TapedLogLikelihood)
 def _taped(op: TapedLogLikelihood, **_: Any) -> Callable:
-    kind = PanelLogLikelihood if isinstance(op, TapedPanelLogLikelihood) else LogLikelihood
-    likelihood = _likelihood(kind(op.system, op.filter))
+    likelihood = _likelihood(LogLikelihood(op.system, op.filter, op.form))
     return lambda *inputs: (*likelihood(*inputs), jnp.empty((0, 0)))
 
 
 @jax_funcify.register(TapePullback)
 def _pullback(op: TapePullback, **_: Any) -> Callable:
-    of_panel = isinstance(op, PanelTapePullback)
-    kind = PanelLogLikelihoodGradient if of_panel else LogLikelihoodGradient
-    gradient = _gradient(kind(op.system, op.filter))
+    gradient = _gradient(LogLikelihoodGradient(op.system, op.filter, op.form))
     return lambda *inputs: gradient(*inputs[:-2], inputs[-1])
 
 

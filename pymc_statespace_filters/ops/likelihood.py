@@ -1,25 +1,44 @@
-"""The log-likelihood of a record and its gradient as PyTensor operations.
+"""Log-likelihoods and their gradients as PyTensor operations: of a record, of points, of a panel.
 
 A graph may hold `LogLikelihood` or `LogLikelihoodGradient` alone. Where it holds both at the same
 inputs, a rewrite replaces them by one forward pass that leaves a tape, `TapedLogLikelihood`, and
 one backward pass over it, `TapePullback`.
+
+A record of a panel is evaluated by the machine code of a single one, so that it has the same bits,
+unless the filter evaluates records side by side (`filters.protocol.BatchFilter`).
 """
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.replace import _vectorize_node
 from pytensor.graph.rewriting.basic import node_rewriter
+from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.rewriting.basic import register_specialize
 
+from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
+from ..compiler.native.plan import Plan
 from ..errors import GradientUnavailableError
-from ..filters.protocol import Compiled, DifferentiableFilter
+from ..filters.protocol import BatchFilter, Compiled, DifferentiableFilter, EnsembleFilter
 from ..filters.recommendation import filters_for, listed, short_form
-from .base import HEALTH_SIZE, RECORD_INPUTS, FilterOp, ThetaDerivative, theta_cotangent_only
+from ..filters.signatures import (
+    GRADIENT,
+    LIKELIHOOD,
+    NORMALS,
+    ONE_RECORD,
+    PANEL,
+    POINTS,
+    PULLBACK,
+    RECORD,
+    TAPED,
+    Signature,
+)
+from .base import HEALTH_SIZE, FilterOp, theta_cotangent_only
+from .unplanned import gradients_one_by_one, values_one_by_one
 
 
 class LogLikelihood(FilterOp):
@@ -27,20 +46,26 @@ class LogLikelihood(FilterOp):
 
     Inputs: ``theta`` (k,), ``steps`` (J,), ``observed`` (J, p), ``inputs`` (steps, n_inputs),
     ``t0``, ``seed``. Outputs: terms (J,), and health (3,): smallest effective number of
-    particles, code of the failure, index of the failing observation.
+    particles, code of the failure, index of the failing observation. See `filters.signatures` for
+    those of many points and of a panel.
     """
 
-    output_types = (pt.dvector, pt.dvector)
-    gufunc_signature = "(k),(j),(j,p),(s,u),(),()->(j),(h)"
-    argument_code: ClassVar[Mapping[str, str | None]] = {"seed": "(seed.item(), no_normals.copy())"}
+    signature = LIKELIHOOD
+    takes_noise = True
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The filter's log-likelihood."""
-        return self.filter.compile(system)
+        if self.form is not ONE_RECORD and isinstance(self.filter, BatchFilter):
+            return self.filter.plan_of_many(system)
+        compiled = self.filter.compile(system)
+        if self.form is PANEL and isinstance(compiled, CompiledFunction):
+            return values_one_by_one(compiled)
+        return compiled
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
-        """As many terms as steps."""
-        return [(input_shapes[1][0],), (HEALTH_SIZE,)]
+        """As many terms as steps, for every point."""
+        points = (input_shapes[0][0],) if self.form is POINTS else ()
+        return [(*points, input_shapes[1][0]), (*points, HEALTH_SIZE)]
 
     def pullback(
         self,
@@ -50,16 +75,16 @@ class LogLikelihood(FilterOp):
     ) -> list[Variable]:
         """Reverse-mode derivative by theta; raises for a filter whose likelihood has none."""
         check_has_gradient(self)
-        terms_bar = cotangents[0]
-        if isinstance(terms_bar.type, DisconnectedType):
-            theta_bar = pt.zeros_like(inputs[0])
-        else:
-            theta_bar = self.gradient()(*inputs, terms_bar)
+        theta_bar = pt.zeros_like(inputs[0])
+        if not isinstance(cotangents[0].type, DisconnectedType):
+            theta_bar = self.gradient()(*inputs, cotangents[0])
         return theta_cotangent_only(self, inputs, theta_bar)
 
-    def gradient(self) -> "LogLikelihoodGradient":
-        """The operation of the vector-Jacobian product."""
-        return LogLikelihoodGradient(self.system, self.filter)
+    def gradient(self) -> FilterOp | Blockwise:
+        """The operation of the vector-Jacobian product; point by point for many points."""
+        if self.form is POINTS:
+            return Blockwise(LogLikelihoodGradient(self.system, self.filter))
+        return LogLikelihoodGradient(self.system, self.filter, self.form)
 
 
 def check_has_gradient(op: LogLikelihood) -> None:
@@ -76,45 +101,54 @@ def check_has_gradient(op: LogLikelihood) -> None:
     )
 
 
-class LogLikelihoodGradient(ThetaDerivative):
-    """Vector-Jacobian product of `LogLikelihood`: inputs and terms_bar (J,) -> theta_bar (k,).
+class LogLikelihoodGradient(FilterOp):
+    """Vector-Jacobian product of `LogLikelihood`: its inputs, and the cotangent of the terms.
 
     It makes both passes of the filter. In a graph that holds the likelihood too, the forward pass
     is made only once: see `fuse_value_and_gradient`.
     """
 
-    input_types = (*RECORD_INPUTS, ("terms_bar", "float64", 1))
-    gufunc_signature = "(k),(j),(j,p),(s,u),(),(),(j)->(k)"
+    signature = GRADIENT
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """Both passes of the filter."""
-        return self.filter.compile_gradient(system)
+        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+            return self.filter.plan_of_many(system, leaves_tape=True, goes_back=True)
+        compiled = self.filter.compile_gradient(system)
+        if self.form is PANEL and isinstance(compiled, CompiledFunction):
+            return gradients_one_by_one(compiled)
+        return compiled
+
+    def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
+        """The shape of theta."""
+        return [input_shapes[0]]
 
 
 class TapedLogLikelihood(FilterOp):
     """`LogLikelihood` with a third output, the tape: a state of the filter in each row."""
 
+    signature = TAPED
     filter: DifferentiableFilter
-    output_types = (pt.dvector, pt.dvector, pt.dmatrix)
-    result_names = ("terms", "health", "tape")
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The forward pass."""
+        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+            return self.filter.plan_of_many(system, leaves_tape=True)
         return self.filter.compile_taped(system)
 
 
-class TapePullback(ThetaDerivative):
-    """Vector-Jacobian product of `TapedLogLikelihood`: inputs, tape and terms_bar -> theta_bar."""
+class TapePullback(FilterOp):
+    """Vector-Jacobian product of `TapedLogLikelihood`: inputs, tape and the terms' cotangent."""
 
+    signature = PULLBACK
     filter: DifferentiableFilter
-    input_types = (*RECORD_INPUTS, ("tape", "float64", 2), ("terms_bar", "float64", 1))
-    # The tape was made by the other operation, which checked the record.
-    record_checks = ()
-    argument_code: ClassVar[Mapping[str, str | None]] = {"tape": "tape"}
+    infer_shape = LogLikelihoodGradient.infer_shape
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The backward pass."""
+        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+            return self.filter.plan_of_many(system, goes_back=True)
         return self.filter.compile_pullback(system)
 
 
@@ -122,23 +156,67 @@ class TapePullback(ThetaDerivative):
 @node_rewriter([LogLikelihoodGradient])
 def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
     """Make one forward pass where a graph holds value and gradient at the same inputs."""
-    return fused(fgraph, node, LogLikelihood, TapedLogLikelihood, TapePullback)
-
-
-def fused(
-    fgraph: FunctionGraph,
-    node: Apply,
-    value_op: type[LogLikelihood],
-    taped_op: type[TapedLogLikelihood],
-    pullback_op: type[TapePullback],
-) -> dict[Variable, Variable] | None:
-    """Replacements of a gradient and of the value at the same inputs, if there is one."""
+    op = node.op
+    if op.form is PANEL and not isinstance(op.filter, BatchFilter):
+        return None
     *inputs, terms_bar = node.inputs
-    system, filter = node.op.system, node.op.filter
+    value_op, taped, pullback = (
+        kind(op.system, op.filter, op.form)
+        for kind in (LogLikelihood, TapedLogLikelihood, TapePullback)
+    )
     for value, _ in fgraph.clients[inputs[0]]:
-        is_value = value.op in (value_op(system, filter), taped_op(system, filter))
-        if is_value and value.inputs == inputs:
-            terms, health, tape = taped_op(system, filter)(*inputs)
-            theta_bar = pullback_op(system, filter)(*inputs, tape, terms_bar)
+        if value.op in (value_op, taped) and value.inputs == inputs:
+            terms, health, tape = taped(*inputs)
+            theta_bar = pullback(*inputs, tape, terms_bar)
             return {value.outputs[0]: terms, value.outputs[1]: health, node.outputs[0]: theta_bar}
     return None
+
+
+def vectorized(op: LogLikelihood, *inputs: Variable) -> list[Variable]:
+    """Terms and health over leading dimensions, of the parameters alone or of any input."""
+    extra = [v.type.ndim - ndim for v, (_, ndim) in zip(inputs, op.arguments, strict=True)]
+    if not any(extra):
+        return op(*inputs, return_list=True)
+    theta, *record = inputs
+    one_record = max(extra[1:]) <= extra[0] and all(
+        length == 1
+        for value, n in zip(record, extra[1:], strict=True)
+        for length in value.type.shape[:n]
+    )
+    is_batch = op.form is ONE_RECORD and isinstance(op.filter, BatchFilter)
+    if not (is_batch and one_record and extra[0]):
+        return Blockwise(op)(*inputs, return_list=True)
+    record = [value[(0,) * n] if n else value for value, n in zip(record, extra[1:], strict=True)]
+    shape = tuple(theta.shape)[:-1]
+    batch = LogLikelihood(op.system, op.filter, POINTS)
+    if len(shape) == 1:
+        return batch(theta, *record)
+    points = theta.reshape((pt.prod(pt.stack(shape)), theta.shape[-1]))
+    results = batch(points, *record)
+    return [result.reshape((*shape, result.shape[-1])) for result in results]
+
+
+@_vectorize_node.register(LogLikelihood)
+def _vectorize(op: LogLikelihood, node: Apply, *inputs: Variable) -> list[Variable]:
+    return vectorized(op, *inputs)
+
+
+class StoredNoise(FilterOp):
+    """The normals that a noisy filter uses with a seed: ``steps`` (J,), ``seed`` -> a vector.
+
+    Reading a normal is many times cheaper than drawing it. A sampler that holds the noise (common
+    random numbers), or moves it a little at a time, draws the normals once.
+    """
+
+    signature = NORMALS
+    filter: EnsembleFilter
+
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+        """The normals, in the filter's layout."""
+        return self.filter.stored_noise(system)
+
+
+class LogLikelihoodOfNoise(LogLikelihood):
+    """`LogLikelihood` with the vector of `StoredNoise` in place of the seed; the same numbers."""
+
+    signature = Signature((*RECORD, ("normals", 1)), LIKELIHOOD.results)

@@ -10,12 +10,11 @@ from math import prod
 
 import numpy as np
 
-from ..filters.protocol import BatchFilter, PanelFilter
-from ..system.panel import N_COLUMNS, RECORD, STEP
+from ..filters.protocol import BatchFilter
+from ..filters.signatures import ONE_RECORD, PANEL, POINTS
+from ..system.panel_records import N_COLUMNS, RECORD, STEP
 from .base import FilterOp, evaluator
-from .batch import BatchLogLikelihood
-from .likelihood import LogLikelihood, LogLikelihoodGradient
-from .panel import PanelLogLikelihood, PanelTapePullback, TapedPanelLogLikelihood
+from .likelihood import LogLikelihood, LogLikelihoodGradient, TapedLogLikelihood, TapePullback
 
 type Arrays = Sequence[np.ndarray]
 type Shape = tuple[int, ...]
@@ -24,25 +23,27 @@ type Shape = tuple[int, ...]
 def values(op: LogLikelihood, *arguments: np.ndarray) -> list[np.ndarray]:
     """Terms (.., J) and health (.., 3)."""
     shape, cores = _shapes(op, arguments)
-    if prod(shape) > 1 and (record := _shared(arguments[1:], cores[1:])):
-        thetas = arguments[0].reshape(-1, *cores[0])
-        if type(op) is LogLikelihood and isinstance(op.filter, BatchFilter):
-            results = evaluator(BatchLogLikelihood(op.system, op.filter))(thetas, *record)
-            return [result.reshape(shape + result.shape[1:]) for result in results]
-        if isinstance(op, PanelLogLikelihood) and isinstance(op.filter, PanelFilter):
-            evaluate = evaluator(op)
-            terms, health = evaluate(*_one_panel(thetas, record))
-            terms, health = terms.reshape(len(thetas), -1), np.tile(health, (len(thetas), 1))
-            if not np.isfinite(terms).all():  # the health is that of the first record that fails
-                health[:] = [evaluate(theta, *record)[1] for theta in thetas]
-            return [result.reshape(shape + result.shape[1:]) for result in (terms, health)]
-    return _in_turn(op, arguments, shape, cores)
+    is_one_record = prod(shape) > 1 and type(op) is LogLikelihood
+    record = _shared(arguments[1:], cores[1:]) if is_one_record else []
+    if not (record and isinstance(op.filter, BatchFilter)):
+        return _in_turn(op, arguments, shape, cores)
+    thetas = arguments[0].reshape(-1, *cores[0])
+    if op.form is ONE_RECORD:
+        results = evaluator(LogLikelihood(op.system, op.filter, POINTS))(thetas, *record)
+    else:
+        evaluate = evaluator(op)
+        terms, health = evaluate(*_one_panel(thetas, record))
+        terms, health = terms.reshape(len(thetas), -1), np.tile(health, (len(thetas), 1))
+        if not np.isfinite(terms).all():  # the health is that of the first record that fails
+            health[:] = [evaluate(theta, *record)[1] for theta in thetas]
+        results = terms, health
+    return [result.reshape(shape + result.shape[1:]) for result in results]
 
 
 def gradients(op: LogLikelihoodGradient, *arguments: np.ndarray) -> list[np.ndarray]:
     """The cotangent of theta (.., k) or (.., G, k); the last argument is that of the terms."""
     shape, cores = _shapes(op, arguments)
-    if prod(shape) > 1 and isinstance(op.filter, PanelFilter):
+    if prod(shape) > 1 and isinstance(op.filter, BatchFilter):
         if record := _shared(arguments[1:-1], cores[1:-1]):
             thetas, terms_bar = (
                 np.broadcast_to(arguments[i], shape + cores[i]).reshape(-1, *cores[i])
@@ -57,10 +58,10 @@ def _side_by_side(
 ) -> np.ndarray:
     """The gradients at several points; zero where the filter fails, as at a single one."""
     panel = _one_panel(thetas, record)
-    terms, _, tape = evaluator(TapedPanelLogLikelihood(op.system, op.filter))(*panel)
+    terms, _, tape = evaluator(TapedLogLikelihood(op.system, op.filter, PANEL))(*panel)
     succeeds = np.isfinite(terms.reshape(len(thetas), -1)).all(axis=1)
     if succeeds.all():
-        pullback = evaluator(PanelTapePullback(op.system, op.filter))
+        pullback = evaluator(TapePullback(op.system, op.filter, PANEL))
         return pullback(*panel, tape, terms_bar.ravel())[0]
     theta_bar = np.zeros(thetas.shape)
     if succeeds.any():  # a panel with a record that fails has no tape
@@ -72,7 +73,7 @@ def _side_by_side(
 
 def _shapes(op: FilterOp, arguments: Arrays) -> tuple[Shape, list[Shape]]:
     """The leading shape of all arguments together, and the shape of each without it."""
-    n_leading = [a.ndim - n for a, (_, _, n) in zip(arguments, op.input_types, strict=True)]
+    n_leading = [a.ndim - n for a, (_, n) in zip(arguments, op.arguments, strict=True)]
     cores = [a.shape[n:] for a, n in zip(arguments, n_leading, strict=True)]
     if not any(n_leading):
         return (), cores

@@ -1,14 +1,11 @@
-"""States along a record, and whole runs of a filter: operations without a derivative."""
-
-from typing import ClassVar
-
-import pytensor.tensor as pt
-from pytensor.tensor.type import TensorType
+"""States along a record, whole runs of a filter, and numbers behind terms: without a derivative."""
 
 from ..compiler.lowering.compiled_system import CompiledSystem
-from ..filters.protocol import Compiled, RunFilter, StatesFilter
+from ..compiler.native.plan import Plan
+from ..filters.protocol import Compiled, HealthFilter, PredictionFilter, RunFilter, StatesFilter
+from ..filters.signatures import PREDICTIONS, RESUMED, RUN, STATES, TERM_HEALTH
 from ..system.model import StateSpaceModel
-from .base import RECORD_INPUTS, FilterOp
+from .base import FilterOp
 
 
 class States(FilterOp):
@@ -18,17 +15,15 @@ class States(FilterOp):
     (also at the row's) or "smoothed" (all). ``draw_seed`` is the seed of the draw alone.
     """
 
-    __props__ = ("system", "filter", "moment")  # type: ignore[assignment]
-    input_types = (*RECORD_INPUTS, ("wanted", "int64", 1), ("draw_seed", "int64", 0))
-    output_types = (pt.dmatrix, pt.dmatrix, pt.dmatrix, pt.dvector, pt.dvector)
-    result_names = ("mean", "sd", "drawn", "n_effective_wanted", "health")
+    __props__ = ("system", "filter", "moment")
+    signature = STATES
     filter: StatesFilter
 
     def __init__(self, system: StateSpaceModel, filter: StatesFilter, moment: str) -> None:
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The filter's states."""
         return self.filter.compile_states(system, self.moment)
 
@@ -40,17 +35,10 @@ class FilterRun(FilterOp):
     without members.
     """
 
-    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (
-        *RECORD_INPUTS,
-        ("wanted", "int64", 1),
-    )
-    output_types = (pt.dvector, pt.dvector, pt.dmatrix, pt.dtensor3, pt.dtensor3, pt.dmatrix)
-    result_names: ClassVar[tuple[str, ...]] = (
-        "terms", "health", "mean", "cov", "members", "weights",
-    )  # fmt: skip
+    signature = RUN
     filter: RunFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled:
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The filter's run."""
         return self.filter.compile_run(system)
 
@@ -58,9 +46,26 @@ class FilterRun(FilterOp):
 class ResumableRun(FilterRun):
     """`FilterRun` from a state of the filter, empty at the start, with the state that it leaves."""
 
-    input_types: ClassVar[tuple[tuple[str, str, int], ...]] = (
-        *FilterRun.input_types,
-        ("state", "float64", 1),
-    )
-    output_types: ClassVar[tuple[TensorType, ...]] = (*FilterRun.output_types, pt.dvector)
-    result_names: ClassVar[tuple[str, ...]] = (*FilterRun.result_names, "state")
+    signature = RESUMED
+
+
+class TermHealth(FilterOp):
+    """Terms (J,) of the likelihood, the effective number (J,) behind each, and health (3,)."""
+
+    signature = TERM_HEALTH
+    filter: HealthFilter
+
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+        """The filter's health."""
+        return self.filter.compile_health(system)
+
+
+class Predictions(FilterOp):
+    """The law of every observation before it is seen: see `protocol.PredictionsFunction`."""
+
+    signature = PREDICTIONS
+    filter: PredictionFilter
+
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+        """The filter's predictions."""
+        return self.filter.compile_predictions(system)

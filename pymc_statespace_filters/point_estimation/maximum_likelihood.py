@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pymc.model import Model, modelcontext
 
 from ..errors import ModelError
-from ..pymc_model.constrained_values import ConstrainedValues
-from ..pymc_model.factors import ModelFactors
+from ..pymc_model.compilation import ConstrainedValues
+from ..pymc_model.prior import ModelFactors
 from ..sampling.starts.annealing import N_SWEEPS, Population
 from ..sampling.starts.population import population_of
 from ..system.checks import check_random_seed

@@ -23,8 +23,9 @@ from pytensor.tensor.shape import Reshape, Shape, Shape_i, SpecifyShape
 from pytensor.tensor.special import LogSumExp, Softmax
 from pytensor.tensor.subtensor import AdvancedSubtensor, Subtensor
 
-from ..ops.panel import PanelLogLikelihood
-from ..system.panel import RECORD
+from ..filters.signatures import PANEL
+from ..ops.likelihood import LogLikelihood
+from ..system.panel_records import RECORD
 
 
 class Aligned(NamedTuple):
@@ -235,10 +236,10 @@ def _blockwise(op: Blockwise, node: Apply, inputs: Sequence[Any], point: Mapping
 
 @_aligned.register
 def _likelihood_of_panel(
-    op: PanelLogLikelihood, node: Apply, inputs: Sequence[Any], point: Mapping
+    op: LogLikelihood, node: Apply, inputs: Sequence[Any], point: Mapping
 ) -> Aligned | None:
     """From a row of parameters for each record to the terms of its rows."""
-    if inputs[0] is None or inputs[0].axis != 0 or any(inputs[1:]):
+    if op.form is not PANEL or inputs[0] is None or inputs[0].axis != 0 or any(inputs[1:]):
         return None
     return Aligned(0, tuple(records_of_rows(node.inputs[1]).tolist()))
 

@@ -1,9 +1,10 @@
-"""Compilation of a model's log-density, and of other graphs of its variables."""
+"""Compilation of a model's log-density, and of its variables from the unconstrained vector."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pymc as pm
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
@@ -43,3 +44,28 @@ def compile_raveled(
     function.trust_input = True
     start = np.concatenate([np.ravel(point[v.name]) for v in variables], dtype=np.float64)
     return function, start
+
+
+Array = NDArray[np.float64]
+
+
+class ConstrainedValues:
+    """The free variables of a model as a function of its unconstrained vector.
+
+    Attributes
+    ----------
+    names : list of str
+        Of the free variables, in the order of the vector.
+    """
+
+    def __init__(self, model: pm.Model) -> None:
+        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        outputs = model.replace_rvs_by_values(model.free_RVs)
+        # Machine code would take seconds to compile.
+        mode = "FAST_COMPILE"
+        self._function, _ = compile_raveled(model.initial_point(), outputs, values, mode=mode)
+        self.names = [rv.name for rv in model.free_RVs]
+
+    def __call__(self, x: Array) -> dict[str, np.ndarray]:
+        """Values by name at the unconstrained point x (k,)."""
+        return dict(zip(self.names, map(np.asarray, self._function(x)), strict=True))

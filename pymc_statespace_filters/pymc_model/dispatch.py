@@ -10,18 +10,15 @@ from pytensor.graph.basic import Variable
 from pytensor.link.numba.dispatch.basic import numba_njit
 from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
 from pytensor.raise_op import CheckAndRaise
-from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.native.cache_key import key_of
 from ..errors import ModelError
 from ..evaluation.simulate import simulator
-from ..filters.records import end_of_record, single_record
-from ..ops.base import cache_key, check_panel, check_record
-from ..ops.batch import vectorized
-from ..ops.likelihood import LogLikelihood
-from ..ops.panel import PANEL_INPUTS, PanelLogLikelihood
-from ..system.panel import FIRST_INPUT, RECORD, STEP
+from ..filters.signatures import PANEL
+from ..ops.likelihood import LogLikelihood, vectorized
+from ..ops.unplanned import cache_key, check_panel, check_record, end_of_record, single_record
+from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
@@ -122,10 +119,8 @@ def _log_density_of_panel(
     """The same for every record; the first rows of each are not scored."""
     (value,) = values
     theta, rows, inputs, t0, seed = params
-    likelihood, record = PanelLogLikelihood(op.system, op.filter), (rows, value, inputs, t0, seed)
-    cores = [ndim for _, _, ndim in PANEL_INPUTS]
-    is_batch = any(v.type.ndim > n for v, n in zip((theta, *record), cores, strict=True))
-    terms = (Blockwise(likelihood) if is_batch else likelihood)(theta, *record)[0]
+    likelihood = LogLikelihood(op.system, op.filter, PANEL)
+    terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
     if op.score_from == 0:
         return terms
     codes = rows[..., RECORD]

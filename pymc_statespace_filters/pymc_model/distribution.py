@@ -19,8 +19,7 @@ from ..filters.recommendation import check_system_and_filter
 from ..system.checks import is_integer
 from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel, symbolic_panel
-from ..system.panel_parameters import symbolic_panel_parameters
-from ..system.parameters import check_names, symbolic_parameters
+from ..system.parameters import check_names, symbolic_panel_parameters, symbolic_parameters
 from ..system.record import check_seed, symbolic_record
 from . import dispatch as dispatch  # registers draw and density
 from .random_variable import PanelRV, StateSpaceRV

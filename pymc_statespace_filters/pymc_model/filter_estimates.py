@@ -15,9 +15,9 @@ from pytensor.graph.traversal import ancestors
 
 from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter
+from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
-from ..ops.panel import PanelLogLikelihood
 from ..parallel.cpu_affinity import available_cores
 from .compilation import compile_raveled
 from .density import check_free_variables
@@ -54,7 +54,7 @@ class VariableAtPoints:
             [values[varying.index(i)] if i in varying else constant[i] for i in range(len(graphs))]
             for values in at_points
         ]
-        self._kind = PanelLogLikelihood if steps.type.ndim == 2 else LogLikelihood
+        self._form = PANEL if steps.type.ndim == 2 else ONE_RECORD
         self._scored = scored_rows(node)
 
     def __len__(self) -> int:
@@ -94,7 +94,7 @@ class VariableAtPoints:
         """
         rows = self._scored if scored else ...
         check_system_and_filter(self.system, filter)
-        evaluate = evaluator(self._kind(self.system, filter))
+        evaluate = evaluator(LogLikelihood(self.system, filter, self._form))
 
         def total(i: int, seed: np.int64) -> float:
             terms = evaluate(*self._arguments[i], np.asarray(seed))[0]

@@ -19,10 +19,9 @@ from ..filters.ekf import EKF
 from ..filters.grid import GridFilter
 from ..filters.protocol import EnsembleFilter, Filter
 from ..filters.recommendation import check_system_and_filter
+from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
-from ..ops.likelihood import LogLikelihood
-from ..ops.noise import LogLikelihoodOfNoise, StoredNoise
-from ..ops.panel import PanelLogLikelihood
+from ..ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from ..system.model import StateSpaceModel
 from .inspection import likelihood_nodes, noisy_filters, state_space_nodes
 
@@ -59,7 +58,7 @@ def with_likelihood_callback(
     normals: dict[TensorVariable, TensorVariable] = {}
     names = {seed: name for name, seed in held.items()}
     nodes = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
-    noisy_nodes = [node for node in nodes if not isinstance(node.op, PanelLogLikelihood)]
+    noisy_nodes = [node for node in nodes if node.op.form is not PANEL]
     for number, node in enumerate(noisy_nodes):
         system, filter = node.op.system, node.op.filter
         steps, seed = node.inputs[1], node.inputs[-1]
@@ -115,7 +114,7 @@ def autoregressive_noise(
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
-            if isinstance(node.op, PanelLogLikelihood):
+            if node.op.form is PANEL:
                 raise ModelError(
                     "correlation must be None for a panel, whose records keep estimates of their "
                     "own"
@@ -167,7 +166,7 @@ def with_filter(
                 f"filters must be the same for {', '.join(names)}: their likelihoods are equal"
             )
         if names:
-            outputs = type(node.op)(node.op.system, new.pop())(*node.inputs)
+            outputs = node.op.of(node.op.system, new.pop())(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     if missing := [name for name in filters if name not in found]:
         raise ModelError(f"the graphs must contain the likelihood of {', '.join(missing)}")

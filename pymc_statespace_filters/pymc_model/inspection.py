@@ -17,7 +17,7 @@ from ..errors import ModelError
 from ..filters.protocol import Filter
 from ..filters.recommendation import collapse_remedy, quiet_filter, short_form
 from ..ops.likelihood import LogLikelihood
-from ..system.panel import RECORD
+from ..system.panel_records import RECORD
 from .random_variable import PanelRV, StateSpaceRV
 
 

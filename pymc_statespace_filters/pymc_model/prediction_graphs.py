@@ -8,8 +8,8 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.symbols import jacobian_of, observation_moments, symbols_of
 from ..filters.protocol import DifferentiableFilter, PredictionFilter
-from ..ops.diagnostics import Predictions
 from ..ops.likelihood import TapedLogLikelihood
+from ..ops.states import Predictions
 from .state_graphs import StateSpaceVariable
 
 type Graphs = list[TensorVariable]

@@ -10,9 +10,8 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..filters.protocol import Filter, StatesFilter, check_states_filter
 from ..filters.recommendation import check_system_and_filter
-from ..ops.diagnostics import TermHealth
 from ..ops.likelihood import LogLikelihood
-from ..ops.states import States
+from ..ops.states import States, TermHealth
 from ..system.model import StateSpaceModel
 from .inspection import state_space_nodes
 

@@ -17,11 +17,11 @@ from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
 from ..filters.ekf import EKF
 from ..filters.protocol import EnsembleFilter, Filter
-from ..ops.panel import PanelLogLikelihood
+from ..filters.signatures import PANEL
 from ..system.accumulators import without_resets
 from ..system.integrators.coupled_noise import CoupledNoise
 from ..system.model import StateSpaceModel
-from ..system.panel import FIRST_INPUT, RECORD, STEP
+from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .compilation import compile_raveled
 from .inspection import likelihood_nodes
 
@@ -51,7 +51,7 @@ def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable]
         if filter is None:
             return None
         for replaced, version in ((coarse, system), (fine, refined)):
-            outputs = type(node.op)(version, filter)(*node.inputs)
+            outputs = node.op.of(version, filter)(*node.inputs)
             replaced |= dict(zip(node.outputs, outputs, strict=True))
     return clone_replace(log_density, coarse), clone_replace(log_density, fine)
 
@@ -105,7 +105,7 @@ def _halved(node: Any, halvings: int) -> list[list[Variable]]:
         filter = filter.smooth(compile_system(systems[0]))
     for version in systems:
         filter.check(compile_system(version))
-    return [type(node.op)(version, filter)(*node.inputs) for version in systems]
+    return [node.op.of(version, filter)(*node.inputs) for version in systems]
 
 
 def _likelihood(node: Any, system: StateSpaceModel) -> list[Variable]:
@@ -118,7 +118,7 @@ def _likelihood(node: Any, system: StateSpaceModel) -> list[Variable]:
         filter.check(compile_system(system))
     except ModelError:
         return _with_shorter_steps(node, system)
-    return type(node.op)(system, filter)(*node.inputs)
+    return node.op.of(system, filter)(*node.inputs)
 
 
 def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
@@ -134,7 +134,7 @@ def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
         rows = pt.set_subtensor(rows[:, -1], rows[:, -1] * begins_step)
     # The rows of a panel have a column of records before those of steps and inputs.
     factors = factor if steps.type.ndim == 1 else np.array([1, factor, factor])
-    likelihood = type(node.op)(single, node.op.filter)
+    likelihood = node.op.of(single, node.op.filter)
     return likelihood(theta, steps * factors, observed, rows, *others)
 
 
@@ -157,7 +157,7 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
         stable = np.ones(len(x), dtype=bool)
         for i, node in enumerate(nodes):
             system, arguments = node.op.system, columns[4 * i : 4 * i + 4]
-            if isinstance(node.op, PanelLogLikelihood):
+            if node.op.form is PANEL:
                 arguments = _each_record(*arguments)
             eigenvalues = path_eigenvalues(system, *arguments)
             is_stable_at = system.integrator.is_stable_at(eigenvalues).all(axis=1)

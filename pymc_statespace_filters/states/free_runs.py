@@ -1,4 +1,4 @@
-"""Free runs: simulations at draws of the posterior that see no observation."""
+"""Free runs: simulations at draws of the posterior that see no observation, and their errors."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,9 +17,8 @@ from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_flag, check_random_seed
 from ..system.record import check_observed
 from ..system.steps import steps_of
-from .draws import select_draws
+from .draws import SAMPLE_DIMS, select_draws
 from .groups import add_group, by_record, join_rows, row_coords, state_dims
-from .prediction_errors import prediction_errors
 from .record import Array, RecordAtDraws, simulate_observations
 from .variable import VariableAtDraws, select_variables
 
@@ -243,3 +242,42 @@ def _warn_of_failed_runs(name: str, paths: Sequence[Array]) -> None:
             FilterWarning,
             stacklevel=3,
         )
+
+
+PROBABILITIES = np.array([0.5, 0.9])  # of the central intervals
+
+
+def prediction_errors(predicted: xr.DataArray, measured: Array, observed: Array) -> xr.Dataset:
+    """Errors of predictions (chain, draw, time, observable) of a record (R, p).
+
+    ``measured`` (draws, R, p) are predictions with measurement noise. Missing data and NaN draws
+    are left out.
+    """
+    name, (time, observable) = predicted.name, map(str, predicted.dims[-2:])
+    record = xr.DataArray(observed, dims=(time, observable))
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)  # means of nothing are NaN
+        rmse = _rmse(predicted.mean(SAMPLE_DIMS), record, time)
+        return xr.Dataset(
+            {
+                f"{name}_rmse": rmse,
+                f"{name}_relative_error": rmse / record.std(time),
+                f"{name}_rmse_of_draws": _rmse(predicted, record, time),
+                f"{name}_coverage": (("interval", observable), _coverage(measured, observed)),
+            },
+            coords={"interval": PROBABILITIES.tolist()},
+        )
+
+
+def _rmse(predicted: xr.DataArray, record: xr.DataArray, time: str) -> xr.DataArray:
+    return ((predicted - record) ** 2).mean(time) ** 0.5
+
+
+def _coverage(measured: Array, observed: Array) -> Array:
+    """Fraction (2, p) of the record in the central intervals of each time."""
+    known, drawn = ~np.isnan(observed), measured[np.isfinite(measured).all(axis=(1, 2))]
+    if not len(drawn):
+        return np.full((len(PROBABILITIES), observed.shape[1]), np.nan)
+    low, high = (np.quantile(drawn, (1 + sign * PROBABILITIES) / 2, axis=0) for sign in (-1, 1))
+    inside = known & (low <= observed) & (observed <= high)
+    return inside.sum(axis=1) / known.sum(axis=0)

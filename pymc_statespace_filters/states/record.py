@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
 from ..compiler.native.python_call import call_machine_code
-from ..compiler.numerics.record_noise import seed_of_record
+from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
 from ..evaluation.simulate import observer
 from ..pymc_model.state_graphs import StateSpaceVariable, states_of, term_health_of

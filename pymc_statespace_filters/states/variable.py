@@ -17,15 +17,14 @@ from pytensor.graph.traversal import ancestors
 from ..compiler.native.compilation import undamaged_files
 from ..compiler.native.pytensor_function import NativeFunction
 from ..compiler.native.rows import Rows
-from ..compiler.numerics.record_noise import generators_of_records
+from ..compiler.numerics.philox import generators_of_records
 from ..errors import ModelError
 from ..evaluation.filter_warnings import warn_about
 from ..filters.outcomes import NONE
 from ..progress import row_progress
 from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables, with_other_filter
-from ..system.panel import FIRST_INPUT, RECORD, STEP
 from ..system.panel_inputs import panel_inputs
-from ..system.panel_records import records_of
+from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from ..system.record import check_inputs
 from .draws import SAMPLE_DIMS, PosteriorDraws
 from .record import Array, Graphs, RecordAtDraws

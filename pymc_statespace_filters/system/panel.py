@@ -21,13 +21,9 @@ from ..errors import ModelError
 from .checks import check_finite
 from .model import StateSpaceModel
 from .panel_inputs import panel_inputs, symbolic_panel_inputs
-from .panel_records import Records, records_of
+from .panel_records import FIRST_INPUT, STEP, Records, records_of
 from .record import check_observed
 from .steps import check_steps, steps_of
-
-# Columns of the rows of a panel.
-RECORD, STEP, FIRST_INPUT = range(3)
-N_COLUMNS = 3
 
 
 class CheckedPanel(NamedTuple):
@@ -38,6 +34,18 @@ class CheckedPanel(NamedTuple):
     observed: np.ndarray
     inputs: np.ndarray
     t0: np.ndarray
+
+    def single_records(self) -> list[tuple[np.ndarray, ...]]:
+        """Steps, observed, inputs and t0 of every record, as a single one has them."""
+        return [
+            (
+                self.rows[own, STEP].copy(),
+                self.observed[own],
+                self.inputs[self.rows[own.start, FIRST_INPUT] :],
+                self.t0,
+            )
+            for own in self.records.slices()
+        ]
 
 
 class SymbolicPanel(NamedTuple):

@@ -9,6 +9,10 @@ import numpy as np
 from ..errors import ModelError
 from .checks import is_integer, shortened
 
+# Columns of the rows of a panel, see `panel`.
+RECORD, STEP, FIRST_INPUT = range(3)
+N_COLUMNS = 3
+
 
 class Records(NamedTuple):
     """The records of a panel, in the order of their rows.

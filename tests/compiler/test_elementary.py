@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 
 from pymc_statespace_filters.compiler.codegen.emitter import INLINED
-from pymc_statespace_filters.compiler.native.cache_key import FAST_MATH
+from pymc_statespace_filters.compiler.native.jit import FAST_MATH
 from pymc_statespace_filters.compiler.numerics.intrinsics import fma, polynomial, sqrt
 
 N = 40_000

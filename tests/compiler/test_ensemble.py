@@ -8,7 +8,7 @@ from scipy import stats
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.covariances import semidefinite_cholesky
+from pymc_statespace_filters.compiler.numerics.small_cholesky import covariance_root
 
 N = 5
 INPUTS = np.array([[0.3], [0.7], [-0.2]])
@@ -96,7 +96,7 @@ def test_square_root_of_a_singular_covariance(rank):
     factors = np.random.default_rng(rank).normal(size=(3, rank))
     cov = factors @ factors.T
     root = cov.copy()
-    semidefinite_cholesky(root)
+    covariance_root(root)
     np.testing.assert_allclose(root @ root.T, cov, atol=1e-12)
     assert (np.triu(root, 1) == 0).all()
 
@@ -106,5 +106,5 @@ def test_square_root_of_a_singular_covariance(rank):
 )
 def test_square_root_of_what_is_no_covariance_is_nan(cov):
     root = np.array(cov)
-    semidefinite_cholesky(root)
+    covariance_root(root)
     assert np.isnan(root).all()

@@ -8,9 +8,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
+from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.batch import BatchLogLikelihood
-from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 N_STATES = 40
@@ -56,7 +56,7 @@ def kalman(record, decay=DECAY):
 def test_ekf_is_the_kalman_filter_at_every_point_of_a_batch(chain, record):
     """Too many states to write out are evaluated in turn; a point that fails touches no other."""
     points = np.array([[DECAY], [np.nan], [0.7]])
-    batch = evaluator(BatchLogLikelihood(chain, psf.EKF()))
+    batch = evaluator(LogLikelihood(chain, psf.EKF(), POINTS))
     terms, health = batch(
         points, np.array(STEPS), record, np.zeros((0, 0)), np.array(0.0), np.array(0)
     )

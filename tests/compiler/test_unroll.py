@@ -8,8 +8,8 @@ from pytensor.compile.mode import Mode
 
 from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.compiler.codegen.expressions import Arena
-from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
-from pymc_statespace_filters.compiler.codegen.functions import vector_functions
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
+from pymc_statespace_filters.compiler.codegen.functions import vector_function
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError, unroll
 from pymc_statespace_filters.system.equations import as_vector
 from tests.compiler import example_functions
@@ -25,8 +25,7 @@ def traced(group):
 
 
 def lowered(x, outputs):
-    function = VectorFunction("c", Graph({"theta": x}, outputs), [False] * len(outputs))
-    compiled = vector_functions({"f": function})["f"].function
+    compiled = vector_function("f", "c", Graph({"theta": x}, outputs)).function
     return compiled if len(outputs) > 1 else lambda point: (compiled(point),)
 
 

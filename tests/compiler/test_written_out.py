@@ -16,7 +16,7 @@ from pytensor.graph.replace import graph_replace
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
 from pymc_statespace_filters.compiler.codegen.expressions import Arena
-from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.machine_code import ModuleEntryPoint
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR
@@ -44,7 +44,7 @@ def test_all_operations_mean_what_they_mean_to_pytensor():
     output = pt.stack(results)
     interpreted = pytensor.function([c], output, mode=Mode("py", None))
     graph = Graph({"theta": c}, [output])
-    compiled = lowering.vector_functions({"f": VectorFunction("c", graph)})["f"].function
+    compiled = lowering.vector_function("f", "c", graph).function
     x, n = pt.tensor("x", shape=(3,), dtype="float64"), len(results)
     (moved,) = graph_replace([output], {c: x})
     members = lowering.member_function("f", "X, out", Graph({"x": x}, [moved]), "out")
@@ -141,7 +141,7 @@ def test_the_log_says_why_code_runs_on_arrays(output, reason, caplog, monkeypatc
     monkeypatch.setattr(lowering, "array_vector_function", lambda *arguments: None)
     x = pt.tensor("x", shape=(3,), dtype="float64")
     with caplog.at_level(logging.DEBUG, "pymc_statespace_filters"):
-        lowering.vector_functions({"f": VectorFunction("c", Graph({"theta": x}, [output(x)]))})
+        lowering.vector_function("f", "c", Graph({"theta": x}, [output(x)]))
     (message,) = caplog.messages
     assert message.startswith(f"f: array code, because of {reason}")
 
@@ -160,11 +160,8 @@ def test_a_function_of_many_results_becomes_machine_code_in_its_callers_only():
     theta = pt.tensor("theta", shape=(2,), dtype="float64")
     covariance = theta[0] * np.eye(21)
     graph = Graph({"theta": theta}, [covariance.ravel()])
-    function = lowering.vector_functions({"f": VectorFunction("c", graph)})["f"]
+    function = lowering.vector_function("f", "c", graph)
     assert function.large
-    copy = lowering.copy_elements("found, c", "c[{i}]", "found", 441)
-    found = np.empty(441)
-    scope = {"f": function.function, "copy": copy}
-    exec("def fill(theta, c): copy(f(theta), c)", scope)
-    numba.njit(scope["fill"])(np.array([3.0, 0.0]), found)
-    np.testing.assert_array_equal(found.reshape(21, 21), 3.0 * np.eye(21))
+    run = function.function
+    found = numba.njit(lambda theta: run(theta))(np.array([3.0, 0.0]))
+    np.testing.assert_array_equal(np.reshape(found, (21, 21)), 3.0 * np.eye(21))

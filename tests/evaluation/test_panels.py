@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
+from pymc_statespace_filters.compiler.numerics.philox import seed_of_record
 from pymc_statespace_filters.system.panel_records import records_of
 from tests.systems import FORCED, PAIR
 

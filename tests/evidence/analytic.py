@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.evidence.estimators.normal_proposals import NormalProposals
+from pymc_statespace_filters.evidence.estimators.whitening import NormalProposals
 from pymc_statespace_filters.evidence.posterior.draws import Posterior
 from tests.evidence.targets import Regression, autoregressive
 

@@ -10,9 +10,9 @@ from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.estimators.normal_proposals import BLOCK, normal_proposals
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.estimators.stopping import FEWEST, MOST, shortfall
+from pymc_statespace_filters.evidence.estimators.whitening import BLOCK, normal_proposals
 from tests.evidence.analytic import gaussian
 from tests.evidence.targets import Regression, TwoModes
 from tests.evidence.test_models import REGRESSION, exact_draws

@@ -8,8 +8,7 @@ from pymc_statespace_filters.compiler.numerics.normals import padded
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, OBSERVATION, PROCESS
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.records import LinearSystem, simulate

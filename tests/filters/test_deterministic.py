@@ -11,11 +11,13 @@ from scipy.linalg import expm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
 from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER
 from pymc_statespace_filters.filters.recommendation import alternatives
+from pymc_statespace_filters.filters.signatures import POINTS
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.prediction_graphs import gaussian_predictions
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
 
@@ -123,12 +125,12 @@ def test_a_guide_can_be_written_out_without_process_noise():
     """`GuidedPF` treats equations without noise whose start is not known."""
     system = compile_system(decay(transition=lambda x: 0.9 * x, initial_cov=1.0))
     assert system.m == 0
-    assert entry_point(system, "look_back").key
+    assert system.entry_point("look_back").key
 
 
 def test_the_gaussian_filters_are_one():
     system = compile_system(KNOWN)
-    for method in ("compile", "compile_pullback", "compile_batch", "compile_run"):
+    for method in ("compile", "compile_pullback", "plan_of_many", "compile_run"):
         first, *others = (getattr(f, method)(system).key for f in GAUSSIAN)
         assert others == [first, first]
 
@@ -151,7 +153,7 @@ def test_the_gradient_is_that_of_the_equations():
 
 def test_many_points_side_by_side():
     points = theta_of() * np.linspace(0.8, 1.2, 5)[:, None]
-    terms, health = compiled("compile_batch", KNOWN)(points, *RECORD)
+    terms, health = evaluator(LogLikelihood(KNOWN, psf.EKF(), POINTS))(points, *RECORD)
     np.testing.assert_allclose(terms, [terms_of(point) for point in points], rtol=1e-12)
     np.testing.assert_array_equal(health[:, 1], 0.0)
 

@@ -6,7 +6,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.diagnostics import TermHealth
+from pymc_statespace_filters.ops.states import TermHealth
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 from tests.references.records import PRECISE_DOUBLE_WELL, SURPRISES, double_well_with_surprises

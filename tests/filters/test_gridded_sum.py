@@ -9,14 +9,14 @@ from numba import njit
 from scipy.special import logsumexp
 
 from pymc_statespace_filters.compiler.numerics.normals import padded
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
+from pymc_statespace_filters.filters.ensemble.reductions import RankLayout
 from pymc_statespace_filters.filters.kernel_density.density import density_method
+from pymc_statespace_filters.filters.kernel_density.direct_sum import Points
 from pymc_statespace_filters.filters.kernel_density.gridded_sum import (
     FLOOR,
     gridded_sum_workspace,
     gridded_sums,
 )
-from pymc_statespace_filters.filters.kernel_density.points import Points
 from pymc_statespace_filters.filters.pf_enkf import PFEnKF
 from tests.compiled import from_python
 from tests.filters.ensemble_contract import LINE, OSCILLATOR, run

@@ -6,7 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.records import (
     BROAD_DOUBLE_WELL,

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.conditional_moments import conditional_moments
+from pymc_statespace_filters.compiler.lowering.observation import conditional_moments
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.testing import kalman_log_likelihood

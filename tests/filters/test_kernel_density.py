@@ -6,8 +6,11 @@ from numba import njit
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
-from pymc_statespace_filters.filters.ensemble.reductions import local_partition, weighted_cov
+from pymc_statespace_filters.filters.ensemble.reductions import (
+    RankLayout,
+    local_partition,
+    weighted_cov,
+)
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     kernel_workspace,

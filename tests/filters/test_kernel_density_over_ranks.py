@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.compiler.numerics.normals import padded
-from pymc_statespace_filters.filters.ensemble.partition import RankLayout
-from pymc_statespace_filters.filters.ensemble.reductions import local_partition
+from pymc_statespace_filters.filters.ensemble.reductions import RankLayout, local_partition
 from pymc_statespace_filters.filters.kernel_density.density import (
     density_workspace,
     log_kernel_density,

@@ -12,16 +12,14 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.normals import fill_normals
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PROCESS
 from pymc_statespace_filters.filters import BootstrapPF, EnKF, GuidedPF, PFEnKF
-from pymc_statespace_filters.filters.ensemble.partition import (
+from pymc_statespace_filters.filters.ensemble.reductions import (
     BLOCKS,
     MEMBERS,
     RankLayout,
-    local_range,
-)
-from pymc_statespace_filters.filters.ensemble.reductions import (
     allgather_sums,
     count,
     local_partition,
+    local_range,
     sum_spread,
     total,
     weighted_cov,

@@ -9,8 +9,8 @@ import pytest
 from pytensor.tensor.linalg import inv
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.codegen.arguments import LANES
 from pymc_statespace_filters.compiler.codegen.scalarize import NotUnrollableError
-from pymc_statespace_filters.compiler.codegen.simd import LANES
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.gaussian import functions as gaussian_functions
 from pymc_statespace_filters.filters.gaussian.machine import STRETCH
@@ -19,14 +19,14 @@ from pymc_statespace_filters.filters.outcomes import (
     NO_FINITE_MEMBER,
     NONE,
 )
-from pymc_statespace_filters.filters.protocol import PanelFilter
+from pymc_statespace_filters.filters.protocol import BatchFilter
+from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import TapedLogLikelihood, TapePullback
-from pymc_statespace_filters.ops.panel import (
-    PanelLogLikelihood,
-    PanelLogLikelihoodGradient,
-    PanelTapePullback,
-    TapedPanelLogLikelihood,
+from pymc_statespace_filters.ops.likelihood import (
+    LogLikelihood,
+    LogLikelihoodGradient,
+    TapedLogLikelihood,
+    TapePullback,
 )
 from tests.systems import PAIR, pair_terms
 
@@ -95,8 +95,8 @@ def records_of(rows):
 
 
 def together(system, filter, theta, panel, bars):
-    terms, health, tape = evaluator(TapedPanelLogLikelihood(system, filter))(theta, *panel)
-    pullback = evaluator(PanelTapePullback(system, filter))
+    terms, health, tape = evaluator(TapedLogLikelihood(system, filter, PANEL))(theta, *panel)
+    pullback = evaluator(TapePullback(system, filter, PANEL))
     return terms, health, *pullback(theta, *panel, tape, bars)
 
 
@@ -147,7 +147,7 @@ def test_terms_are_those_of_kalman_filters():
     theta = np.column_stack([rng.uniform(-0.9, 0.9, 9), rng.normal(size=9)])
     panel = table([5, 2, 7, 1, 4, 4, 4, 3, 6], rng, p=2)
     rows, observed = panel[:2]
-    terms, _ = evaluator(PanelLogLikelihood(PAIR, psf.EKF()))(theta, *panel)
+    terms, _ = evaluator(LogLikelihood(PAIR, psf.EKF(), PANEL))(theta, *panel)
     for (a, b), part in zip(theta, records_of(rows), strict=True):
         exact = pair_terms(a, b, observed[part], rows[part, 1])
         np.testing.assert_allclose(terms[part], exact, rtol=1e-11, atol=1e-12)
@@ -216,8 +216,8 @@ def test_value_and_gradient_are_those_of_the_tape():
     panel, theta = table([3, 9, 6], rng, p=2, n_inputs=2), bent_theta(3, rng)
     bars = rng.normal(size=len(panel[0]))
     terms, health, theta_bar = together(BENT, psf.EKF(), theta, panel, bars)
-    value = evaluator(PanelLogLikelihood(BENT, psf.EKF()))(theta, *panel)
-    gradient = evaluator(PanelLogLikelihoodGradient(BENT, psf.EKF()))(theta, *panel, bars)
+    value = evaluator(LogLikelihood(BENT, psf.EKF(), PANEL))(theta, *panel)
+    gradient = evaluator(LogLikelihoodGradient(BENT, psf.EKF(), PANEL))(theta, *panel, bars)
     for found, expected in zip([*value, *gradient], [terms, health, theta_bar], strict=True):
         np.testing.assert_array_equal(found, expected)
 
@@ -227,7 +227,7 @@ def test_the_tape_grows_with_the_rows_and_not_with_the_steps_between_them():
     for gap in (2, STRETCH):
         rows = np.array([(0, gap * step, 0) for step in range(50)])
         panel = rows, np.zeros((50, 1)), np.zeros((0, 0)), T0, SEED
-        *_, tape = evaluator(TapedPanelLogLikelihood(WELL, psf.UKF()))(np.ones((1, 1)), *panel)
+        *_, tape = evaluator(TapedLogLikelihood(WELL, psf.UKF(), PANEL))(np.ones((1, 1)), *panel)
         sizes.append(tape.size)
     assert sizes == [50 * 2 * LANES] * 2
 
@@ -256,11 +256,11 @@ def test_systems_too_large_for_lanes_have_the_bits_of_single_records(monkeypatch
         np.testing.assert_array_equal(terms, expected)
         np.testing.assert_array_equal(health, healths[1])
         np.testing.assert_array_equal(theta_bar, expected_bar * (slope > 0.0))
-    value = evaluator(PanelLogLikelihood(system, psf.EKF()))(theta, *panel)
+    value = evaluator(LogLikelihood(system, psf.EKF(), PANEL))(theta, *panel)
     for found, taped in zip(value, (terms, health), strict=True):
         np.testing.assert_array_equal(found, taped)
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF(), psf.IPLF()])
 def test_the_gaussian_filters_take_panels(filter):
-    assert isinstance(filter, PanelFilter)
+    assert isinstance(filter, BatchFilter)

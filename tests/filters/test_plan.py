@@ -9,12 +9,8 @@ import pytest
 from numba import types
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.codegen.function_types import (
-    MEMBER_ARGUMENTS,
-    MemberArguments,
-)
+from pymc_statespace_filters.compiler.codegen.arguments import MEMBER_ARGUMENTS, MemberArguments
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.compiler.lowering.entry_points import entry_point
 from pymc_statespace_filters.compiler.native.entry_point import F64_PTR, I64_PTR, EntryPoint
 from pymc_statespace_filters.compiler.native.plan import (
     DAMAGED,
@@ -78,7 +74,7 @@ def test_what_is_packed_is_read_under_its_own_name():
     read = PlannedFunction(plan, RECORD_ARGUMENTS, (("normals", 1),))
     steps, observed = np.array([1, 4]), np.zeros((2, 3))
     seen = read(np.full(4, 7.0), steps, observed, np.zeros((6, 5)), 0.75)
-    addresses = [entry_point(system, name).address for name in FUNCTIONS]
+    addresses = [system.entry_point(name).address for name in FUNCTIONS]
     assert seen.tolist() == [
         2, 3, 4, n_constants, 6, 5, *addresses, 0, 1, system.dt, 7.0, 1, 2, 0.125, 8.0, 0.75, 4,
     ]  # fmt: skip

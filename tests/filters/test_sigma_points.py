@@ -15,6 +15,9 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.gaussian.linearization import Linearizations
 from pymc_statespace_filters.filters.gaussian.sigma_points import SigmaPoints
 from pymc_statespace_filters.filters.gaussian.tangent import Tangent, linearizations_of
+from pymc_statespace_filters.filters.signatures import POINTS
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.test_ekf_states import (
     FORCE,
@@ -317,7 +320,7 @@ def test_the_scaling_is_that_of_wan_and_van_der_merwe():
 @BOTH
 def test_a_batch_is_its_points(filter):
     points = theta_of(NONLINEAR) * np.random.default_rng(2).uniform(0.7, 1.3, size=(11, 7))
-    terms, health = filter.compile_batch(compile_system(SYSTEM)).function(points, *RECORD)
+    terms, health = evaluator(LogLikelihood(SYSTEM, filter, POINTS))(points, *RECORD)
     for i, point in enumerate(points):
         one = evaluate(filter, point)
         np.testing.assert_allclose(terms[i], one.terms, rtol=1e-10)

@@ -13,9 +13,9 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.blockwise import Blockwise
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.codegen.simd import LANES
+from pymc_statespace_filters.compiler.codegen.arguments import LANES
+from pymc_statespace_filters.filters import signatures
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.batch import BatchLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from tests.systems import PAIR, PAIR_DATA, STEPS
 
@@ -49,7 +49,7 @@ def bent_points(n):
 
 
 def batch_and_loop(system, points, record):
-    batch = evaluator(BatchLogLikelihood(system, psf.EKF()))(points, *record)
+    batch = evaluator(LogLikelihood(system, psf.EKF(), signatures.POINTS))(points, *record)
     alone = evaluator(LogLikelihood(system, psf.EKF()))
     loop = [alone(point, *record) for point in points]
     return batch, [np.array([one[i] for one in loop]) for i in (0, 1)]
@@ -63,7 +63,9 @@ def test_a_batch_is_its_points(n):
 
 
 def test_an_empty_batch():
-    terms, health = evaluator(BatchLogLikelihood(PAIR, psf.EKF()))(np.zeros((0, 2)), *RECORD)
+    terms, health = evaluator(LogLikelihood(PAIR, psf.EKF(), signatures.POINTS))(
+        np.zeros((0, 2)), *RECORD
+    )
     assert terms.shape == (0, 4)
     assert health.shape == (0, 3)
 
@@ -98,10 +100,10 @@ def test_vectorizing_a_graph_over_parameters_makes_one_batch():
     batched = vectorize_graph([terms, health], {theta: thetas})
     function = pytensor.function([thetas], batched)
     kinds = {type(node.op) for node in function.maker.fgraph.apply_nodes}
-    assert BatchLogLikelihood in kinds
+    assert LogLikelihood in kinds
     assert not any(issubclass(kind, Blockwise) for kind in kinds)
     got = function(POINTS[:6].reshape(2, 3, 2))
-    direct = evaluator(BatchLogLikelihood(PAIR, psf.EKF()))(POINTS[:6], *RECORD)
+    direct = evaluator(LogLikelihood(PAIR, psf.EKF(), signatures.POINTS))(POINTS[:6], *RECORD)
     for a, b in zip(got, direct, strict=True):
         np.testing.assert_array_equal(a, b.reshape(2, 3, -1))
     assert function(np.zeros((0, 3, 2)))[0].shape == (0, 3, 4)
@@ -116,12 +118,12 @@ def test_other_batches_are_loops(filter):
     batches = {theta: thetas, data: datas} if not filter.noisy else {theta: thetas}
     nodes = [v.owner for v in ancestors([vectorize_graph(terms, batches)]) if v.owner]
     assert [n for n in nodes if isinstance(n.op, Blockwise)]
-    assert not [n for n in nodes if isinstance(n.op, BatchLogLikelihood)]
+    assert not [n for n in nodes if getattr(n.op, "form", None) is signatures.POINTS]
 
 
 def test_gradient_of_a_batch():
     thetas = pt.dmatrix("thetas")
-    terms, _ = BatchLogLikelihood(PAIR, psf.EKF())(thetas, *RECORD)
+    terms, _ = LogLikelihood(PAIR, psf.EKF(), signatures.POINTS)(thetas, *RECORD)
     function = pytensor.function([thetas], pt.grad(terms.sum(), thetas))
     alone = evaluator(LogLikelihoodGradient(PAIR, psf.EKF()))
     want = [alone(point, *RECORD, np.ones(4))[0] for point in POINTS[:3]]
@@ -143,7 +145,7 @@ def test_log_density_of_a_batch_of_parameters_in_pymc():
     d = psf.StateSpace.dist(thetas, *record, system=PAIR, filter=psf.EKF())
     logp = pm.logp(d, PAIR_DATA)
     nodes = [v.owner for v in ancestors([logp]) if v.owner]
-    assert [n for n in nodes if isinstance(n.op, BatchLogLikelihood)]
+    assert [n for n in nodes if getattr(n.op, "form", None) is signatures.POINTS]
     got = pytensor.function([thetas], logp)(POINTS[:3])
-    direct, _ = evaluator(BatchLogLikelihood(PAIR, psf.EKF()))(POINTS[:3], *RECORD)
+    direct, _ = evaluator(LogLikelihood(PAIR, psf.EKF(), signatures.POINTS))(POINTS[:3], *RECORD)
     np.testing.assert_allclose(got, direct, rtol=1e-12)

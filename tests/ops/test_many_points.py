@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.filters import signatures
 from pymc_statespace_filters.ops import many_points
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.many_points import gradients, values
-from pymc_statespace_filters.ops.panel import PanelLogLikelihood
 from tests.systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, pair_terms
 
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))
@@ -33,7 +33,7 @@ class InTurn:
     has_gradient = True
 
     def __getattr__(self, name):
-        if name in {"compile_batch", "compile_panel", "compile_panel_gradient"}:
+        if name == "plan_of_many":
             raise AttributeError(name)
         return getattr(psf.EKF(), name)
 
@@ -64,7 +64,7 @@ def evaluations(monkeypatch):
 
     def counted(op):
         evaluate = evaluator(op)
-        return lambda *args: calls.append(type(op).__name__) or evaluate(*args)
+        return lambda *args: calls.append(f"{type(op).__name__}, {op.form.name}") or evaluate(*args)
 
     monkeypatch.setattr(many_points, "evaluator", counted)
     return calls
@@ -80,17 +80,19 @@ def test_points_of_one_record_are_evaluated_side_by_side(evaluations):
     assert_same(values(op, POINTS, *lead(RECORD)), alone(op, POINTS, RECORD))
     found = gradients(op.gradient(), POINTS, *lead(RECORD), BARS)
     assert_same(found, alone(op.gradient(), POINTS, RECORD, BARS))
-    assert evaluations == ["BatchLogLikelihood", "TapedPanelLogLikelihood", "PanelTapePullback"]
+    assert evaluations == [
+        "LogLikelihood, points", "TapedLogLikelihood, panel", "TapePullback, panel"
+    ]  # fmt: skip
 
 
 def test_panels_of_many_points_are_one_panel(evaluations):
-    op = PanelLogLikelihood(FORCED, psf.EKF())
+    op = LogLikelihood(FORCED, psf.EKF(), signatures.PANEL)
     bars = rng.normal(size=(6, 6))
     assert_same(values(op, PANELS, *lead(PANEL)), alone(op, PANELS, PANEL))
     found = gradients(op.gradient(), PANELS, *lead(PANEL), bars)
     assert_same(found, alone(op.gradient(), PANELS, PANEL, bars))
     assert evaluations == [
-        "PanelLogLikelihood", "TapedPanelLogLikelihood", "PanelTapePullback"
+        "LogLikelihood, panel", "TapedLogLikelihood, panel", "TapePullback, panel"
     ]  # fmt: skip
 
 
@@ -110,7 +112,7 @@ def test_a_point_that_fails_touches_no_other():
 def test_a_panel_with_a_record_that_fails_touches_no_other():
     points = PANELS.copy()
     points[2, 1] = 1e300
-    op = PanelLogLikelihood(FORCED, psf.EKF())
+    op = LogLikelihood(FORCED, psf.EKF(), signatures.PANEL)
     found = values(op, points, *lead(PANEL))
     assert found[1][2, 1] != 0
     assert_same(found, alone(op, points, PANEL))
@@ -152,14 +154,15 @@ def test_records_that_differ_are_evaluated_in_turn(evaluations):
     wanted = [pair_terms(a, b, observed=d) for (a, b), d in zip(POINTS[:3], data, strict=True)]
     np.testing.assert_allclose(terms, wanted, rtol=1e-10)
     gradients(op.gradient(), POINTS[:3], *record, BARS[:3])
-    assert evaluations == ["LogLikelihood"] * 3 + ["LogLikelihoodGradient"] * 3
+    of_one = ["LogLikelihood, one record"] * 3 + ["LogLikelihoodGradient, one record"] * 3
+    assert evaluations == of_one
 
 
 @pytest.mark.parametrize("filter", [InTurn(), psf.BootstrapPF(20)], ids=["InTurn", "BootstrapPF"])
 def test_filters_of_single_points_are_evaluated_in_turn(filter, evaluations):
     op = LogLikelihood(PAIR, filter)
     assert_same(values(op, POINTS[:3], *lead(RECORD)), alone(op, POINTS[:3], RECORD))
-    assert evaluations == ["LogLikelihood"] * 3
+    assert evaluations == ["LogLikelihood, one record"] * 3
     if filter.has_gradient:
         found = gradients(op.gradient(), POINTS[:3], *lead(RECORD), BARS[:3])
         assert_same(found, alone(op.gradient(), POINTS[:3], RECORD, BARS[:3]))

@@ -15,8 +15,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
-from pymc_statespace_filters.ops.base import cache_key, evaluator
+from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
+from pymc_statespace_filters.ops.unplanned import cache_key
 from tests.systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
 
 PF = psf.BootstrapPF(20)

@@ -10,7 +10,7 @@ from scipy.stats import chi2, multinomial, norm
 import pymc_statespace_filters as psf
 from benchmarks.posteriors import HARDENING, narrow
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.factors import ModelFactors
+from pymc_statespace_filters.pymc_model.prior import ModelFactors
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.systems import autoregression, simulated
 

@@ -11,8 +11,7 @@ from pytensor.graph.replace import clone_replace
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.noise import StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, StoredNoise
 from pymc_statespace_filters.pymc_model.graph_rewrites import autoregressive_noise
 from pymc_statespace_filters.pymc_model.inspection import health_outputs, noise_seeds
 

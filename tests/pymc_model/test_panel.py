@@ -8,7 +8,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.numerics.record_noise import seed_of_record
+from pymc_statespace_filters.compiler.numerics.philox import seed_of_record
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.posterior.observed_data import (
     observation_count,

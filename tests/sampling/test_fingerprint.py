@@ -15,7 +15,7 @@ from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.fingerprint import (
+from pymc_statespace_filters.sampling.checkpoint.manifest import (
     model_data_fingerprint,
     model_fingerprint,
 )

@@ -10,7 +10,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.run import population_search
 from pymc_statespace_filters.sampling.starts import population
-from pymc_statespace_filters.sampling.starts.nested import nested_reference
+from pymc_statespace_filters.sampling.starts.population import nested_reference
 
 T = np.linspace(-1.0, 1.0, 40)
 NOISE, PRIOR = 0.02, 5.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.sampling.particle_number.noisiest import (
+from pymc_statespace_filters.sampling.particle_number.measurement import (
     is_concentrated,
     noisiest_terms,
 )

@@ -9,8 +9,11 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise
+from pymc_statespace_filters.ops.likelihood import (
+    LogLikelihood,
+    LogLikelihoodGradient,
+    LogLikelihoodOfNoise,
+)
 
 STEPS = np.arange(1, 13)
 INPUTS = np.linspace(1.0, 2.0, 15)[:, None]

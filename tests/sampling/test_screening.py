@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.sampling.kernel.delayed_rejection import log_acceptance
-from pymc_statespace_filters.sampling.kernel.surrogate import log_surrogate_acceptance
+from pymc_statespace_filters.sampling.kernel.transition import log_surrogate_acceptance
 from tests.compiled import from_python
 from tests.sampling.test_delayed_rejection import (
     FULL,

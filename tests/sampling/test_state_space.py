@@ -12,8 +12,7 @@ from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,
 )
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.ops.noise import StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, StoredNoise
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.log_density import LogDensity

@@ -16,7 +16,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, convergence
-from pymc_statespace_filters.sampling.run import chain_task, convergence_display, model_task
+from pymc_statespace_filters.sampling.run import chain_task, model_task, scheduler
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import LOGGER, assert_identical, sample_dram
@@ -130,8 +130,8 @@ def test_the_bar_shows_what_the_draws_so_far_say(model, stopped, monkeypatch):
         shown.append((rhat, ess))
         show(bars, number, rhat, ess)
 
-    monkeypatch.setattr(convergence_display, "_SECONDS", 0.0)
-    monkeypatch.setattr(convergence_display, "_SHARE", 1e9)
+    monkeypatch.setattr(scheduler, "_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "_SHARE", 1e9)
     monkeypatch.setattr(ChainProgress, "show_convergence", watched)
     assert_identical(sample_dram(model, **RULE | {"progressbar": True}), stopped)
     found = convergence(list(draws_of(stopped)))

@@ -5,14 +5,9 @@ import pandas as pd
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.system.panel import (
-    FIRST_INPUT,
-    RECORD,
-    STEP,
-    checked_panel,
-)
-from pymc_statespace_filters.system.panel_parameters import panel_parameters
-from pymc_statespace_filters.system.panel_records import records_of
+from pymc_statespace_filters.system.panel import checked_panel
+from pymc_statespace_filters.system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
+from pymc_statespace_filters.system.parameters import panel_parameters
 from tests.systems import FORCE, FORCED, PAIR, forced
 
 LABELS = ["b", "b", "a", "c", "c"]

@@ -15,15 +15,9 @@ from ...errors import LoweringError
 from ..native.cache_key import key_of
 from ..native.compilation import undamaged_files, warning_filter
 from ..native.entry_point import EntryPoint
+from .arguments import MEMBER_ARGUMENTS
 from .array_linalg import use_loops
-from .function_types import (
-    MEMBER_ARGUMENTS,
-    MEMBER_INPUTS,
-    CompiledFunction,
-    Graph,
-    VectorFunction,
-    function_of,
-)
+from .function_types import MEMBER_INPUTS, CompiledFunction, Graph, function_of
 
 # The code that reads a whole input, if not its name.
 _WHOLE = {
@@ -38,19 +32,12 @@ _AT_ADDRESS = {
 }  # fmt: skip
 
 
-def array_vector_function(name: str, function: VectorFunction) -> CompiledFunction:
+def array_vector_function(name: str, arguments: str, graph: Graph) -> CompiledFunction:
     """A vector function that passes arrays; NaN where the array code raises."""
-    graph = function.graph
     used = used_inputs(graph.inputs, graph.outputs)
     compiled = array_code(list(used.values()), graph.outputs)
-    results = [
-        f"out[{i}].item()" if scalar else f"out[{i}].copy()"
-        for i, scalar in enumerate(function.scalar)
-    ]
-    failed = [
-        "nan" if scalar else f"np.full({output.type.shape[0]}, nan)"
-        for scalar, output in zip(function.scalar, graph.outputs, strict=True)
-    ]
+    results = [f"out[{i}].copy()" for i in range(len(graph.outputs))]
+    failed = [f"np.full({output.type.shape[0]}, nan)" for output in graph.outputs]
     body = [
         "try:",
         f"    out = array_code({_whole(used)})",
@@ -58,7 +45,7 @@ def array_vector_function(name: str, function: VectorFunction) -> CompiledFuncti
         "except Exception:",  # a singular matrix, say
         f"    return {', '.join(failed)}",
     ]
-    return _build(name, function.arguments, body, array_code=compiled)
+    return _build(name, arguments, body, array_code=compiled)
 
 
 def array_member_function(name: str, graph: Graph, target: str) -> EntryPoint:

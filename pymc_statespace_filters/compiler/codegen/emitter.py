@@ -19,7 +19,7 @@ from pytensor.scalar.math import Log1mexp, Sigmoid, Softplus
 
 from ...errors import LoweringError
 from ..native.entry_point import F64_PTR, EntryPoint
-from ..numerics import exponential, hyperbolic, trigonometric
+from ..numerics import exponential, trigonometric
 from ..numerics.quantiles.binomial import bernoulli_quantile, binomial_quantile
 from ..numerics.quantiles.gamma import gamma_quantile
 from ..numerics.quantiles.normal import normal_probability
@@ -40,8 +40,8 @@ INLINED = {
     function.py_func.__name__: function
     for function in (
         exponential.exp, exponential.exp2, exponential.expm1, exponential.log, exponential.log2,
-        exponential.log10, exponential.log1p, exponential.power, hyperbolic.sinh, hyperbolic.cosh,
-        hyperbolic.tanh, trigonometric.sin, trigonometric.cos, trigonometric.tan,
+        exponential.log10, exponential.log1p, exponential.power, exponential.sinh, exponential.cosh,
+        exponential.tanh, trigonometric.sin, trigonometric.cos, trigonometric.tan,
         trigonometric.arctan, trigonometric.arctan2, trigonometric.floor_divide,
         trigonometric.modulo, normal_probability,
     )

@@ -2,17 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
-from numba import types
 from pytensor.graph.basic import Variable
 
-from ..native.cache_key import FAST_MATH
-from ..native.entry_point import F64_PTR, EntryPoint, address_of, arguments_class, call_address
-from ..native.jit import linked
+from ..native.entry_point import EntryPoint, address_of, call_address
+from ..native.jit import FAST_MATH, linked, njit_generated
+from .arguments import MEMBER_ARGUMENTS
 
 # Inputs that differ between the members of an ensemble.
 MEMBER_INPUTS = frozenset({"x", "z"})
@@ -30,18 +28,6 @@ class CompiledFunction[F]:
     key: str | None = None
     large: bool = False
 
-
-MEMBER_ARGUMENTS = {
-    "c": F64_PTR, "inputs": F64_PTR, "k": types.intp, "t": types.float64, "z": F64_PTR,
-    "width": types.intp, "X": F64_PTR, "out": F64_PTR, "n_members": types.intp,
-}  # fmt: skip
-"""Arguments of a function of all members. ``z`` holds normals in rows of ``width``, or one
-vector for all members: an observation or noise. ``out`` may hold gains, which are read."""
-
-MemberArguments = arguments_class("MemberArguments", MEMBER_ARGUMENTS, __name__)
-
-PARAMETER_ARGUMENTS = {"theta": F64_PTR, "n_theta": types.intp, "out": F64_PTR}
-"""Arguments of a function of parameters."""
 
 _PLACES = {"Z": "z", "d": "z", "noise": "z", "D": "out", "M": "out", "gains": "out"}
 
@@ -115,15 +101,6 @@ class Graph:
     outputs: Sequence[Variable]
 
 
-@dataclass(frozen=True)
-class VectorFunction:
-    """The graph and arguments of a vector function; ``scalar[i]`` if output i is one number."""
-
-    arguments: str
-    graph: Graph
-    scalar: Sequence[bool] = (False,)
-
-
 def function_of(
     name: str,
     arguments: str,
@@ -141,9 +118,5 @@ def function_of(
 def jit(function: Any, large: bool = False) -> Any:
     """Compile with the flags of all generated code."""
     # A large function has one caller, into which it is inlined; alone, it would be optimised twice.
-    decorator = (
-        partial(linked, forceinline=True)
-        if large
-        else partial(numba.njit, nogil=True, error_model="numpy")
-    )
-    return decorator(fastmath=FAST_MATH)(function)
+    decorator = linked(forceinline=True, fastmath=FAST_MATH) if large else njit_generated
+    return decorator(function)

@@ -8,7 +8,7 @@ PyTensor's array code otherwise; both forms have the same interface.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,14 @@ from numba import types
 from numba.core import cgutils
 from numba.core.typing import signature
 from numba.extending import intrinsic
-from numba.np.arrayobj import load_item, make_array, store_item
+from numba.np.arrayobj import load_item, make_array
 from pytensor.graph.basic import Variable
 
 from ..native.cache_key import key_of
 from .array_fallback import array_member_function, array_vector_function
 from .emitter import Emitter, n_operations
 from .expressions import Arena, Value
-from .function_types import CompiledFunction, Graph, MemberFunction, VectorFunction, function_of
+from .function_types import CompiledFunction, Graph, MemberFunction, function_of
 from .machine_code import DOUBLE, POINTER, Code, Module, constant
 from .members import member_entry_point
 from .scalarize import NotUnrollableError, unroll
@@ -86,18 +86,27 @@ def member_function(
     return MemberFunction(entry, arguments)
 
 
-def vector_functions(functions: Mapping[str, VectorFunction]) -> dict[str, CompiledFunction]:
-    """Functions that pass vectors to each other: all written out in scalars, or all on arrays.
+def vector_function(name: str, arguments: str, graph: Graph) -> CompiledFunction:
+    """A function of these arguments that returns vectors, to be read by index.
 
-    In scalars a vector is a tuple of numbers, otherwise an array; both are read by index.
+    In scalars a vector is a tuple of numbers, otherwise an array.
     """
     try:
-        written = {name: unrolled(f.graph) for name, f in functions.items()}
+        values = unrolled(graph)
     except NotUnrollableError as reason:
-        log_choice(", ".join(functions), reason)
-        return {name: array_vector_function(name, f) for name, f in functions.items()}
-    log_choice(", ".join(functions))
-    return {name: _scalar_vector_function(name, f, written[name]) for name, f in functions.items()}
+        log_choice(name, reason)
+        return array_vector_function(name, arguments, graph)
+    log_choice(name)
+    flat = [v for group in values for v in group]
+    code, used = vector_code(flat)
+    for entry in code.needs:
+        entry.compile()  # now: machine code of the caller may come from disk
+    places = [_place(graph, element) for element in used]
+    sizes = [len(group) for group in values]
+    scope = {"evaluate": _inserted(arguments, code, places, sizes)}
+    large = n_operations(flat) > LARGE or len(flat) > LARGE_TUPLE
+    compiled, source = function_of(name, arguments, [f"return evaluate({arguments})"], scope, large)
+    return CompiledFunction(compiled, key_of(__name__, f"{source}{places}{sizes}", code.key), large)
 
 
 def log_choice(names: str, reason: Exception | None = None) -> None:
@@ -106,21 +115,6 @@ def log_choice(names: str, reason: Exception | None = None) -> None:
         _LOG.debug("%s: written out in scalars", names)
     else:
         _LOG.debug("%s: array code, because of %s", names, reason)
-
-
-def _scalar_vector_function(name: str, function: VectorFunction, values: list) -> CompiledFunction:
-    flat = [v for group in values for v in group]
-    code, used = vector_code(flat)
-    for entry in code.needs:
-        entry.compile()  # now: machine code of the caller may come from disk
-    places = [_place(function.graph, element) for element in used]
-    sizes = [None if one else len(v) for v, one in zip(values, function.scalar, strict=True)]
-    arguments = function.arguments
-    scope = {"evaluate": _inserted(arguments, code, places, sizes)}
-    large = n_operations(flat) > LARGE or len(flat) > LARGE_TUPLE
-    body = [f"return evaluate({arguments})"]
-    compiled, source = function_of(name, arguments, body, scope, large)
-    return CompiledFunction(compiled, key_of(__name__, f"{source}{places}{sizes}", code.key), large)
 
 
 def vector_code(values: Sequence[Value]) -> tuple[Code, list[str]]:
@@ -152,32 +146,35 @@ def _place(graph: Graph, element: str) -> tuple:
 
 
 def _inserted(
-    arguments: str, code: Code, places: Sequence[tuple], sizes: Sequence[int | None]
+    arguments: str, code: Code, places: Sequence[tuple], sizes: Sequence[int]
 ) -> Callable:
     """The function of these arguments, in compiled code, that calls ``main``.
 
-    Its results are vectors of these sizes, or single numbers.
+    Its results are vectors of these sizes. Its code is inserted into that of its callers.
     """
-    kinds = [types.float64 if n is None else types.UniTuple(types.float64, n) for n in sizes]
+    kinds = [types.UniTuple(types.float64, n) for n in sizes]
     returned = kinds[0] if len(kinds) == 1 else types.Tuple(kinds)
-    total = sum(1 if n is None else n for n in sizes)
+    names = [argument.strip() for argument in arguments.split(",")]
 
-    def generate(frame: "_Frame") -> Any:
-        builder = frame.builder
-        given, out = (_room(builder, n) for n in (len(places), total))
-        for i, (name, *indices) in enumerate(places):
-            builder.store(frame.read(name, *indices), builder.gep(given, [constant(i)]))
-        code.call(frame.context, builder, [given, out])
-        numbers = iter([builder.load(builder.gep(out, [constant(i)])) for i in range(total)])
-        made = [
-            next(numbers)
-            if n is None
-            else frame.context.make_tuple(builder, kind, [next(numbers) for _ in range(n)])
-            for n, kind in zip(sizes, kinds, strict=True)
-        ]
-        return made[0] if len(made) == 1 else frame.context.make_tuple(builder, returned, made)
+    def typed(given_kinds: tuple) -> tuple:
+        def insert(context: Any, builder: Any, _: Any, values: Sequence) -> Any:
+            frame = _Frame(context, builder, names, given_kinds, values)
+            given, out = (_room(builder, n) for n in (len(places), sum(sizes)))
+            for i, (name, *indices) in enumerate(places):
+                builder.store(frame.read(name, *indices), builder.gep(given, [constant(i)]))
+            code.call(context, builder, [given, out])
+            loaded = (builder.load(builder.gep(out, [constant(i)])) for i in range(sum(sizes)))
+            made = [
+                context.make_tuple(builder, kind, [next(loaded) for _ in range(n)])
+                for n, kind in zip(sizes, kinds, strict=True)
+            ]
+            return made[0] if len(made) == 1 else context.make_tuple(builder, returned, made)
 
-    return _intrinsic(arguments, returned, generate)
+        return signature(returned, *given_kinds), insert
+
+    scope = {"typed": typed}
+    exec(f"def code(typing, {arguments}): return typed(({arguments},))", scope)
+    return intrinsic(scope["code"])
 
 
 def _room(builder: ir.IRBuilder, n: int) -> ir.Value:
@@ -187,67 +184,26 @@ def _room(builder: ir.IRBuilder, n: int) -> ir.Value:
 class _Frame:
     """The arguments of an intrinsic where it is inserted, by their names."""
 
-    def __init__(self, context: Any, builder: ir.IRBuilder, kinds: Mapping, values: Mapping):
-        self.context, self.builder, self._kinds, self._values = context, builder, kinds, values
+    def __init__(
+        self, context: Any, builder: Any, names: Sequence[str], kinds: Sequence, values: Sequence
+    ) -> None:
+        self._context, self._builder = context, builder
+        self._kinds = dict(zip(names, kinds, strict=True))
+        self._values = dict(zip(names, values, strict=True))
         self._arrays: dict[str, Any] = {}
 
     def read(self, name: str, *indices: int | str) -> ir.Value:
         """A number: an argument, or an element of one."""
-        kind, value = self._kinds[name], self._values[name]
+        context, build, kind = self._context, self._builder, self._kinds[name]
+        value = self._values[name]
         if not indices:
-            return self.context.cast(self.builder, value, kind, types.float64)
+            return context.cast(build, value, kind, types.float64)
         if isinstance(kind, types.BaseTuple):
-            element = self.builder.extract_value(value, indices[0])
-            return self.context.cast(self.builder, element, kind[indices[0]], types.float64)
-        place = self._address(name, indices)
-        return load_item(self.context, self.builder, kind, place)
-
-    def write(self, value: ir.Value, name: str, *indices: int | str) -> None:
-        """Set an element of an array."""
-        place = self._address(name, indices)
-        store_item(self.context, self.builder, self._kinds[name], value, place)
-
-    def _address(self, name: str, indices: Sequence[int | str]) -> ir.Value:
-        kind = self._kinds[name]
+            element = build.extract_value(value, indices[0])
+            return context.cast(build, element, kind[indices[0]], types.float64)
         if name not in self._arrays:
-            self._arrays[name] = make_array(kind)(self.context, self.builder, self._values[name])
+            self._arrays[name] = make_array(kind)(context, build, value)
         at = [self._values[i] if isinstance(i, str) else constant(i) for i in indices]
         array = self._arrays[name]
-        return cgutils.get_item_pointer(
-            self.context, self.builder, kind, array, at, wraparound=False
-        )
-
-
-def _intrinsic(arguments: str, returned: Any, generate: Callable[[_Frame], Any]) -> Callable:
-    """A function of these arguments whose code is inserted into that of its callers."""
-    names = [argument.strip() for argument in arguments.split(",")]
-
-    def typed(kinds: tuple) -> tuple:
-        by_name = dict(zip(names, kinds, strict=True))
-
-        def insert(context: Any, builder: Any, _: Any, values: Sequence) -> Any:
-            given = dict(zip(names, values, strict=True))
-            result = generate(_Frame(context, builder, by_name, given))
-            return context.get_dummy_value() if result is None else result
-
-        return signature(returned, *kinds), insert
-
-    scope = {"typed": typed}
-    exec(f"def code(typing, {arguments}): return typed(({arguments},))", scope)
-    return intrinsic(scope["code"])
-
-
-def copy_elements(arguments: str, target: str, source: str, size: int) -> Any:
-    """``copy(arguments)`` sets ``target``, a place for element i, to the elements of a vector.
-
-    A tuple that is indexed in a loop compiles to a branch for each of its elements.
-    """
-    name, _, place = target.rstrip("]").partition("[")
-    *before, last = (part.strip() for part in place.split(","))
-    first = sum(int(part) for part in last.replace("{i}", "0").split("+"))
-
-    def generate(frame: _Frame) -> None:
-        for i in range(size):
-            frame.write(frame.read(source, i), name, *before, first + i)
-
-    return _intrinsic(arguments, types.void, generate)
+        place = cgutils.get_item_pointer(context, build, kind, array, at, wraparound=False)
+        return load_item(context, build, kind, place)

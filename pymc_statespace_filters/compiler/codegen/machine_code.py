@@ -24,7 +24,7 @@ from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 from ...parallel.signals import held_interrupts
 from ...progress import slow_compilation
 from ..native.cache_key import key_of
-from ..native.entry_point import EntryPoint
+from ..native.entry_point import F64_PTR, I64_PTR, EntryPoint
 
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 POINTER = DOUBLE.as_pointer()
@@ -35,7 +35,10 @@ def constant(number: int) -> ir.Constant:
     return ir.Constant(INT, number)
 
 
-_LLVM_TYPES = {types.float64: DOUBLE, types.int64: INT, types.intp: INT}
+_LLVM_TYPES = {
+    types.float64: DOUBLE, types.int64: INT, types.intp: INT, F64_PTR: POINTER,
+    I64_PTR: INT.as_pointer(),
+}  # fmt: skip
 
 
 class Module:
@@ -49,6 +52,12 @@ class Module:
     def function(self, name: str, arguments: Sequence[Any]) -> ir.Function:
         """Begin a function without result."""
         return ir.Function(self._ir, ir.FunctionType(ir.VoidType(), arguments), name)
+
+    def main(self, arguments: Mapping[str, Any]) -> tuple[ir.IRBuilder, dict[str, ir.Value]]:
+        """Begin the function of these arguments that the module is for, and name its values."""
+        function = self.function("main", [_LLVM_TYPES[kind] for kind in arguments.values()])
+        given = dict(zip(arguments, function.args, strict=True))
+        return ir.IRBuilder(function.append_basic_block()), given
 
     def declared(self, name: str, arguments: Sequence[Any], result: Any) -> ir.Function:
         """A function that is defined elsewhere."""

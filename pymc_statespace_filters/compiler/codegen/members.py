@@ -21,10 +21,11 @@ from ..native.entry_point import F64_PTR, EntryPoint
 from ..numerics.quantiles.binomial import binomial_block
 from ..numerics.quantiles.gamma import gamma_block
 from ..numerics.quantiles.poisson import poisson_block
+from .arguments import MEMBER_ARGUMENTS
 from .emitter import Emitter, depends_on
 from .expressions import FLOAT, Expression, Value
-from .function_types import MEMBER_ARGUMENTS, MEMBER_INPUTS, Graph
-from .machine_code import DOUBLE, INT, POINTER, Module, ModuleEntryPoint, constant
+from .function_types import MEMBER_INPUTS, Graph
+from .machine_code import DOUBLE, INT, Module, ModuleEntryPoint, constant
 
 BLOCK = 64
 
@@ -39,8 +40,6 @@ BLOCKS = {
     "gamma_quantile": gamma_block,
 }
 """Functions with branches for a block of members: of rows of a buffer."""
-
-LLVM_TYPES = {F64_PTR: POINTER, types.intp: INT, types.float64: DOUBLE}
 
 
 def is_block(value: Value) -> bool:
@@ -81,9 +80,7 @@ class _Members:
         self, module: Module, graph: Graph, values: Sequence[Value], target: str, *, vector: bool
     ) -> None:
         self.module, self.values, self._target = module, values, target
-        main = module.function("main", [LLVM_TYPES[kind] for kind in MEMBER_ARGUMENTS.values()])
-        self.arguments = dict(zip(MEMBER_ARGUMENTS, main.args, strict=True))
-        self.builder = ir.IRBuilder(main.append_basic_block())
+        self.builder, self.arguments = module.main(MEMBER_ARGUMENTS)
         inputs = graph.inputs.get("u")
         self._n_inputs = 0 if inputs is None else inputs.type.shape[0]
         written = [f"{target}.{i}" for i in range(len(values))]

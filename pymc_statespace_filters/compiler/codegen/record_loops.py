@@ -4,43 +4,18 @@ Every step waits for the one before, so that a loop that passes the state throug
 function for every row, takes up to four times as long.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from llvmlite import ir
-from numba import types
 
-from ..native.entry_point import F64_PTR, I64_PTR, arguments_class
+from ..native.entry_point import F64_PTR
+from .arguments import ALONG_ARGUMENTS
 from .emitter import Emitter
-from .expressions import Value
-from .machine_code import BOOL, DOUBLE, INT, POINTER, Code, Module, constant
+from .machine_code import BOOL, DOUBLE, Code, Module, constant
+from .simd import Written
 
-ALONG_ARGUMENTS = {
-    "W": F64_PTR, "steps": I64_PTR, "row_width": types.intp, "n_rows": types.intp,
-    "first": types.intp, "observed": F64_PTR, "inputs": F64_PTR, "noises": F64_PTR,
-    "states": F64_PTR, "stride": types.intp, "t0": types.float64, "dt": types.float64,
-    "terms": F64_PTR,
-}  # fmt: skip
-"""The step of row j is ``steps[j * row_width]``, and ``first`` that of the state at the start of a
-forward pass; a way back ends at step 0. Successive states are ``stride`` numbers apart on
-the tape ``states``, or on one place if this is 0."""
-
-AlongArguments = arguments_class("AlongArguments", ALONG_ARGUMENTS, __name__)
-
-_LLVM_TYPES = {
-    F64_PTR: POINTER, I64_PTR: INT.as_pointer(), types.intp: INT, types.float64: DOUBLE
-}  # fmt: skip
 _ADDRESSES = [name for name, kind in ALONG_ARGUMENTS.items() if kind is F64_PTR]
-
-
-class Part(NamedTuple):
-    """What a step or a row computes, and the rows of ``W`` that have parts of it.
-
-    The values are those of what is carried along the record, then the term of an update.
-    """
-
-    values: Sequence[Value]
-    known: Mapping[Value, int]
 
 
 class Sizes(NamedTuple):
@@ -53,18 +28,19 @@ class Sizes(NamedTuple):
     result: int
 
 
-def forward_loop(step: Part, row: Part, carried: Sequence[str], sizes: Sizes) -> Code:
+def forward_loop(step: Written, row: Written, carried: Sequence[str], sizes: Sizes) -> Code:
     """The code of `ALONG_ARGUMENTS`: from the state at ``states`` on, write terms and states.
 
     It writes the state before each step and each row, and the last one. The result is the number of
     rows before the first without a finite state and term. ``carried`` are the names of elements.
+    The values of a step are theirs; behind those of a row is the term of an update.
     """
     builder = _Builder(step, row, carried, sizes)
     builder.forward()
     return builder.module.finished()
 
 
-def backward_loop(step: Part, row: Part, carried: Sequence[str], sizes: Sizes) -> Code:
+def backward_loop(step: Written, row: Written, carried: Sequence[str], sizes: Sizes) -> Code:
     """The same, from the end of a tape back, for the cotangents ``terms``.
 
     What is carried is zero at first, and is the result.
@@ -77,12 +53,10 @@ def backward_loop(step: Part, row: Part, carried: Sequence[str], sizes: Sizes) -
 class _Builder:
     """Builds the loops."""
 
-    def __init__(self, step: Part, row: Part, carried: Sequence[str], sizes: Sizes) -> None:
+    def __init__(self, step: Written, row: Written, carried: Sequence[str], sizes: Sizes) -> None:
         self.module, self._step, self._row, self._sizes = Module(), step, row, sizes
         self._carried = {name: i for i, name in enumerate(carried)}
-        main = self.module.function("main", [_LLVM_TYPES[k] for k in ALONG_ARGUMENTS.values()])
-        self._given = dict(zip(ALONG_ARGUMENTS, main.args, strict=True))
-        self._build = ir.IRBuilder(main.append_basic_block())
+        self._build, self._given = self.module.main(ALONG_ARGUMENTS)
         self._distinct = self.module.distinct(_ADDRESSES)
 
     def forward(self) -> None:
@@ -232,7 +206,7 @@ class _Builder:
             phi.add_incoming(value, block)
 
     def _emit(
-        self, part: Part, carried: Sequence[ir.Value], k: ir.Value, place: ir.Value, j: Any
+        self, part: Written, carried: Sequence[ir.Value], k: ir.Value, place: ir.Value, j: Any
     ) -> list[ir.Value]:
         """Emit a step or a row, with the state at a place of the tape."""
         build, given, sizes = self._build, self._given, self._sizes

@@ -11,29 +11,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from llvmlite import ir
-from numba import types
 from numba.core import cgutils
+from pytensor.graph.basic import Variable
 
-from ..native.entry_point import F64_PTR, EntryPoint, arguments_class
+from ..native.entry_point import EntryPoint
+from .arguments import LANE_ARGUMENTS, LANES
 from .emitter import Emitter, depends_on
 from .expressions import FLOAT, Expression, Value, in_order
 from .function_types import Graph
 from .functions import unrolled
 from .machine_code import Module, ModuleEntryPoint, constant
-from .members import LLVM_TYPES, sorted_by_number
+from .members import sorted_by_number
 
-LANES = 32  # at most
-LANES_AT_ONCE = 8  # the number of lanes is a multiple of this
-
-LANE_ARGUMENTS = {
-    "W": F64_PTR, "n_lanes": types.intp, "states": F64_PTR, "forces": F64_PTR, "t0": types.float64,
-    "dt": types.float64, "k": types.intp, "n_steps": types.intp,
-}  # fmt: skip
-"""Of a function of the steps k to k + n_steps - 1, whose states and inputs come first."""
-
-LaneArguments = arguments_class("LaneArguments", LANE_ARGUMENTS, __name__)
-
-PARAMETERS, STATE, INPUTS, TIME = "theta", "s", "u", "t"
+PARAMETERS, STATE, INPUTS, TIME, NOISE = "theta", "s", "u", "t", "z"
 
 
 class LaneFunction(NamedTuple):
@@ -49,66 +39,106 @@ class LaneFunction(NamedTuple):
     backwards: bool = False
 
 
-class LaneFunctions(NamedTuple):
-    """Entry points with `LANE_ARGUMENTS`, and the number of rows of ``W``."""
+class Places(NamedTuple):
+    """The first row in ``W`` of each vector, the first free row, and lengths of other vectors.
 
-    entries: Mapping[str, EntryPoint]
+    To a step belong its inputs and, behind them, its noises.
+    """
+
+    rows: Mapping[str, int]
     n_rows: int
+    state_size: int
+    n_inputs: int
+    n_observables: int
+    n_noises: int = 0
+
+    def of(self, name: str) -> tuple[str, int]:
+        """The array that a function of one step reads a vector from, and its first element."""
+        of_step = {STATE: ("states", 0), INPUTS: ("forces", 0), NOISE: ("forces", self.n_inputs)}
+        return of_step.get(name) or ("W", self.rows[name])
+
+
+class Written(NamedTuple):
+    """A function written out: values, their targets, and the rows of what is read of ``W``."""
+
+    values: Sequence[Value]
+    targets: Sequence[tuple[str, int]]
+    known: Mapping[Value, int]
 
 
 def lane_functions(
-    functions: Mapping[str, LaneFunction],
-    rows: Mapping[str, int],
-    n_rows: int,
-    state_size: int,
-    n_inputs: int,
-) -> LaneFunctions:
-    """Write functions out for lanes; raises NotUnrollableError where there is no scalar form.
+    functions: Mapping[str, LaneFunction], places: Places
+) -> tuple[dict[str, EntryPoint], int]:
+    """Entry points with `LANE_ARGUMENTS`, and the number of rows of ``W``.
 
-    ``rows`` has the first row in ``W`` of each vector, and ``n_rows`` is the first that is free.
     The first function is to be called whenever parameters are written to their rows: it also
-    computes what the others need of parameters alone.
+    computes what the others need of parameters alone. Raises NotUnrollableError where there is no
+    scalar form.
     """
-    first, *others = functions
     values = {
         name: [v for group in unrolled(function.graph) for v in group]
         for name, function in functions.items()
     }
-    known: dict[str, dict[Value, int]] = {first: {}}
-    for name in others:
-        constants = constants_of(values[name], functions[name].graph)
-        known[name] = {v: n_rows + i for i, v in enumerate(constants)}
-        n_rows += len(constants)
-    entries = {}
+    written, n_rows = written_out(functions, values, places)
+    entries: dict[str, EntryPoint] = {}
     for name, function in functions.items():
-        results, targets = values[name], _targets(function, rows, state_size)
-        if name == first:
-            for other in others:
-                results = [*results, *known[other]]
-                targets = [*targets, *(("W", row) for row in known[other].values())]
-        code = _Lanes(rows, state_size, n_inputs)
-        code.emit(results, targets, known[name], backwards=function.backwards)
+        code = _Lanes(places)
+        code.emit(written[name], backwards=function.backwards)
         entries[name] = ModuleEntryPoint(code.module.finished(), LANE_ARGUMENTS, name)
-    return LaneFunctions(entries, n_rows)
+    return entries, n_rows
+
+
+def written_out(
+    functions: Mapping[str, LaneFunction],
+    values: Mapping[str, Sequence[Value]],
+    places: Places,
+    *,
+    shares: bool = True,
+) -> tuple[dict[str, Written], int]:
+    """What each function computes, the first also for the others, and the number of rows.
+
+    Unless it ``shares``, each computes alone what depends on parameters alone.
+    """
+    first, *others = functions
+    known: dict[str, dict[Value, int]] = {name: {} for name in functions}
+    n_rows = places.n_rows
+    for name in others if shares else []:
+        for value in constants_of(values[name], functions[name].graph):
+            known[name][value] = n_rows
+            n_rows += 1
+    shared = [item for name in others for item in known[name].items()]
+    written = {}
+    for name, function in functions.items():
+        more = shared if name == first else []
+        targets = [*_targets(function, places), *(("W", row) for _, row in more)]
+        results = [*values[name], *(value for value, _ in more)]
+        written[name] = Written(results, targets, known[name])
+    return written, n_rows
+
+
+def length_of(variable: Variable) -> int:
+    """The length of a vector, 1 for a number."""
+    return variable.type.shape[0] if variable.type.ndim else 1
+
+
+def sizes_of(function: LaneFunction) -> list[tuple[str, int]]:
+    """Names and lengths of the outputs."""
+    outputs = function.graph.outputs
+    return [(name, length_of(v)) for name, v in zip(function.targets, outputs, strict=True)]
+
+
+def _targets(function: LaneFunction, places: Places) -> list[tuple[str, int]]:
+    """The array and the element or row that each element of the outputs is written to."""
+    found = []
+    for name, length in sizes_of(function):
+        array, first = places.of(name)
+        first += places.state_size if name == STATE else 0  # the next state
+        found += [(array, first + i) for i in range(length)]
+    return found
 
 
 def _elements(graph: Graph) -> set[str]:
-    return {
-        f"{name}.{i}"
-        for name, variable in graph.inputs.items()
-        for i in range(variable.type.shape[0] if variable.type.ndim else 1)
-    }
-
-
-def _targets(
-    function: LaneFunction, rows: Mapping[str, int], state_size: int
-) -> list[tuple[str, int]]:
-    """The array and row that each element of the outputs is written to."""
-    return [
-        ("states", state_size + i) if name == STATE else ("W", rows[name] + i)
-        for name, output in zip(function.targets, function.graph.outputs, strict=True)
-        for i in range(output.type.shape[0])
-    ]
+    return {f"{name}.{i}" for name, v in graph.inputs.items() for i in range(length_of(v))}
 
 
 def constants_of(values: Sequence[Value], graph: Graph) -> list[Expression]:
@@ -125,28 +155,17 @@ def constants_of(values: Sequence[Value], graph: Graph) -> list[Expression]:
 class _Lanes:
     """A function with `LANE_ARGUMENTS` under construction: loops over steps and lanes."""
 
-    def __init__(self, rows: Mapping[str, int], state_size: int, n_inputs: int) -> None:
-        self.module, self._rows = Module(), rows
-        self._sizes = {"W": 0, "states": state_size, "forces": n_inputs}
-        main = self.module.function("main", [LLVM_TYPES[k] for k in LANE_ARGUMENTS.values()])
-        self._arguments = dict(zip(LANE_ARGUMENTS, main.args, strict=True))
-        self._builder = ir.IRBuilder(main.append_basic_block())
+    def __init__(self, places: Places) -> None:
+        self.module, self._rows = Module(), places.rows
+        self._sizes = {"W": 0, "states": places.state_size, "forces": places.n_inputs}
+        self._builder, self._arguments = self.module.main(LANE_ARGUMENTS)
         self._distinct = self.module.distinct(list(self._sizes))
         self._starts: dict[str, ir.Value] = {}
         self._lane = self._time = None
 
-    def emit(
-        self,
-        values: Sequence[Value],
-        targets: Sequence[tuple[str, int]],
-        known: Mapping[Value, int],
-        *,
-        backwards: bool,
-    ) -> None:
-        """Write ``values`` to ``targets``; what is equal in all lanes is computed before.
-
-        The ``known`` are read from their rows of ``W``.
-        """
+    def emit(self, written: Written, *, backwards: bool) -> None:
+        """Write values to their targets; what is equal in all lanes is computed before."""
+        values, targets, known = written
         build, given = self._builder, self._arguments
         emitter = Emitter(self.module, build, self._read, vector=True)
         with cgutils.for_range(build, given["n_steps"]) as loop:

@@ -5,8 +5,8 @@ of many records are, see `simd`, with one lane. Those that cannot be written out
 array code.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -14,37 +14,27 @@ from numba import carray
 
 from ..native.entry_point import EntryPoint
 from ..native.jit import njit_internal
+from .arguments import ALONG_ARGUMENTS, LANE_ARGUMENTS
 from .array_fallback import array_code, used_inputs
 from .emitter import Emitter
 from .expressions import Value
 from .function_types import function_of
 from .functions import log_choice, unrolled
 from .machine_code import Module, ModuleEntryPoint, constant
-from .members import LLVM_TYPES
-from .record_loops import ALONG_ARGUMENTS, Part, Sizes, backward_loop, forward_loop
+from .record_loops import Sizes, backward_loop, forward_loop
 from .scalarize import NotUnrollableError
-from .simd import INPUTS, LANE_ARGUMENTS, STATE, TIME, LaneFunction, constants_of
-
-NOISE = "z"
-
-
-class Places(NamedTuple):
-    """The first row in ``W`` of each vector, the first free row, and lengths of other vectors.
-
-    To a step belong its inputs and, behind them, its noises.
-    """
-
-    rows: Mapping[str, int]
-    n_rows: int
-    state_size: int
-    n_inputs: int
-    n_observables: int
-    n_noises: int = 0
-
-    def of(self, name: str) -> tuple[str, int]:
-        """The array that a function of one step reads a vector from, and its first element."""
-        of_step = {STATE: ("states", 0), INPUTS: ("forces", 0), NOISE: ("forces", self.n_inputs)}
-        return of_step.get(name) or ("W", self.rows[name])
+from .simd import (
+    INPUTS,
+    NOISE,
+    STATE,
+    TIME,
+    LaneFunction,
+    Places,
+    Written,
+    length_of,
+    sizes_of,
+    written_out,
+)
 
 
 def step_functions(
@@ -56,38 +46,29 @@ def step_functions(
     others need of parameters alone, see `simd`. ``along`` names the functions of a step and of a
     row, and the entry point with `ALONG_ARGUMENTS` that takes their place.
     """
-    first, *others = functions
-    written = {name: _unrolled(name, function) for name, function in functions.items()}
-    known: dict[str, dict[Value, int]] = {name: {} for name in functions}
-    n_rows = places.n_rows
-    if written[first] is not None:
-        for name in others:
-            for value in constants_of(written[name] or [], functions[name].graph):
-                known[name][value] = n_rows
-                n_rows += 1
+    values = {name: _unrolled(name, function) for name, function in functions.items()}
+    first = next(iter(functions))
+    in_scalars = {name: v or [] for name, v in values.items()}
+    # Array code computes nothing for others.
+    shares = values[first] is not None
+    written, n_rows = written_out(functions, in_scalars, places, shares=shares)
     entries: dict[str, EntryPoint] = {}
     *pair, name_along = along
     for name, function in functions.items():
-        values = written[name]
         if name in pair:
             continue
-        if values is None:
+        if values[name] is None:
             entries[name] = _on_arrays(name, function, places)
-            continue
-        targets = _targets(function, places)
-        if name == first:
-            for other in others:
-                values = [*values, *known[other]]
-                targets += [("W", row) for row in known[other].values()]
-        entries[name] = _in_scalars(name, places, values, targets, known[name])
+        else:
+            entries[name] = _in_scalars(name, places, written[name])
     step, row = (functions[name] for name in pair)
-    parts = [Part(written[name] or [], known[name]) for name in pair]
-    if any(written[name] is None for name in pair):
+    if any(values[name] is None for name in pair):
         entries[name_along] = _along_on_arrays(name_along, step, row, places)
     else:
-        carried = [f"{name}.{i}" for name, n in _sizes(step) for i in range(n)]
+        carried = [f"{name}.{i}" for name, n in sizes_of(step) for i in range(n)]
         loop = backward_loop if step.backwards else forward_loop
-        code = loop(parts[0], parts[1], carried, _sizes_along(step, places))
+        sizes = _sizes_along(step, places)
+        code = loop(written[pair[0]], written[pair[1]], carried, sizes)
         entries[name_along] = ModuleEntryPoint(code, ALONG_ARGUMENTS, name_along)
     return entries, n_rows
 
@@ -107,38 +88,10 @@ def _unrolled(name: str, function: LaneFunction) -> list[Value] | None:
     return values
 
 
-def _length(variable: Any) -> int:
-    return variable.type.shape[0] if variable.type.ndim else 1
-
-
-def _sizes(function: LaneFunction) -> list[tuple[str, int]]:
-    """Names and lengths of the outputs."""
-    outputs = function.graph.outputs
-    return [(name, _length(v)) for name, v in zip(function.targets, outputs, strict=True)]
-
-
-def _targets(function: LaneFunction, places: Places) -> list[tuple[str, int]]:
-    """The array and the element of it that each output is written to."""
-    found = []
-    for name, length in _sizes(function):
-        array, first = places.of(name)
-        first += places.state_size if name == STATE else 0  # the next state
-        found += [(array, first + i) for i in range(length)]
-    return found
-
-
-def _in_scalars(
-    name: str,
-    places: Places,
-    values: Sequence[Value],
-    targets: Sequence[tuple[str, int]],
-    known: Mapping[Value, int],
-) -> EntryPoint:
+def _in_scalars(name: str, places: Places, written: Written) -> EntryPoint:
     """A function of one step, written out in scalars."""
     module = Module()
-    main = module.function("main", [LLVM_TYPES[kind] for kind in LANE_ARGUMENTS.values()])
-    given = dict(zip(LANE_ARGUMENTS, main.args, strict=True))
-    build = ir.IRBuilder(main.append_basic_block())
+    build, given = module.main(LANE_ARGUMENTS)
 
     def read(element: str) -> ir.Value:
         vector, _, i = element.partition(".")
@@ -150,9 +103,10 @@ def _in_scalars(
         return build.load(build.gep(given[array], [constant(first + int(i))]))
 
     emitter = Emitter(module, build, read, vector=False)
-    for value, row in known.items():
+    for value, row in written.known.items():
         emitter.set(value, build.load(build.gep(given["W"], [constant(row)])))
-    for (array, i), result in zip(targets, emitter.floats(values), strict=True):
+    results = emitter.floats(written.values)
+    for (array, i), result in zip(written.targets, results, strict=True):
         build.store(result, build.gep(given[array], [constant(i)]))
     build.ret_void()
     return ModuleEntryPoint(module.finished(), LANE_ARGUMENTS, name)
@@ -196,11 +150,11 @@ def _array_step(
     given = []
     for name, variable in used.items():
         array, first = elsewhere.get(name) or places.of(name) if name != TIME else ("", "")
-        value = f"vector_at({array}, {first}, {_length(variable)})"
+        value = f"vector_at({array}, {first}, {length_of(variable)})"
         value = value if variable.type.ndim else f"np.asarray({value}[0])"
         given.append("np.asarray(t)" if name == TIME else value)
     writes, failed = ["    pass"], ["    pass"]
-    for n, (name, length) in enumerate(_sizes(function)):
+    for n, (name, length) in enumerate(sizes_of(function)):
         array, first = elsewhere.get(name) or places.of(name)
         first = f"{first} + {places.state_size}" if name == STATE else first
         writes.append(f"    write({array}, {first}, out[{n}])")
@@ -260,7 +214,7 @@ def _along_on_arrays(
             at = _next(states, at, size, stride)
         W[result] = n_rows
 
-    result, n_bars = _sizes_along(step, places).result, sum(n for _, n in _sizes(step))
+    result, n_bars = _sizes_along(step, places).result, sum(n for _, n in sizes_of(step))
 
     def backward(
         W, steps, row_width, n_rows, first, observed, inputs, noises, states, stride, t0, dt, terms

@@ -11,12 +11,11 @@ from ..codegen.function_types import Graph, MemberFunction, ParameterFunction
 from ..codegen.functions import member_function
 from ..native.entry_point import EntryPoint
 from . import quantiles, structure
-from .constants import extend, lowered, pull_back
-from .covariances import covariances, followed_by_square_roots
-from .expected_observation import expected_observation
-from .gaussian import observation_log_density
+from .constants import covariances, extend, followed_by_square_roots, lowered, pull_back
 from .guidance import guided_noise, linearize_step, n_gains, observation_information
+from .guide_loops import follow, look_back
 from .jumps import jumping_equations
+from .observation import expected_observation, observation_log_density
 from .symbols import call, symbols_of
 
 quantiles.register()
@@ -54,7 +53,7 @@ class CompiledSystem:
       column of X into M (2, N); for one state and additive noise.
 
     Each has an entry point, for machine code, and a ``function`` that Python calls with these
-    arguments. They are what `entry_points.entry_point` gives filters.
+    arguments.
 
     Attributes
     ----------
@@ -111,6 +110,14 @@ class CompiledSystem:
         return None if self._extension is None else pull_back(self._extension).entry
 
     # Functions
+
+    def entry_point(self, name: str) -> EntryPoint:
+        """A function by its name, or a loop over steps that a guide makes; not compiled yet."""
+        if name == "follow":
+            return follow(self)
+        if name in ("look_back", "start_back"):
+            return look_back(self.n, self.n if name == "start_back" else self.m)
+        return getattr(self, name).entry
 
     @cached_property
     def prepare(self) -> ParameterFunction:

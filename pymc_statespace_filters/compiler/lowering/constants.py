@@ -2,10 +2,11 @@
 
 A system whose functions have such parts is lowered to one with a longer vector of parameters: the
 user's, followed by the values of these parts, which its functions read. Whatever is compiled for it
-takes the longer vector, which `extension` makes of the user's.
+takes the longer vector, which `extension` makes of the user's. Covariances and their lower square
+roots are constants too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -13,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
+from numba import carray, types
 from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.op import Op
@@ -24,7 +26,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
 from ..codegen.function_types import ParameterFunction
+from ..native.entry_point import F64_PTR, EntryPoint
+from ..numerics.small_cholesky import covariance_root
 from .staged import ENTRY_POINTS, staged
+from .symbols import call
 
 # Functions that are called at every step; the others, once per evaluation.
 _AT_EVERY_STEP = (
@@ -140,3 +145,41 @@ def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVari
     theta = extension.inputs[0].type("theta")
     (extended,) = extension.bind([theta])
     return theta, extended
+
+
+def covariances(
+    system: StateSpaceModel, merged_noise: FrozenFunctionGraph | None = None
+) -> dict[str, FrozenFunctionGraph]:
+    """Covariances whose square roots colour the noise; an integrator's noise is white."""
+    graphs = dict(vars(system.equations))
+    if not system.has_gaussian_start:
+        graphs["initial_cov"] = None
+    if merged_noise is not None:
+        graphs["process_noise"] = merged_noise
+    names = ("initial_cov", "process_noise", "observation_noise")
+    return {name: graphs[name] for name in names if graphs[name] is not None}
+
+
+def followed_by_square_roots(
+    outputs: Sequence[TensorVariable],
+    system: StateSpaceModel,
+    given: TensorVariable,
+    theta: TensorVariable,
+    graphs: Mapping[str, FrozenFunctionGraph],
+) -> ParameterFunction:
+    """These vectors, then the lower square root of every covariance, as a function of ``given``.
+
+    The parameters theta are a function of it too.
+    """
+    covs = [call(graph, system, {"theta": theta}) for graph in graphs.values()]
+    flat = pt.concatenate([*outputs, *(cov.ravel() for cov in covs)])
+    sizes = [cov.type.shape[0] for cov in covs]
+    return staged("prepare", [given], flat, SQUARE_ROOT, sizes)
+
+
+def _take_root(a, size):
+    covariance_root(carray(a, (size, size)))
+
+
+SQUARE_ROOT = EntryPoint(_take_root, {"a": F64_PTR, "size": types.intp}, "square_root")
+"""`covariance_root` of the matrix at an address, compiled once for all systems."""

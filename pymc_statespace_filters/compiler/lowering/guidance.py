@@ -10,7 +10,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
 from ..codegen.function_types import Graph
-from .gaussian import log_normal, observation_log_density, without_missing
+from .observation import log_normal, observation_log_density, without_missing
 from .symbols import jacobian_of, observation_moments
 
 

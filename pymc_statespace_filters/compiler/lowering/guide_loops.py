@@ -1,37 +1,27 @@
 """Loops of a guide over the steps between two observations, for n states and m noises.
 
 Sizes are constants of the machine code, so that the inner loops are unrolled and small vectors stay
-in registers: a step there and back takes 60 ns, where calls of general code took 370 ns.
+in registers: a step there and back takes 60 ns, where calls of general code took 370 ns. Each loop
+is an entry point, as the functions of a system are.
 """
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numba import carray, types
 
-from ..codegen.function_types import MemberArguments
-from ..native.entry_point import F64_PTR, arguments_class, call_address
+from ..codegen.arguments import FOLLOW_ARGUMENTS, LOOK_BACK_ARGUMENTS, MemberArguments
+from ..codegen.functions import vector_function
+from ..codegen.machine_code import INT, Module, ModuleEntryPoint
+from ..native.entry_point import EntryPoint, call_address
 from ..native.jit import inline_always
-from .guidance import n_gains, step_size
-
-FOLLOW_ARGUMENTS = {
-    "c": F64_PTR, "inputs": F64_PTR, "first": types.intp, "last": types.intp, "t0": types.float64,
-    "dt": types.float64, "path": F64_PTR, "gains": F64_PTR, "steps": F64_PTR, "cov": F64_PTR,
-}  # fmt: skip
+from .guidance import n_gains, smoothed_cov, step_back, step_size
 
 # Of the loop, which is told what it calls at every step.
 LOOP_ARGUMENTS = {**FOLLOW_ARGUMENTS, "linearize": types.intp}
-
-FollowArguments = arguments_class("FollowArguments", FOLLOW_ARGUMENTS, __name__)
-
-LOOK_BACK_ARGUMENTS = {
-    "first": types.intp, "last": types.intp, "path": F64_PTR, "steps": F64_PTR, "gains": F64_PTR,
-    "psi": F64_PTR, "misfit": F64_PTR,
-}  # fmt: skip
-
-LookBackArguments = arguments_class("LookBackArguments", LOOK_BACK_ARGUMENTS, __name__)
 
 
 def follow_loop(smooth: Any, n: int, m: int) -> Callable:
@@ -178,3 +168,29 @@ def look_back_loop(step_back: Any, n: int, m: int) -> Callable:
                     place += m - r
 
     return look_back
+
+
+@lru_cache(maxsize=256)
+def follow(system: Any) -> EntryPoint:
+    """The loop of a guide that linearises the steps of a system."""
+    module = Module()
+    builder, given = module.main(FOLLOW_ARGUMENTS)
+    linearize = builder.ptrtoint(module.entry(system.linearized_step.entry), INT)
+    module.call(builder, _follow_loop(system.n, system.m), [*given.values(), linearize])
+    builder.ret_void()
+    return ModuleEntryPoint(module.finished(), FOLLOW_ARGUMENTS, "follow")
+
+
+@lru_cache
+def _follow_loop(n: int, m: int) -> EntryPoint:
+    smooth = vector_function("smoothed_cov", "step, gains, cov", smoothed_cov(n, m))
+    loop = follow_loop(smooth.function, n, m)
+    return EntryPoint(loop, LOOP_ARGUMENTS, "follow", (repr((n, m)), smooth.key))
+
+
+@lru_cache
+def look_back(n: int, m: int) -> EntryPoint:
+    """The loop of a guide that goes back; none of its arithmetic is the system's."""
+    back = vector_function("step_back", "step, path, psi", step_back(n, m))
+    loop = look_back_loop(back.function, n, m)
+    return EntryPoint(loop, LOOK_BACK_ARGUMENTS, "look_back", (repr((n, m)), back.key))

@@ -17,9 +17,10 @@ from pytensor.graph.traversal import io_toposort
 from pytensor.tensor.variable import TensorVariable
 
 from ...system.linear_step import LinearStep, LinearStepBack, make_functions
+from ..codegen.arguments import PARAMETER_ARGUMENTS
 from ..codegen.array_fallback import array_code
 from ..codegen.emitter import Emitter
-from ..codegen.function_types import PARAMETER_ARGUMENTS, Graph, ParameterFunction, jit
+from ..codegen.function_types import Graph, ParameterFunction, jit
 from ..codegen.functions import unrolled
 from ..codegen.machine_code import DOUBLE, INT, POINTER, Module, ModuleEntryPoint, constant
 from ..codegen.scalarize import NotUnrollableError

@@ -28,8 +28,9 @@ from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
 from ...parallel.signals import held_interrupts
 from ...progress import slow_compilation
-from .cache_key import FAST_MATH, key_of
+from .cache_key import key_of
 from .code_library import InternalLinkageCompiler, with_internal_linkage
+from .jit import FAST_MATH
 
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)

@@ -14,6 +14,11 @@ from numba import njit
 
 from .code_library import LinkedCompiler
 
+# No "nnan" or "ninf": filters detect failures by NaN and infinity. No "reassoc": with "nsz" it
+# folds x - x to 0 for every x, and numba's isfinite, which uses x - x, would always be true.
+FAST_MATH = {"contract", "nsz", "arcp"}
+"""The flags of generated code."""
+
 linked = partial(
     njit,
     error_model="numpy",
@@ -29,6 +34,9 @@ njit_internal = linked(fastmath={"contract"})
 
 njit_callable = njit(error_model="numpy", nogil=True, fastmath={"contract"})
 """For a function that Python calls, too."""
+
+njit_generated = njit(error_model="numpy", nogil=True, fastmath=FAST_MATH)
+"""For a function with the flags of generated code."""
 
 njit_reassoc = linked(fastmath={"contract", "reassoc"})
 """For sums over members, which may be reordered in order to vectorise."""

@@ -1,7 +1,7 @@
 """Machine instructions that numba does not expose, and the compilation of functions built on them.
 
 Such functions have neither branches nor calls, so that loops around them vectorise. None of them
-uses fast-math flags: the caller's flags (`cache_key.FAST_MATH`) do not apply inside an inlined
+uses fast-math flags: the caller's flags (`jit.FAST_MATH`) do not apply inside an inlined
 function, so error-free transformations are computed as written, and a result does not depend on
 whether the loop around it was vectorised.
 """

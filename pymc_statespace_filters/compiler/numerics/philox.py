@@ -4,12 +4,15 @@ The generator is Philox4x32-7 (Salmon et al. 2011, "Parallel random numbers: as 
 seven rounds that mix a counter with a key, the number with which it passes BigCrush. The key is the
 seed and the counter is where the number is used, so there is no state: a number depends neither on
 the number of members, nor on the numbers drawn before, nor on the rank that draws it. There are no
-branches and no rejection, so that loops vectorise.
+branches and no rejection, so that loops vectorise. The noise of a record of a panel depends on a
+seed and on the record's code alone.
 """
+
+from typing import Any
 
 import numpy as np
 
-from ..native.jit import inline_always
+from ..native.jit import inline_always, njit_callable
 from .intrinsics import float_of
 
 INITIAL, PROCESS, OBSERVATION, RESAMPLING, STATES = (np.uint64(purpose) for purpose in range(5))
@@ -66,3 +69,29 @@ def uniform_at(seed, purpose, step, component):
     zero = np.uint64(0)
     w0, w1, _, _ = philox(zero, np.uint64(component), np.uint64(step), purpose, k0, k1)
     return open_unit(w0, w1)
+
+
+@njit_callable
+def seed_of_record(seed, code):
+    """The seed of a record's noise; that of the record with the code 0 is ``seed`` itself.
+
+    The finaliser of MurmurHash3 (A. Appleby) maps 0 to 0 and neighbouring codes far apart.
+    """
+    bits = np.uint64(code)
+    bits ^= bits >> np.uint64(33)
+    bits *= np.uint64(0xFF51AFD7ED558CCD)
+    bits ^= bits >> np.uint64(33)
+    bits *= np.uint64(0xC4CEB9FE1A85EC53)
+    bits ^= bits >> np.uint64(33)
+    return np.int64((np.uint64(seed) + bits) & np.uint64(0x7FFFFFFFFFFFFFFF))
+
+
+def seeds_of_records(seed: Any, codes: np.ndarray) -> list[np.ndarray]:
+    """The seed of each record, from that of their panel."""
+    return [np.asarray(seed_of_record(np.int64(seed), code)) for code in codes]
+
+
+def generators_of_records(rng: np.random.Generator, codes: np.ndarray) -> list[np.random.Generator]:
+    """A generator for each record, which depends on ``rng`` and on the code of the record alone."""
+    seed = rng.integers(np.iinfo(np.int64).max)
+    return [np.random.default_rng(seed_of_record(seed, code)) for code in codes]

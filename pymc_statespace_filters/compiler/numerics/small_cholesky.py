@@ -1,16 +1,15 @@
 """Cholesky factors, triangular solves and the Gaussian log-density of small matrices, in place.
 
-Three other factorisations differ on purpose. `lowering.covariances.semidefinite_cholesky` takes
-covariances given by the user, and returns NaN for a matrix that is no covariance.
-`codegen.scalarize` and `codegen.array_linalg` implement PyTensor's Cholesky in generated code, with
-its conventions.
+The factorisations differ on purpose. `covariance_root` takes covariances given by the user, and
+returns NaN for a matrix that is no covariance. `codegen.scalarize` and `codegen.array_linalg`
+implement PyTensor's Cholesky in generated code, with its conventions.
 """
 
 import math
 
 import numpy as np
 
-from ..native.jit import inline_always, njit_internal
+from ..native.jit import inline_always, njit_generated, njit_internal
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 
@@ -70,6 +69,42 @@ def semidefinite_cholesky(A, floor, active):
             for i in range(j, A.shape[0]):
                 A[i, j] = A[j, i] = 0.0
     return True
+
+
+@njit_generated
+def covariance_root(a):
+    """Lower square root in place; a zero pivot gives a zero column, a negative one NaN.
+
+    Covariances without spread in some direction are ordinary here: a known initial state, noise
+    that acts on the velocity alone. Zero is relative to the variance of the component: one may be
+    in pascals, the next in metres.
+    """
+    n = a.shape[0]
+    variance = np.empty(n)
+    for j in range(n):
+        variance[j] = a[j, j]
+    for j in range(n):
+        pivot = a[j, j]
+        for k in range(j):
+            pivot -= a[j, k] ** 2
+        if pivot < -1e-10 * abs(variance[j]) or not np.isfinite(pivot):
+            a[:] = np.nan
+            return
+        root = np.sqrt(pivot) if pivot > 1e-14 * variance[j] else 0.0
+        a[j, j] = root
+        for i in range(j + 1, n):
+            rest = a[i, j]
+            for k in range(j):
+                rest -= a[i, k] * a[j, k]
+            if root > 0.0:
+                a[i, j] = rest / root
+            elif abs(rest) > 1e-7 * np.sqrt(variance[i] * variance[j]):
+                a[:] = np.nan
+                return
+            else:
+                a[i, j] = 0.0
+        for i in range(j):
+            a[i, j] = 0.0
 
 
 @njit_internal

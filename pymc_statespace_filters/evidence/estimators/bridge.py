@@ -52,10 +52,9 @@ from scipy.stats import Covariance, multivariate_normal
 
 from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ..posterior.draws import Posterior, check_overlap
-from .normal_proposals import NormalProposals, normal_proposals
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
-from .whitening import Whitening, moments
+from .whitening import NormalProposals, Whitening, moments, normal_proposals
 
 MAX_ERROR = MIN_EFFECTIVE**-0.5  # the error of `MIN_EFFECTIVE` terms of relative variance one
 MAX_GAP = 4.0

@@ -44,10 +44,10 @@ from ...system.checks import check_count
 from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ..posterior.draws import Posterior, check_overlap
 from .block_ordinates import BlockEstimate, estimate_in_blocks
-from .normal_proposals import normal_proposals
 from .protocol import Estimate
 from .random_walk_proposal import Proposal, ProposalPlan, plan_proposal
 from .stopping import FEWEST, check_target, is_small, ratio_of_errors, shortfall
+from .whitening import normal_proposals
 
 MIN_PROPOSALS = 100
 MOST_PROPOSALS = 20_000

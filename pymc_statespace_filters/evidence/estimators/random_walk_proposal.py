@@ -19,9 +19,8 @@ from scipy.cluster.vq import kmeans2
 from ...errors import DataMismatchError
 from ..log_mean import log_mean, log_mean_of_chains
 from ..posterior.draws import Posterior
-from .normal_proposals import BLOCK, NormalProposals
 from .stopping import ratio_of_errors
-from .whitening import Whitening, moments
+from .whitening import BLOCK, NormalProposals, Whitening, moments
 
 SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 N_PILOT = BLOCK  # evaluations to choose the scale, not used for the estimate

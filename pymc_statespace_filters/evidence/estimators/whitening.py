@@ -1,11 +1,19 @@
-"""Whitening of draws by their mean and the Cholesky factor of their covariance."""
+"""Whitening of draws by their mean and the Cholesky factor of their covariance.
 
+Chib and Jeliazkov's plan and both kinds of bridge sampling need log-densities at draws of N(m, C),
+with the moments of each half of the chains. In a set of estimators they are evaluated once. Points
+are made in blocks, each with its own random numbers. Every estimator therefore gets the same first
+points, and an estimate does not depend on which estimators run beside it.
+"""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ModelError
+from ..posterior.draws import Posterior
 
 Array = NDArray[np.float64]
 
@@ -63,3 +71,53 @@ def _factored(mean: Array, covariance: Array, count: int) -> Whitening:
             "the draws of idata must vary in every direction, got a singular covariance of "
             f"{count} draws of {len(mean)} unconstrained parameters"
         ) from None
+
+
+BLOCK = 500  # points
+
+
+class NormalProposals:
+    """Draws of N(mean, C) with the moments of a posterior's draws, and their log-densities."""
+
+    def __init__(self, posterior: Posterior, seed: Sequence[int]) -> None:
+        self.moments: Whitening = moments(posterior.draws)
+        self._posterior, self._seed = posterior, seed
+        self._blocks: list[tuple[Array, Array]] = []
+
+    def first(self, count: int) -> tuple[Array, Array]:
+        """The first points (count, k) and their log-densities (count,).
+
+        What is lacking is evaluated, in whole blocks; a noisy likelihood takes fresh noise.
+        """
+        lacking = range(len(self._blocks), -(-count // BLOCK))
+        streams = [np.random.default_rng([*self._seed, block]) for block in lacking]
+        shape = BLOCK, len(self.moments.mean)
+        for rng in streams:
+            points = self.moments.unconstrained(rng.standard_normal(shape))
+            self._blocks.append((points, self._posterior.evaluate(points, rng)))
+        points, values = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
+        return points[:count], values[:count]
+
+
+def normal_proposals(
+    posterior: Posterior, rng: np.random.Generator
+) -> tuple[NormalProposals, NormalProposals]:
+    """Proposals fitted to the first and to the second half of every chain.
+
+    They are those of all estimators that run on this posterior, if it has a seed for them;
+    otherwise new ones of `rng`.
+    """
+    seed = posterior.shared_seed
+    if seed is None:
+        return _of_halves(posterior, rng.integers(2**63, size=2).tolist())
+    if "normal_proposals" not in posterior.shared:
+        posterior.shared["normal_proposals"] = _of_halves(posterior, seed)
+    found: tuple[NormalProposals, NormalProposals] = posterior.shared["normal_proposals"]
+    return found
+
+
+def _of_halves(
+    posterior: Posterior, seed: Sequence[int]
+) -> tuple[NormalProposals, NormalProposals]:
+    first, second = posterior.halves()
+    return NormalProposals(first, [*seed, 0]), NormalProposals(second, [*seed, 1])

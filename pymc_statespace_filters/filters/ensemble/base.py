@@ -1,17 +1,50 @@
-"""The base class of filters that move members by noise: the functions that they compile."""
+"""The base class of filters that move members by noise: the functions that they compile.
 
-from collections.abc import Sequence
+Settings are checked once, when a filter is constructed.
+"""
+
+from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import Any, ClassVar
+
+import numpy as np
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
 from ...compiler.native.planned_function import PlannedFunction
 from ...compiler.numerics.normals import BLOCK, padded
-from ..functions import likelihood, run, states, term_health
+from ...errors import ModelError
+from ...system.checks import is_integer
 from ..plan import make_plan
 from ..protocol import System
+from ..signatures import LIKELIHOOD_OF_NOISE, NORMALS, RUN, STATES, TERM_HEALTH
 from .noise import STORE_NORMALS, NoiseSizes, n_stored
 from .summaries import LAST_EVENTS, MEMBER_RUN, MEMBER_STATES, STORE_MEMBERS, SUMMARISE
+
+MOST_MEMBERS = 10**8
+
+
+def check_count(name: str, value: object) -> int:
+    """Return ``value`` as an int of at least 2, of which the memory may hold the states."""
+    if not is_integer(value) or not 2 <= value <= MOST_MEMBERS:
+        raise ModelError(f"{name} must be an integer from 2 to {MOST_MEMBERS:.0e}, got {value!r}.")
+    return int(value)
+
+
+def check_fraction(name: str, value: object) -> float:
+    """Return ``value`` as a float between 0 and 1."""
+    is_real = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    if not is_real or not 0.0 <= float(value) <= 1.0:  # type: ignore[arg-type]
+        raise ModelError(f"{name} must be a number from 0 to 1, got {value!r}.")
+    return float(value)  # type: ignore[arg-type]
+
+
+def check_choice(name: str, value: object, allowed: Iterable[str]) -> None:
+    """Raise unless ``value`` is one of the allowed words."""
+    words = list(allowed)
+    if not isinstance(value, str) or value not in words:
+        listed = ", ".join(repr(word) for word in words)
+        raise ModelError(f"{name} must be one of {listed}, got {value!r}.")
 
 
 class EnsembleFilterBase:
@@ -100,34 +133,32 @@ class EnsembleFilterBase:
     def stored_noise(self, system: System) -> PlannedFunction:
         """Compile the function (steps, seed) -> the normals that an evaluation with it uses."""
         plan = self.algorithm(system).plan(system, STORE_NORMALS, ())
-        return PlannedFunction(plan, (("steps", 1), ("seed", 0)), (("normals", 1),))
+        return PlannedFunction(plan, *NORMALS)
 
     # Compiled functions
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return likelihood(self.algorithm(system).evaluation(system))
+        return PlannedFunction(self.algorithm(system).evaluation(system), *LIKELIHOOD_OF_NOISE)
 
     def compile_health(self, system: System) -> PlannedFunction:
         """Compile the effective number behind every term of `compile`."""
-        return term_health(self.algorithm(system).evaluation(system))
+        return PlannedFunction(self.algorithm(system).evaluation(system), *TERM_HEALTH)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states."""
         filter = self.algorithm(system)
         if moment == "smoothed":
-            return states(filter.smoother(system))
+            return PlannedFunction(filter.smoother(system), *STATES)
         last_event = LAST_EVENTS[moment]
-        return states(
-            filter.observed(system, MEMBER_STATES, observer=SUMMARISE, last_event=last_event)
-        )
+        plan = filter.observed(system, MEMBER_STATES, observer=SUMMARISE, last_event=last_event)
+        return PlannedFunction(plan, *STATES)
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
         last_event, filter = LAST_EVENTS["filtered"], self.algorithm(system)
-        return run(
-            filter.observed(system, MEMBER_RUN, observer=STORE_MEMBERS, last_event=last_event)
-        )
+        plan = filter.observed(system, MEMBER_RUN, observer=STORE_MEMBERS, last_event=last_event)
+        return PlannedFunction(plan, *RUN)
 
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""

@@ -15,8 +15,7 @@ from ..outcomes import NONE, is_missing
 from ..plan import PLAN, initialise, propagate, read_system, settings_of
 from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
 from .noise import NoiseSizes, initial_normals, n_stored, noise_of, process_normals, sizes_of
-from .partition import RankLayout
-from .reductions import local_partition
+from .reductions import RankLayout, local_partition
 
 N_LEADING = 6
 """Settings of every filter: the number of members and five of `NoiseSizes`."""

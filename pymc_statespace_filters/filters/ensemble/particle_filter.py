@@ -7,11 +7,10 @@ from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import Plan
 from ..protocol import System
-from ..settings import check_choice, check_count, check_fraction
 from . import ancestral_smoother, backward_simulation
 from .ancestral_smoother import CARRY_PAST, LAG
 from .backward_simulation import STORE
-from .base import EnsembleFilterBase
+from .base import EnsembleFilterBase, check_choice, check_count, check_fraction
 from .hilbert_sort import ORDER_PARTICLES
 from .loop import ensemble_filter
 from .noise import resampling_normals

@@ -20,8 +20,7 @@ from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.normals import BLOCK, exponential, padded, uniform
 from ...errors import ModelError
 from .hilbert_sort import MOST_STATES, OrderWork, order_at, order_workspace
-from .partition import MEMBERS, allgather
-from .reductions import sum_blocks
+from .reductions import MEMBERS, allgather, sum_blocks
 
 
 @njit_internal

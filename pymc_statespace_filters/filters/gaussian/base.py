@@ -7,21 +7,22 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.codegen.function_types import Graph
-from ...compiler.lowering.symbols import symbols_of
+from ...compiler.lowering.observation import differentiable_log_density
+from ...compiler.lowering.symbols import call, symbols_of
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
 from ...compiler.native.planned_function import PlannedFunction
 from ...errors import ModelError
 from ...system.model import StateSpaceModel
-from .. import functions
 from ..protocol import System
-from . import deterministic
+from ..signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PULLBACK, RUN, STATES, TAPED
 from .backward import BACKWARD
 from .forward import FORWARD
 from .functions import filter_plan
 from .linearization import Linearization, Linearizations, predict, start, state_size, update
 from .recursion import GaussianFilterFunctions
-from .states import RUN, states_plan
+from .states import RUN as RUN_STATES
+from .states import states_plan
 from .tangent import linearizations_of
 
 
@@ -45,54 +46,38 @@ class GaussianFilterBase:
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return functions.likelihood(self._plan(system, FORWARD))
-
-    def compile_batch(self, system: System) -> PlannedFunction:
-        """Compile the likelihood of many points: theta (B, k) -> terms (B, J), health (B, 3)."""
-        return functions.of_points(self._plan(system, FORWARD, of_many=True))
+        return PlannedFunction(self._plan(system, FORWARD), *LIKELIHOOD_OF_NOISE)
 
     def compile_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass, with a third result: the tape."""
-        return functions.taped(self._plan(system, FORWARD, leaves_tape=True))
+        return PlannedFunction(self._plan(system, FORWARD, leaves_tape=True), *TAPED)
 
     def compile_pullback(self, system: System) -> PlannedFunction:
         """Compile the backward pass along the tape."""
-        return functions.pullback(self._plan(system, BACKWARD))
+        return PlannedFunction(self._plan(system, BACKWARD), *PULLBACK)
 
     def compile_gradient(self, system: System) -> PlannedFunction:
         """Compile both passes as one function."""
-        return functions.gradient(self._plan(system, BACKWARD, leaves_tape=True))
+        return PlannedFunction(self._plan(system, BACKWARD, leaves_tape=True), *GRADIENT)
 
-    def compile_panel(self, system: System) -> PlannedFunction:
-        """Compile the likelihood of a panel: theta (G, k), rows (J, 3) -> terms (J,), health."""
-        return functions.of_panel(self._plan(system, FORWARD, of_many=True))
-
-    def compile_panel_taped(self, system: System) -> PlannedFunction:
-        """Compile the forward pass of a panel, with a third result: the tape."""
-        plan = self._plan(system, FORWARD, of_many=True, leaves_tape=True)
-        return functions.taped(plan, of_panel=True)
-
-    def compile_panel_pullback(self, system: System) -> PlannedFunction:
-        """Compile the backward pass of a panel along the tape."""
-        return functions.pullback(self._plan(system, BACKWARD, of_many=True), of_panel=True)
-
-    def compile_panel_gradient(self, system: System) -> PlannedFunction:
-        """Compile both passes of a panel as one function."""
-        plan = self._plan(system, BACKWARD, of_many=True, leaves_tape=True)
-        return functions.gradient(plan, of_panel=True)
+    def plan_of_many(
+        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+    ) -> Plan:
+        """Plan a pass along many records, or of many points, side by side if that fits."""
+        run = BACKWARD if goes_back else FORWARD
+        return self._plan(system, run, of_many=True, leaves_tape=leaves_tape)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
-            return functions.states(self._plan(system, RUN))
+            return PlannedFunction(self._plan(system, RUN_STATES), *STATES)
         recursion = self._functions(system)
-        return functions.states(
-            states_plan(system, recursion, self._linearizations(system), moment)
-        )
+        plan = states_plan(system, recursion, self._linearizations(system), moment)
+        return PlannedFunction(plan, *STATES)
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        return functions.run(self._plan(system, RUN))
+        return PlannedFunction(self._plan(system, RUN_STATES), *RUN)
 
     def _plan(
         self, system: System, run: EntryPoint, *, of_many: bool = False, leaves_tape: bool = False
@@ -108,7 +93,7 @@ class GaussianFilterBase:
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         if system.is_deterministic:
-            return _of_deterministic(system.model.gaussian)
+            return deterministic_functions(system.model.gaussian)
         return _functions(self._linearizations(system), system.model.gaussian)
 
     def _linearizations(self, system: System) -> Linearizations:
@@ -131,9 +116,6 @@ class GaussianFilterBase:
             )
 
 
-_of_deterministic = lru_cache(maxsize=256)(deterministic.filter_functions)
-
-
 @lru_cache(maxsize=256)
 def _functions(by: Linearizations, system: StateSpaceModel) -> GaussianFilterFunctions:
     """The three functions of the filter, each of theta and the state of the filter ``s``."""
@@ -151,4 +133,34 @@ def _functions(by: Linearizations, system: StateSpaceModel) -> GaussianFilterFun
         function("theta", start(system, values)),
         function("theta u t s", forecast),
         function("theta u t d s", analysis, pt.atleast_1d(term)),
+    )
+
+
+@lru_cache(maxsize=256)
+def deterministic_functions(system: StateSpaceModel) -> GaussianFilterFunctions:
+    """The three functions of a filter for a system without noise whose start is known.
+
+    There is no covariance, so a Gaussian filter is a run of the equations. No observation moves the
+    state and each has the density p(d | x), of any kind: the likelihood is exact. The vector ``s``
+    of the filter is the state.
+    """
+    values = symbols_of(system)
+    del values["q"]  # zero
+    values["s"] = values.pop("x").type("s")
+    state = {**values, "x": values["s"]}
+
+    def function(inputs: str, *outputs: TensorVariable) -> Graph:
+        return Graph({name: values[name] for name in inputs.split()}, outputs)
+
+    start = call(system.equations.initial_mean, system, values)
+    step = call(system.equations.transition, system, state)
+    # A copy: the derivative of the term by s would be lost beside s itself as an output.
+    seen = [pt.tensor_copy(values["s"]), pt.atleast_1d(differentiable_log_density(system, state))]
+    return GaussianFilterFunctions(
+        system,
+        # Measured for Runge-Kutta steps: explicit rows take 45 % longer than propagation.
+        False,
+        function("theta", start),
+        function("theta u t s", step),
+        function("theta u t d s", *seen),
     )

@@ -7,9 +7,9 @@ memory. The tape of a record alone has all states: before each step and before e
 
 import numpy as np
 
-from ...compiler.lowering.covariances import semidefinite_cholesky
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ...compiler.numerics.small_cholesky import covariance_root
 from ..calls import OK, opened, reals_at
 from ..outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN, settings_of
@@ -159,7 +159,7 @@ def _is_covariance(machine, W, lane, row, size):
     for i in range(n):
         for j in range(n):
             root[i, j] = W[(row + i * n + j) * machine.width + lane]
-    semidefinite_cholesky(root)
+    covariance_root(root)
     for i in range(n):
         for j in range(n):
             if np.isnan(root[i, j]):

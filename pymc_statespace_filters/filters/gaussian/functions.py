@@ -15,11 +15,12 @@ import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
+from ...compiler.codegen.arguments import LANES
 from ...compiler.codegen.function_types import Graph
 from ...compiler.codegen.scalarize import NotUnrollableError
-from ...compiler.codegen.simd import LANES, LaneFunction, lane_functions
-from ...compiler.codegen.steps import Places, step_functions
-from ...compiler.lowering.covariances import covariances
+from ...compiler.codegen.simd import LaneFunction, Places, lane_functions
+from ...compiler.codegen.steps import step_functions
+from ...compiler.lowering.constants import covariances
 from ...compiler.lowering.symbols import call
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
@@ -137,10 +138,7 @@ def compiled(
     """The entry points of functions; see `step_functions` for those along a record."""
     if not in_lanes:
         return Functions(*step_functions(functions, places, along), 1)
-    lanes = lane_functions(
-        functions, places.rows, places.n_rows, places.state_size, places.n_inputs
-    )
-    return Functions(lanes.entries, lanes.n_rows, LANES)
+    return Functions(*lane_functions(functions, places), LANES)
 
 
 def filter_plan(
@@ -173,9 +171,9 @@ def filter_plan(
 
 def extensions(system: System, *, goes_back: bool = False) -> dict[str, EntryPoint]:
     """The functions from the user's parameters to those of the filter, if these are more."""
-    if system.extend is None:
-        return {}
-    return {"extend": system.extend} | ({"extend_back": system.extend_back} if goes_back else {})
+    back = system.extend_back if goes_back else None
+    found = {"extend": system.extend, "extend_back": back}
+    return {name: entry for name, entry in found.items() if entry is not None}
 
 
 @lru_cache(maxsize=256)

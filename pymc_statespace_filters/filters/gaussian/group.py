@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.codegen.record_loops import AlongArguments
+from ...compiler.codegen.arguments import AlongArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.native.plan import RECORD
-from ...system import panel
+from ...system import panel_records as panel
 from ..calls import integers_at, reals_at, state_given
 from ..plan import PLAN
 from .machine import STRETCH

@@ -15,7 +15,7 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.codegen.semidefinite import regular_factor
-from ...compiler.lowering.gaussian import log_normal, without_missing
+from ...compiler.lowering.observation import log_normal, without_missing
 from ...compiler.lowering.symbols import call
 from ...system.model import StateSpaceModel
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.codegen.simd import LANES_AT_ONCE, LaneArguments
+from ...compiler.codegen.arguments import LANES_AT_ONCE, LaneArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
 from ..plan import PLAN

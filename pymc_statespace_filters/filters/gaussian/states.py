@@ -9,11 +9,11 @@ from functools import lru_cache
 import numpy as np
 
 from ...compiler.codegen.function_types import jit
-from ...compiler.lowering.covariances import semidefinite_cholesky
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, Plan, plan_entry
 from ...compiler.numerics.normals import BLOCK, FILL_NORMALS
 from ...compiler.numerics.philox import STATES
+from ...compiler.numerics.small_cholesky import covariance_root
 from ..calls import OK, opened, reals_at, wanted_rows
 from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN, make_plan, settings_of
@@ -216,7 +216,7 @@ def apply_covariance(values, first, size, Z):
     for i in range(size):
         for j in range(size):
             root[i, j] = values[first + i * size + j]
-    semidefinite_cholesky(root)
+    covariance_root(root)
     for i in range(size - 1, -1, -1):  # last row first: a row depends on itself and those above
         for member in range(Z.shape[1]):
             total = 0.0

@@ -28,8 +28,8 @@ import numpy as np
 from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.normals import BLOCK
 from ...compiler.numerics.restricted_domain import exp
-from ..ensemble.partition import BLOCKS, MEMBERS, RankLayout, allgather, local_range
-from .points import complete_points
+from ..ensemble.reductions import BLOCKS, MEMBERS, RankLayout, allgather, local_range
+from .direct_sum import complete_points
 from .simd_windows import (
     LANES,
     POINTS,

@@ -18,10 +18,9 @@ import numpy as np
 
 from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.restricted_domain import exp, log
-from ..ensemble.partition import BLOCKS, MEMBERS, allgather, local_range
-from .direct_sum import compact, log_kernel_sum
+from ..ensemble.reductions import BLOCKS, MEMBERS, allgather, local_range
+from .direct_sum import Points, compact, complete_points, log_kernel_sum
 from .gridded_sum import FLOOR, gridded_sums
-from .points import Points, complete_points
 
 _LOG_FLOOR = math.log(FLOOR)
 _FEW = 64  # so many exact sums cost less than another grid; both costs are O(N)

@@ -1,8 +1,26 @@
-"""Moments and draws of a density given by its masses on a grid."""
+"""What is asked of the states; moments and draws of a density given by its masses on a grid."""
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from ...compiler.native.jit import inline_always, njit_internal, njit_reassoc
+
+PREDICTED, FILTERED, SMOOTHED = range(3)
+MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
+"""Given the observations before the step, up to and at the step, or all."""
+
+
+class Rows(NamedTuple):
+    """Results: mean, standard deviation and a draw of the state at the steps ``at``."""
+
+    at: np.ndarray
+    draw_seed: int
+    mean: np.ndarray
+    sd: np.ndarray
+    drawn: np.ndarray
+
 
 _HALVINGS = 40  # of the bisection for a draw within a cell
 _STRIDE = 16  # points, in the search for that cell

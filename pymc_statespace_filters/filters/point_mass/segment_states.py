@@ -10,8 +10,8 @@ from ...compiler.numerics.restricted_domain import exp
 from ..outcomes import NONE
 from .bisection import empty_segments
 from .forward_pass import LONGEST_REACH
+from .moments import PREDICTED, SMOOTHED
 from .recursion import TOO_COARSE, TOO_SHORT
-from .rows import PREDICTED, SMOOTHED
 from .segment_pass import first_accuracy, next_accuracy, pass_from
 from .segments import POINTS, draw, mean_over_gaussian, moments
 

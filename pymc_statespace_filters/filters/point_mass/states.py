@@ -35,9 +35,8 @@ from .forward_pass import (
     write_outcome,
 )
 from .grid import gather, grid_points
-from .moments import draw, mean_and_sd, total_mass
+from .moments import PREDICTED, SMOOTHED, Rows, draw, mean_and_sd, total_mass
 from .recursion import TOO_SHORT, empty_table, has_valid_covariances, transition_at, with_sources
-from .rows import PREDICTED, SMOOTHED, Rows
 from .segment_states import states_on_segments
 from .tiles import LANES, block_of, multiply
 

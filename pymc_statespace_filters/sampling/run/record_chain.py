@@ -8,8 +8,12 @@ import numpy as np
 from ...errors import ModelError
 from ..kernel.independence import no_mixture
 from ..kernel.random_numbers import draw_seeds
-from ..kernel.records.arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, RecordRandomBlock
-from ..kernel.records.evaluation import RecordEvaluation
+from ..kernel.records.arrays import (
+    FIRST_ACCEPTED,
+    FIRST_ESTIMATE,
+    RecordEvaluation,
+    RecordRandomBlock,
+)
 from ..kernel.records.moves import advance_records
 from ..kernel.state import (
     LOG_DENSITY,

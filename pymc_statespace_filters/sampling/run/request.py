@@ -15,7 +15,7 @@ from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
 from ...system.checks import check_count, check_flag, check_positive, is_integer
-from ..checkpoint.fingerprint import model_data_fingerprint, model_fingerprint
+from ..checkpoint.manifest import model_data_fingerprint, model_fingerprint
 from ..target.settings import DRAMSettings
 
 _GATHER = ("root", "all")

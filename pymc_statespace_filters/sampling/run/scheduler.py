@@ -10,7 +10,7 @@ the rank where it ran, or ends the model. What it decides depends on the draws a
 
 The last message of rank 0 says that the run is over, and no rank leaves before it. So every rank
 learns of an error on any other, and no message is left for the next user of the communicator.
-Interrupts are handled by rank 0.
+Interrupts are handled by rank 0. The progress bar shows R-hat and the effective sample size.
 """
 
 import time
@@ -27,7 +27,6 @@ from ...parallel.signals import deferred_interrupts, ignored_interrupts
 from ...progress import ChainProgress
 from ..kernel.state import ChainState, Draws
 from .chain_task import ChainTask
-from .convergence_display import ConvergenceDisplay
 from .model_task import ModelTask
 from .thread_pool import ChainPool
 
@@ -290,3 +289,47 @@ class _Worker:
             if message is not None and message.kind == _OVER:
                 return
             time.sleep(_LISTENING_SECONDS)
+
+
+# Seconds between two computations, and the part of the time that they may take.
+_SECONDS, _SHARE = 2.0, 0.01
+
+
+class ConvergenceDisplay:
+    """Computes the diagnostics of each model that runs, and shows them below the bars.
+
+    They are those of the chains whose draws are on this rank: of those that run here, and of those
+    that have ended anywhere. Without a bar nothing is computed.
+
+    Parameters
+    ----------
+    bars : ChainProgress
+    chains : int
+        Number of chains of a model; they are numbered through all models.
+    """
+
+    def __init__(self, bars: ChainProgress, chains: int):
+        self._bars, self._n_per_model = bars, chains
+        self._next = time.monotonic() + _SECONDS
+
+    def refresh(self, tasks: Sequence[ModelTask], running: Mapping[int, ChainTask]) -> None:
+        """Show the diagnostics of the models of running chains, if it is time to."""
+        began = time.monotonic()
+        if not self._bars.shows_convergence or began < self._next:
+            return
+        by_model: dict[int, dict[int, ChainTask]] = {}
+        for number, task in running.items():
+            model, chain = divmod(number, self._n_per_model)
+            by_model.setdefault(model, {})[chain] = task
+        for model, chains in by_model.items():
+            self.show(model, tasks[model], chains)
+        now = time.monotonic()
+        self._next = now + max(_SECONDS, (now - began) / _SHARE)
+
+    def show(self, model: int, task: ModelTask, running: Mapping[int, ChainTask]) -> None:
+        """Show the diagnostics of a model, of its results and of chains that run here."""
+        if not self._bars.shows_convergence:
+            return
+        found = task.convergence_so_far(running)
+        if found is not None:
+            self._bars.show_convergence(model, float(found.rhat.max()), float(found.ess.min()))

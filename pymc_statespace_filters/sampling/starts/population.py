@@ -4,7 +4,7 @@ Draws of the prior are annealed to the posterior. If the filters are expensive a
 Kalman filter exists, it leads the way: the population is first annealed to the prior times the
 square root of its likelihood, and from there to the posterior, which takes fewer evaluations. The
 square root, because the two likelihoods may differ by many nats. Draws of some variables from a
-pilot, if there are any, lead the way instead (`nested`).
+pilot, if there are any, lead the way instead (`nested_reference`).
 
 The cost is proportional to the number of points. If they are few, the `EKF` still leads many, which
 cost little, and an expensive filter evaluates some of them.
@@ -20,14 +20,13 @@ from ...compiler.native.rows import Rows
 from ...errors import ModelError
 from ...progress import row_progress
 from ...pymc_model.support import can_sample
-from ...student_mixture import StudentMixture
+from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ..kernel.random_numbers import draw_seeds
 from ..target.settings import DRAMSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
 from .annealing import Population, anneal
 from .modes import Points, find_modes
-from .nested import nested_reference
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
@@ -213,3 +212,34 @@ def _from_ekf(cheap: Densities, full: Densities) -> Densities:
 def _number(values: Array) -> Array:
     """The values, with minus infinity for NaN and plus infinity."""
     return np.where(values < np.inf, values, -np.inf)
+
+
+_N_COMPONENTS = 4  # of the known draws, which may have several modes
+_PRIOR_WEIGHT = 0.2
+
+
+def nested_reference(known: Array, prior: Array, rng: np.random.Generator) -> StudentMixture:
+    """The mixture for draws (n, d) with columns of NaN, and draws of the prior (m, d).
+
+    The draws are of a posterior that lacks the variables of these columns, such as that of a nested
+    model. Their product with the prior of the others is described by a mixture of Student-t
+    distributions. A further component covers the prior of all variables, as the posterior may lie
+    far from the known draws.
+    """
+    lacking = np.isnan(known[0])
+    paired = prior[rng.integers(len(prior), size=len(known))]
+    near = _fitted(np.where(lacking, paired, known), _N_COMPONENTS, rng)
+    far = _fitted(prior, 1, rng)
+    return StudentMixture(
+        np.append((1 - _PRIOR_WEIGHT) * near.weights, _PRIOR_WEIGHT * far.weights),
+        np.concatenate([near.means, far.means]),
+        np.concatenate([near.chols, far.chols]),
+    )
+
+
+def _fitted(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
+    draws = standardised(x)
+    if draws is None:
+        raise ModelError("pilot must have draws that vary in every direction")
+    placed = place_components(draws.z, n_components, rng)
+    return fit_mixture(draws.z, placed).affine(draws.mean, draws.chol)

@@ -17,8 +17,12 @@ from ...parallel.signals import held_interrupts
 from ...pymc_model.compilation import compile_raveled
 from ...pymc_model.inspection import health_outputs
 from ...pymc_model.panel_structure import PanelStructure
-from ..kernel.records.arrays import NativeRecordDensities
-from ..kernel.records.evaluation import RecordEvaluation, evaluate_likelihoods, evaluate_priors
+from ..kernel.records.arrays import (
+    NativeRecordDensities,
+    RecordEvaluation,
+    evaluate_likelihoods,
+    evaluate_priors,
+)
 from ..kernel.state import RAISED
 
 

@@ -10,8 +10,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from .diffusion import check_additive
-from .substeps import SubstepIntegrator, Values
+from .substeps import SubstepIntegrator, Values, check_additive
 
 N_TERMS = 9  # of the series for a 1/64 of a step
 DOUBLINGS = 6

@@ -9,9 +9,8 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from .diffusion import check_additive
 from .euler_maruyama import EulerMaruyama
-from .substeps import SubstepIntegrator, Values
+from .substeps import SubstepIntegrator, Values, check_additive
 
 LARGEST_Z = 1.6
 

@@ -8,11 +8,10 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.codegen.function_types import Graph, VectorFunction
-from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_functions
-from pymc_statespace_filters.compiler.native import cache_key, sources
-from pymc_statespace_filters.compiler.native.cache_key import key_of
-from pymc_statespace_filters.compiler.native.sources import Sources
+from pymc_statespace_filters.compiler.codegen.function_types import Graph
+from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_function
+from pymc_statespace_filters.compiler.native import cache_key
+from pymc_statespace_filters.compiler.native.cache_key import Sources, key_of
 
 NAME = psf.__name__
 LOOP, CODE = f"{NAME}.filters.ensemble.loop", f"{NAME}.compiler.codegen.functions"
@@ -54,7 +53,7 @@ class Copy:
         self.start()
         theta = pt.tensor("theta", shape=(2,), dtype="float64")
         graph = Graph({"theta": theta}, [2.0 * theta])
-        return vector_functions({"f": VectorFunction("c", graph)})["f"].key
+        return vector_function("f", "c", graph).key
 
     def module(self):
         """The key of a module, into which an exponential is linked."""
@@ -202,5 +201,5 @@ def test_code_outside_the_package_has_no_key():
 
 def test_sources_are_parsed_once_for_all_processes(copy, monkeypatch):
     expected = copy.start().digest_of(LOOP)
-    monkeypatch.setattr(sources.ast, "parse", None)
+    monkeypatch.setattr(cache_key.ast, "parse", None)
     assert copy.start().digest_of(LOOP) == expected

@@ -20,8 +20,7 @@ from .bottom_up import (
     start,
 )
 from .normal import limited, tail
-from .saddle_point import TWO_PI, deviance, smallest_reached, stirling_error
-from .series import series, short_series
+from .series import TWO_PI, deviance, series, short_series, smallest_reached, stirling_error
 from .single_precision import ONE, TWO
 
 _LARGE = 1e6

@@ -38,8 +38,7 @@ from ..restricted_domain import exp as normal_exp
 from ..restricted_domain import log as normal_log
 from .gamma_tables import LARGE, MEDIUM, SMALL, Fit
 from .normal import limited, tail
-from .saddle_point import deviance, stirling_error
-from .series import in_variables
+from .series import deviance, in_variables, stirling_error
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 # As `normal._RATIO`, in t = (x - 4) / (x + 4), to 1.3e-12

@@ -47,8 +47,7 @@ from ..state import (
     SCALING,
     STAGE,
 )
-from .arrays import FIRST_ACCEPTED, FIRST_ESTIMATE
-from .evaluation import evaluate_likelihoods, evaluate_priors
+from .arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, evaluate_likelihoods, evaluate_priors
 
 _internal = linked()
 
