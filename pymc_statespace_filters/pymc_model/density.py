@@ -12,12 +12,12 @@ import pymc as pm
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from ..compiler.native.pytensor_function import NativeFunction
 from ..compiler.native.rows import Rows
 from ..errors import ModelError
 from .compilation import compile_raveled
 from .graph_rewrites import smooth_filters, with_filter
 from .inspection import noise_seeds
+from .written_function import native_function
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class RowFunction:
         start = model.initial_point()
         function, point = compile_raveled(start, [output, *extra], values, shared)
         example = [point, *self.model_seeds]
-        self.calls = Rows(NativeFunction(function, example), len(example))
+        self.calls = Rows(native_function(function, example), len(example))
 
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
         """Evaluate points x (m, k), each with its row of seeds (m, n_seeds); NaN becomes -inf.

@@ -6,7 +6,7 @@ elementwise operations, sums and small linear algebra are written out.
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -65,8 +65,8 @@ def unroll(
     known: dict[Variable, np.ndarray] = dict(zip(inputs, values, strict=True))
     for node in io_toposort(inputs, outputs):
         arguments = [_value(known, variable) for variable in node.inputs]
-        results = _evaluate(arena, node, arguments)
-        known.update(zip(node.outputs, map(_objects, results), strict=True))
+        results = evaluate(arena, node, arguments)
+        known.update(zip(node.outputs, map(objects, results), strict=True))
         if len(arena) > max_expressions:
             raise NotUnrollableError(f"more than {max_expressions} scalar operations")
     return [_value(known, variable) for variable in outputs]
@@ -76,11 +76,11 @@ def _value(known: dict[Variable, np.ndarray], variable: Variable) -> np.ndarray:
     if variable not in known:
         if not isinstance(variable, Constant):
             raise NotUnrollableError(f"an input that is not an argument, {variable}")
-        known[variable] = _objects(variable.data)
+        known[variable] = objects(variable.data)
     return known[variable]
 
 
-def _objects(array) -> np.ndarray:
+def objects(array) -> np.ndarray:
     """Any value as an object array of expressions and Python scalars."""
     if isinstance(array, np.ndarray) and array.dtype == object:
         return array
@@ -102,7 +102,8 @@ def _numbers(node_input: Variable, value: np.ndarray) -> np.ndarray:
     return np.asarray(value.tolist(), dtype=node_input.type.dtype)
 
 
-def _evaluate(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+def evaluate(arena: Arena, node, arguments: list[np.ndarray]) -> list:
+    """The results of one operation, arrays or objects that become such."""
     for types, rule in _RULES:
         if isinstance(node.op, types):
             return rule(arena, node, arguments)
@@ -127,28 +128,26 @@ def _join(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     return [np.concatenate(arguments, axis=node.op.axis)]
 
 
-def _elementwise(arena: Arena, op: ps.ScalarOp, *arguments: np.ndarray) -> np.ndarray:
-    arrays = np.broadcast_arrays(*arguments)
-    out = np.empty(arrays[0].shape, dtype=object)
-    for index in np.ndindex(out.shape):
-        out[index] = _scalar(arena, op, [array[index] for array in arrays])
-    return out
-
-
-def _scalar(arena: Arena, op: ps.ScalarOp, arguments: list):
+def _scalars(arena: Arena, op: ps.ScalarOp, arguments: list) -> list:
+    """The results of an operation on scalars, or of several that PyTensor has fused."""
     if not isinstance(op, ps.Composite):
-        return arena.apply(op, *arguments)
+        return [arena.apply(op, *arguments)]
     known = dict(zip(op.fgraph.inputs, arguments, strict=True))
     for node in op.fgraph.toposort():
         inner = [plain(i.data) if isinstance(i, Constant) else known[i] for i in node.inputs]
-        known[node.outputs[0]] = _scalar(arena, node.op, inner)
-    return known[op.fgraph.outputs[0]]
+        known.update(zip(node.outputs, _scalars(arena, node.op, inner), strict=True))
+    return [plain(o.data) if isinstance(o, Constant) else known[o] for o in op.fgraph.outputs]
 
 
 def _elemwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    if len(node.outputs) != 1:
-        raise NotUnrollableError(f"the operation {node.op} with several outputs")
-    return [_elementwise(arena, node.op.scalar_op, *arguments)]
+    op = node.op.scalar_op if isinstance(node.op, Elemwise) else node.op
+    arrays = np.broadcast_arrays(*arguments)
+    results = [np.empty(arrays[0].shape, dtype=object) for _ in node.outputs]
+    for index in np.ndindex(arrays[0].shape):
+        values = _scalars(arena, op, [array[index] for array in arrays])
+        for result, value in zip(results, values, strict=True):
+            result[index] = value
+    return results
 
 
 def _reduce(arena: Arena, node, arguments: list[np.ndarray]) -> list:
@@ -189,7 +188,7 @@ def _blockwise(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     results: list[np.ndarray] = []
     for index in np.ndindex(batch):
         core_arguments = [_as_array(array[index]) for array in spread]
-        cores = [_objects(r) for r in _evaluate(arena, core_node, core_arguments)]
+        cores = [objects(r) for r in evaluate(arena, core_node, core_arguments)]
         if not results:
             results = [np.empty(batch + c.shape, dtype=object) for c in cores]
         for result, core in zip(results, cores, strict=True):
@@ -248,7 +247,8 @@ def _check(arena: Arena, node, arguments: list[np.ndarray]) -> list:
         holds: Value = True
         for each in condition.flat:
             holds = arena.apply(ps.and_, holds, each)
-        value = _elementwise(arena, ps.switch, _as_array(holds), value, _as_array(float("-inf")))
+        where_it_holds = np.frompyfunc(partial(arena.apply, ps.switch, holds), 2, 1)
+        value = _as_array(where_it_holds(value, float("-inf")))
     return [value]
 
 
@@ -267,7 +267,7 @@ def _same(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 
 
 _RULES: tuple[tuple[tuple[type, ...], Callable], ...] = (
-    ((Elemwise,), _elemwise),
+    ((Elemwise, ps.ScalarOp), _elemwise),
     ((CAReduce,), _reduce),
     ((Dot,), _dot),
     ((Cholesky,), cholesky),

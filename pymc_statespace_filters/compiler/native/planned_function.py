@@ -4,7 +4,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from ctypes import addressof, c_char
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -61,6 +61,30 @@ def _exception(status: int) -> type[Exception]:
     return RuntimeError if status == RAISED else ModelError
 
 
+def refusal(status: int) -> Exception:
+    """What the status of a call says."""
+    return _exception(status)(REFUSALS[status])
+
+
+class BoundCall(NamedTuple):
+    """A call of a plan with its memory, for `composed_call`.
+
+    ``places`` are those of numbers that are passed by value, among the words, None for arrays.
+    """
+
+    plan: int
+    words: array
+    results: list[np.ndarray]
+    places: list[int | None]
+    arguments: Sequence[Any]  # alive as long as the call
+
+
+def _vectors(words: array) -> tuple[int, int, int]:
+    """The addresses of record, request and results."""
+    record, _ = words.buffer_info()
+    return record, record + _BYTES * N_RECORD, record + _BYTES * _RESULTS
+
+
 class PlannedFunction:
     """A compiled function of arrays and numbers, of which a plan is the machine code.
 
@@ -96,6 +120,28 @@ class PlannedFunction:
 
     def __call__(self, *values: Any) -> Any:
         """Call from Python; arrays are contiguous and of the right types."""
+        words, made = self._prepared(values)
+        replacement = words[_REPLACEMENT]
+        run = PlanFunction(replacement) if replacement else self.plan.run
+        self._check(run(self.plan.address, *_vectors(words)))
+        if self._tape is not None:
+            made[self._tape] = made[self._tape][: words[_RESULTS + RESULTS.n_tape]]
+        return tuple(made) if len(made) > 1 else made[0]
+
+    def bound(self, *values: Any) -> "BoundCall":
+        """A call that machine code makes as often as it wants, from one thread.
+
+        It reads the arrays anew each time, also numbers that are passed by value, once they are
+        copied to their places. What it checks about their shapes is checked now.
+        """
+        words, results = self._prepared(values, is_checked=True)
+        places = [place if is_value else None for place, _, is_value in self._places]
+        return BoundCall(self.plan.address, words, results, places, values)
+
+    def _prepared(
+        self, values: Sequence[Any], *, is_checked: bool = False
+    ) -> tuple[array, list[np.ndarray]]:
+        """The words of a call with these arguments, and its results, not written yet."""
         words = _DEFAULT_WORDS[:]
         given = [v if type(v) is np.ndarray else np.asarray(v) for v in _flat_values(values)]
         for (place, shape, is_value), value in zip(self._places, given, strict=True):
@@ -105,32 +151,25 @@ class PlannedFunction:
             words[place] = _address(value)
             for word, length in zip(shape, value.shape, strict=True):
                 words[word] = length
-        record, _ = words.buffer_info()
-        request, results = record + _BYTES * N_RECORD, record + _BYTES * _RESULTS
-        run, plan = self.plan.run, self.plan.address
-        replacement = words[_REPLACEMENT]
-        if self._asks_for_sizes or replacement:  # which is given only arguments that were checked
+        # A replacement is given only arguments that were checked.
+        asks = is_checked or self._asks_for_sizes or words[_REPLACEMENT]
+        if asks:
             words[_SIZES_ONLY] = 1
-            self._check(run(plan, record, request, results))
+            self._check(self.plan.run(self.plan.address, *_vectors(words)))
             words[_SIZES_ONLY] = 0
         made = []
         for place, sizes in self._shapes:
             result = np.empty([self._size(words, s) if is_slot else s for s, is_slot in sizes])
             words[_RESULTS + place] = _address(result)
             made.append(result)
-        if replacement:
-            run = PlanFunction(replacement)
-        self._check(run(plan, record, request, results))
-        if self._tape is not None:
-            made[self._tape] = made[self._tape][: words[_RESULTS + RESULTS.n_tape]]
-        return tuple(made) if len(made) > 1 else made[0]
+        return words, made
 
     def _size(self, words: array, slot: int) -> int:
         return words[_RESULTS + slot if self._asks_for_sizes else _WORDS_OF_SIZES[slot]]
 
     def _check(self, status: int) -> None:
         if status:
-            raise _exception(status)(REFUSALS[status])
+            raise refusal(status)
 
     @cached_property
     def function(self) -> Any:

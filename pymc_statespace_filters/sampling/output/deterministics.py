@@ -37,9 +37,9 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.type import TensorType
 from pytensor.tensor.variable import TensorVariable
 
-from ...compiler.native.pytensor_function import NativeFunction
 from ...compiler.native.rows import Rows, at_points
 from ...pymc_model.compilation import compile_raveled
+from ...pymc_model.written_function import native_function
 from ..target.variables import RaveledVariables
 
 # Positions in a block, whose intermediate results stay in the processor's cache.
@@ -164,7 +164,7 @@ class _PerPosition:
 
     def __call__(self, positions: np.ndarray) -> list[np.ndarray]:
         # With the data as they are now.
-        rows = Rows(NativeFunction(self._function, [positions[0]]), 1, in_turn=True)
+        rows = Rows(native_function(self._function, [positions[0]]), 1, in_turn=True)
         return rows(positions)
 
 

@@ -26,6 +26,7 @@ from ...parallel.signals import held_interrupts
 from ...pymc_model.compilation import compile_density, compile_raveled
 from ...pymc_model.graph_rewrites import autoregressive_noise, with_filter, with_likelihood_callback
 from ...pymc_model.inspection import health_outputs, log_density_terms, state_space_nodes
+from ...pymc_model.written_function import native_function
 from ..kernel.state import RAISED, Evaluation, NativeLogDensity
 from ..kernel.transition import evaluate
 from .leader_follower import Leader, leader_errors
@@ -129,7 +130,7 @@ class LogDensity:
         self._normals = self._first_normals()
         seeds = [np.zeros((), np.int64)] * self._n_seeds
         inputs = [self._start, *seeds, *self._others, *noise, *self._normals]
-        self._native = NativeFunction(self._function, inputs, errors)
+        self._native = native_function(self._function, inputs, errors)
         return self._native
 
     def at_rows(self) -> Rows:

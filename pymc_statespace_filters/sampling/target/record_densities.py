@@ -17,6 +17,7 @@ from ...parallel.signals import held_interrupts
 from ...pymc_model.compilation import compile_raveled
 from ...pymc_model.inspection import health_outputs
 from ...pymc_model.panel_structure import PanelStructure
+from ...pymc_model.written_function import native_function
 from ..kernel.records.arrays import (
     NativeRecordDensities,
     RecordEvaluation,
@@ -68,8 +69,8 @@ class RecordDensities:
         """Load the machine code, and read the data as they are now."""
         inputs = _inputs(self._start, np.zeros(self._n_seeds, dtype=np.int64))
         self._native = (
-            NativeFunction(self._likelihood, inputs),
-            NativeFunction(self._prior, inputs[:1]),
+            native_function(self._likelihood, inputs),
+            native_function(self._prior, inputs[:1]),
         )
         return self._native
 
