@@ -64,7 +64,7 @@ class VariableAtPoints:
     @property
     def n_steps(self) -> int:
         """Steps of one evaluation, of all records."""
-        op = self._kind(self.system, self.filter)
+        op = LogLikelihood(self.system, self.filter, self._form)
         return op.n_steps(self._arguments[0]) if self._arguments else 0
 
     def log_likelihood(self, filter: Filter, seeds: NDArray[np.int64]) -> Array:
