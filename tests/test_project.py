@@ -70,7 +70,8 @@ def test_imported_distributions_are_the_declared_dependencies():
     imported = {
         canonicalize_name(module.partition(".")[0]) for module, _ in imports_from_elsewhere()
     }
-    assert imported | {"matplotlib"} == declared  # PyMC imports it without depending on it
+    # PyMC imports matplotlib without depending on it; users import arviz, which is its three parts.
+    assert imported | {"matplotlib", "arviz"} == declared
 
 
 # import-linter sees only whole external packages.
