@@ -7,11 +7,11 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 from arviz_stats import ELPDDataLFO, SamplingWrapper, ess, lfo_cv
-from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning, ModelError
+from ..importance import largest_good_k, smoothed
 from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.variable import select_variables
@@ -143,7 +143,7 @@ def leave_future_out(
             forecast_horizon=1,
             time_dim=time,
             pointwise=True,
-            k_threshold=_good_k(terms),
+            k_threshold=largest_good_k(terms.sizes["chain"] * terms.sizes["draw"]),
         )
 
 
@@ -177,12 +177,6 @@ def _stored_terms(idata: xr.DataTree, name: str) -> xr.DataArray | None:
     return terms.transpose("chain", "draw", ...) if ours else None
 
 
-def _good_k(terms: xr.DataArray) -> float:
-    """The Pareto k up to which weights of this many draws are reliable (Vehtari et al. 2024)."""
-    n_draws = terms.sizes["chain"] * terms.sizes["draw"]
-    return min(0.7, 1 - 1 / np.log10(n_draws))
-
-
 def _score_by_reweighting(
     idata: xr.DataTree, terms: xr.DataArray, min_observations: int
 ) -> ELPDDataLFO:
@@ -191,9 +185,11 @@ def _score_by_reweighting(
     scored = rows[:, min_observations:]
     removed = np.cumsum(scored[:, ::-1], axis=1)[:, ::-1]  # log-likelihood of d_j and all later
     efficiency = _efficiency(idata)
-    weighted = [_pareto_smoothed(column, efficiency) for column in removed.T]
+    weighted = [smoothed(-column, efficiency) for column in removed.T]
     log_weights, pareto_k = map(np.array, zip(*weighted, strict=True))
-    good_k = _good_k(terms)
+    # Equal weights in the tail are those of one point, where a chain rejected.
+    pareto_k = np.where(np.isneginf(pareto_k), np.inf, pareto_k)
+    good_k = largest_good_k(len(rows))
     known = pareto_k <= good_k
     scores = logsumexp(log_weights + scored.T, axis=1) - logsumexp(log_weights, axis=1)
     elpd_i = np.where(known, scores, np.nan)
@@ -225,16 +221,6 @@ def _score_by_reweighting(
         n_refits=0,
         p_lfo_i=by_time(p_i),
     )
-
-
-def _pareto_smoothed(
-    log_likelihood: NDArray[np.float64], efficiency: float
-) -> tuple[NDArray[np.float64], float]:
-    """Pareto-smoothed log weights 1 / likelihood, and the Pareto shape k."""
-    try:
-        return array_stats.psislw(log_likelihood, r_eff=efficiency)
-    except ValueError:  # all weights of the tail are equal, from a chain that rejected
-        return -log_likelihood, np.inf
 
 
 def _efficiency(idata: xr.DataTree) -> float:

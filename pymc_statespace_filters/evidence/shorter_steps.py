@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning
+from ..importance import MIN_EFFECTIVE, mcse_of_chains, pareto_k
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.posterior_draws import MIN_DRAWS, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
 from ..system.checks import check_count, check_random_seed
-from .log_mean import MIN_EFFECTIVE, mcse_of_chains, pareto_k
 
 N_SEEDS = 8  # of a noisy likelihood, at every draw
 MAX_CORRECTION = 0.1  # nats, of the bias of a ratio of means over these seeds

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..evidence.estimators.maximum_likelihood import maximize_noisy
 from ..evidence.estimators.newton import BatchFunction, EdgeError
-from ..evidence.log_mean import log_mean_of_independent
+from ..importance import log_mean_of_independent
 from ..sampling.starts.annealing import Population
 from .peak import EDGE, HIDDEN, Lost, Peak, unconstrained_hessian
 from .smooth import population_scale, rescaled

@@ -89,7 +89,7 @@ def test_refits_give_the_scores_of_the_whole_record(exact, idata, refit):
 
 
 def test_a_refit_wherever_weights_fail(exact, idata, refit, monkeypatch):
-    monkeypatch.setattr(module, "_good_k", lambda terms: -3.0)
+    monkeypatch.setattr(module, "largest_good_k", lambda n_draws: -3.0)
     found = psf.leave_future_out(idata, exact, min_observations=N - 4, refit=refit)
     np.testing.assert_allclose(found.elpd_i, scores()[-4:], atol=1e-5)
     assert refit.lengths == [N - 4, N - 3, N - 2, N - 1]

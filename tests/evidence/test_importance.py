@@ -7,7 +7,7 @@ import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.log_mean import pareto_k
+from pymc_statespace_filters.importance import pareto_k
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.hard_targets import Funnel
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed

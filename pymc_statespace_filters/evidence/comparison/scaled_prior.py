@@ -27,8 +27,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
+from ...importance import MIN_EFFECTIVE, SAME, log_mean_of_chains, pareto_k
 from ...pymc_model.support import can_sample
-from ..log_mean import MIN_EFFECTIVE, SAME, log_mean_of_chains, pareto_k
 
 EDGE = 0.05  # fraction of a bounded support, at each end
 # Limits beyond which the reweighted evidence is unreliable.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pymc as pm
 import xarray as xr
 
-from ..log_mean import MIN_EFFECTIVE
+from ...importance import MIN_EFFECTIVE
 from .scaled_prior import MAX_BEYOND, MAX_PARETO_K, UNCHANGED, ReweightedEvidence, ScaledPrior
 
 MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown

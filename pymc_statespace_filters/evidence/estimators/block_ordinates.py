@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from ...errors import DataMismatchError
-from ..log_mean import log_mean, mcse_of_chains, mcse_of_walkers
+from ...importance import log_mean, mcse_of_chains, mcse_of_walkers
 from ..posterior.draws import Posterior
 from .random_walk_proposal import Proposal
 from .whitening import Whitening

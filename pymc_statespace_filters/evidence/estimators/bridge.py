@@ -50,7 +50,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, log_expit, logsumexp
 from scipy.stats import Covariance, multivariate_normal
 
-from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ..posterior.draws import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals

@@ -40,8 +40,8 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import ModelError
+from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ...system.checks import check_count
-from ..log_mean import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ..posterior.draws import Posterior, check_overlap
 from .block_ordinates import BlockEstimate, estimate_in_blocks
 from .protocol import Estimate

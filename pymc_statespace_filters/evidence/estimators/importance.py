@@ -27,7 +27,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..log_mean import MIN_EFFECTIVE, log_mean_of_independent, pareto_k
+from ...importance import MIN_EFFECTIVE, log_mean_of_independent, pareto_k
 from ..posterior.draws import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from ...importance import mcse_of_chains
 from ...student_mixture import fit_mixture, place_components, standardised
-from ..log_mean import mcse_of_chains
 from ..posterior.draws import Posterior
 from .smc_moves import Particles
 

@@ -19,8 +19,8 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import ModelError
+from ...importance import MIN_EFFECTIVE, log_mean_of_independent
 from ...system.checks import check_count
-from ..log_mean import MIN_EFFECTIVE, log_mean_of_independent
 from ..posterior.draws import Posterior
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals

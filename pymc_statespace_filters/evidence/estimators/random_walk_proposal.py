@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from ...errors import DataMismatchError
-from ..log_mean import log_mean, log_mean_of_chains
+from ...importance import log_mean, log_mean_of_chains
 from ..posterior.draws import Posterior
 from .stopping import ratio_of_errors
 from .whitening import BLOCK, NormalProposals, Whitening, moments

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ModelError
+from ...importance import systematic
 from ...student_mixture import StudentMixture
 from ..posterior.draws import Posterior
 from .whitening import Whitening
@@ -55,11 +56,7 @@ def resample_systematic(log_weights: Array, rng: np.random.Generator) -> NDArray
     n_runs, n_particles = log_weights.shape
     peak = log_weights.max(axis=1, keepdims=True)
     weights = np.where(np.isneginf(peak), 1.0, np.exp(log_weights - np.maximum(peak, -1e300)))
-    ends = np.cumsum(weights, axis=1)
-    ends *= n_particles / ends[:, -1:]
-    places = rng.random((n_runs, 1)) + np.arange(n_particles)
-    chosen = [np.searchsorted(e, p, side="right") for e, p in zip(ends, places, strict=True)]
-    index = np.minimum(np.stack(chosen), n_particles - 1)
+    index = np.stack([systematic(of_run, n_particles, rng) for of_run in weights])
     return (index + n_particles * np.arange(n_runs)[:, np.newaxis]).ravel()
 
 

@@ -1,4 +1,9 @@
-"""Means of positive terms given by their logarithms, with standard errors."""
+"""Importance sampling: means of weights given by their logarithms, and what the weights are worth.
+
+A mean of weights has a standard error; the tail of the weights says whether that error holds, and
+their effective number how many equal weights they are worth. Weighted points become draws by
+resampling.
+"""
 
 import math
 from typing import NamedTuple
@@ -68,11 +73,44 @@ def log_mean_of_independent(log_terms: Array) -> LogMean:
     return LogMean(value, float(np.exp(log_terms - value).std() / len(log_terms) ** 0.5))
 
 
+def smoothed(log_weights: Array, r_eff: float = 1.0) -> tuple[Array, float]:
+    """Pareto-smoothed log weights, of any shape, and the Pareto shape k of their upper tail.
+
+    k is larger if the tail is heavier. If all weights of the tail are equal, nothing is smoothed
+    and k is -inf. ``r_eff`` is the effective over the actual number of draws. Source: Vehtari,
+    Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25(72), 1-58.
+    """
+    # ArviZ does not accept infinities.
+    finite = np.maximum(log_weights, log_weights.max() - NEGLIGIBLE)
+    n_tail = math.ceil(min(0.2 * finite.size, 3 * finite.size**0.5))
+    if np.ptp(np.sort(finite, axis=None)[-n_tail:]) < SAME:
+        return log_weights, -np.inf
+    # It expects log-likelihoods, not log weights, and returns the weights normalised.
+    new, tail = array_stats.psislw(-finite.ravel(), r_eff=r_eff)
+    return np.where(np.isneginf(log_weights), -np.inf, new.reshape(finite.shape)), float(tail)
+
+
 def pareto_k(log_weights: Array) -> float:
     """Pareto shape of the upper tail of weights, larger if heavier; -inf if all are equal."""
-    # ArviZ does not accept infinities.
-    weights = np.maximum(log_weights.ravel(), log_weights.max() - NEGLIGIBLE)
-    n_tail = math.ceil(min(0.2 * weights.size, 3 * weights.size**0.5))
-    if np.ptp(np.sort(weights)[-n_tail:]) < SAME:
-        return -np.inf
-    return float(array_stats.psislw(-weights)[1])  # expects log-likelihoods, not log weights
+    return smoothed(log_weights)[1]
+
+
+def largest_good_k(count: int) -> float:
+    """The Pareto shape up to which the mean of so many weights is reliable (the same source)."""
+    return min(0.7, 1 - 1 / math.log10(count))
+
+
+def normalised(log_weights: Array) -> Array:
+    """Weights of sum one, of which at least one is positive."""
+    weights = np.exp(log_weights - log_weights.max())
+    return np.asarray(weights / weights.sum())
+
+
+def systematic(weights: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices (count,) of points (n,) in their order, each as often as its weight says, or nearly.
+
+    The number of copies differs from its expectation by less than one.
+    """
+    ends = np.cumsum(weights)
+    places = (rng.random() + np.arange(count)) * (ends[-1] / count)
+    return np.minimum(np.searchsorted(ends, places, side="right"), len(weights) - 1)
