@@ -30,6 +30,7 @@ from .evidence import (
     estimate_evidence,
     marginal_modes,
     prior_sensitivity,
+    reweight,
     step_error,
 )
 from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
@@ -131,6 +132,7 @@ __all__ = [
     "plot_residuals",
     "plot_states",
     "prior_sensitivity",
+    "reweight",
     "run_filter",
     "run_models",
     "sample_dram",

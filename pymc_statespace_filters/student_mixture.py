@@ -64,6 +64,10 @@ class StudentMixture:
             np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
         )
 
+    def widened(self, scale: float) -> "StudentMixture":
+        """The same with wider components."""
+        return StudentMixture(self.weights, self.means, scale * self.chols)
+
     def affine(self, mean: Array, chol: Array) -> "StudentMixture":
         """The distribution of mean + chol x."""
         return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)

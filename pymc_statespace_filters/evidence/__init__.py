@@ -9,6 +9,7 @@ from .comparison import (
 )
 from .estimation import EvidenceEstimates, chib_jeliazkov, estimate_evidence
 from .evidence import Evidence
+from .reweighting import reweight
 from .shorter_steps import step_error
 
 __all__ = [
@@ -21,5 +22,6 @@ __all__ = [
     "estimate_evidence",
     "marginal_modes",
     "prior_sensitivity",
+    "reweight",
     "step_error",
 ]

@@ -11,6 +11,7 @@ import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
 from ..errors import EvidenceWarning, ModelError
+from ..filters.protocol import Filter
 from ..parallel.cpu_affinity import cores_set_to
 from ..system.checks import check_count, check_positive
 from .agreement import Agreement, assess_agreement
@@ -19,7 +20,7 @@ from .estimators.chib_jeliazkov import ChibJeliazkov
 from .estimators.importance import Importance
 from .estimators.laplace import Laplace
 from .estimators.prior_monte_carlo import PriorMonteCarlo
-from .estimators.protocol import Estimator
+from .estimators.protocol import Estimator, uses_draws
 from .estimators.tempered_smc import TemperedSMC
 from .evidence import Evidence
 from .runner import run_estimators
@@ -33,6 +34,7 @@ _BUILT_IN: tuple[Estimator, ...] = (
     PriorMonteCarlo(),
     Laplace(),
 )
+DEFAULT = ("chib_jeliazkov", "bridge")
 ESTIMATORS: Mapping[str, Estimator] = {estimator.name: estimator for estimator in _BUILT_IN}
 
 
@@ -177,7 +179,8 @@ def estimate_evidence(
     idata: xr.DataTree,
     model: pm.Model | None = None,
     *,
-    estimators: str | Estimator | Iterable[str | Estimator] = ("chib_jeliazkov", "bridge"),
+    filter: Filter | None = None,
+    estimators: str | Estimator | Iterable[str | Estimator] | None = None,
     target_se: float = 0.05,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -192,13 +195,19 @@ def estimate_evidence(
         Posterior draws from any sampler, as for `chib_jeliazkov`.
     model : pymc.Model, optional
         The model that was sampled; by default that of the ``with`` block.
-    estimators : str, Estimator, or iterable of them
-        Names among "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution),
-        "warp_bridge" (warp-III bridge sampling, for skewed posteriors), "importance" (importance
-        sampling from a mixture of Student-t distributions, for several modes), "tempered_smc"
-        (tempered sequential Monte Carlo from the prior, guided by the draws), "prior_monte_carlo"
-        (mean likelihood of prior draws, for few parameters) and "laplace" (Laplace's approximation,
-        without a standard error); or any
+    filter : filter, optional
+        Another filter than that of the draws, unbiased as `BootstrapPF` or exact: the evidence is
+        then that of the model with this filter in every observed StateSpace variable. The draws
+        only say where the posterior lies, so that "importance" is the default and
+        "chib_jeliazkov", "bridge", "warp_bridge" and "laplace" are refused. By default the filter
+        of the model.
+    estimators : str, Estimator, or iterable of them, optional
+        By default "chib_jeliazkov" and "bridge". Names among "chib_jeliazkov", "bridge" (bridge
+        sampling to a normal distribution), "warp_bridge" (warp-III bridge sampling, for skewed
+        posteriors), "importance" (importance sampling from a mixture of Student-t distributions,
+        for several modes), "tempered_smc" (tempered sequential Monte Carlo from the prior, guided
+        by the draws), "prior_monte_carlo" (mean likelihood of prior draws, for few parameters) and
+        "laplace" (Laplace's approximation, without a standard error); or any
         `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other settings or
         your own.
     target_se : float
@@ -227,8 +236,9 @@ def estimate_evidence(
     Raises
     ------
     ModelError
-        If an estimator is unknown, `target_se` is not positive, or no estimator can treat the
-        model: "laplace" needs a deterministic likelihood and a mode inside the support,
+        If an estimator is unknown, `target_se` is not positive, `filter` is biased or that of the
+        model, or no estimator can treat the model: "laplace" needs a deterministic likelihood and a
+        mode inside the support,
         "tempered_smc" and "prior_monte_carlo" a prior that can be sampled. Further as
         `chib_jeliazkov`.
     DataMismatchError, TypeError
@@ -248,6 +258,16 @@ def estimate_evidence(
     distributions that they fit to the halves of the draws: the first to choose its proposals, the
     other two in their estimates. No estimate depends on which others are made.
 
+    With `filter`, the mean of prior times estimated likelihood over the density of the proposals is
+    unbiased, and the noise of the estimates is part of the standard error (Tran, Scharth, Pitt and
+    Kohn 2013). Evaluated are at most 1000 of the draws, and the proposals. An estimate stored
+    before by the same estimator is replaced.
+
+    References
+    ----------
+    M.-N. Tran, M. Scharth, M. K. Pitt and R. Kohn (2013). Importance sampling squared for Bayesian
+    inference in latent variable models. arXiv:1309.3339.
+
     Examples
     --------
     >>> import arviz as az
@@ -263,11 +283,17 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
+    if estimators is None:
+        estimators = DEFAULT if filter is None else "importance"
+    selected = _select_estimators(estimators, check_positive("target_se", target_se))
+    if filter is not None:
+        _check_guided(selected)
     with cores_set_to(_checked_cores(cores)), COMPILATION:
         estimates = run_estimators(
             idata,
             model,
-            _select_estimators(estimators, check_positive("target_se", target_se)),
+            selected,
+            filter=filter,
             random_seed=random_seed,
             extend_inferencedata=extend_inferencedata,
             progressbar=progressbar,
@@ -310,6 +336,15 @@ def _select_estimators(
     if not found:
         raise ModelError(f"estimators must have at least one of {list(ESTIMATORS)}, got {given!r}")
     return [_with_target(estimator, target_se) for estimator in found.values()]
+
+
+def _check_guided(estimators: Iterable[Estimator]) -> None:
+    """Raise unless the estimators take the draws for no more than a guide."""
+    if refused := [e.name for e in estimators if uses_draws(e) and not isinstance(e, Importance)]:
+        raise ModelError(
+            "estimators must be among 'importance', 'tempered_smc' and 'prior_monte_carlo' with "
+            f"filter=, got {refused}, for which the draws must be those of the exact posterior"
+        )
 
 
 def _with_target(estimator: Estimator, target_se: float) -> Estimator:

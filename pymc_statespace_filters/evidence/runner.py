@@ -13,6 +13,7 @@ import xarray as xr
 from ..errors import EvidenceWarning, ModelError
 from ..filter_checks.checks import stored
 from ..filter_checks.finding import OFF
+from ..filters.protocol import Filter
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
@@ -24,9 +25,11 @@ from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
 from .evidence import Evidence, store_evidence
 from .posterior.draws import Posterior, build_posterior
+from .posterior.exact_density import MOST_DRAWS, ExactDensity, with_exact_density
 from .posterior.observed_data import data_fingerprint, observation_count
 
 MAXIMUM = "maximum likelihood"
+AT_DRAWS = "likelihood of the draws"
 SHARED = "shared proposals"
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
 
@@ -36,13 +39,15 @@ def run_estimators(
     model: pm.Model | None,
     estimators: Sequence[Estimator],
     *,
+    filter: Filter | None = None,
     random_seed: int | np.random.Generator | None,
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> dict[str, Evidence]:
     """Run estimators with different names on the same draws, and report an `Evidence` for each.
 
-    The other arguments are those of `chib_jeliazkov`.
+    With another ``filter`` the evidence is that of the model with it. The other arguments are those
+    of `chib_jeliazkov`.
 
     Warns
     -----
@@ -54,13 +59,15 @@ def run_estimators(
     if not isinstance(model, pm.Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
     posterior_group(idata)  # fails early, before anything is compiled
-    density = ModelDensity(pm.modelcontext(model), moved=noise_was_moved(idata))
+    model = pm.modelcontext(model)
+    exact = None if filter is None else ExactDensity(model, filter)
+    density = ModelDensity(model, moved=noise_was_moved(idata))
     posterior, noise = build_posterior(idata, density)
-    support = Support.of(density.model)
+    support = Support.of(model)
     common = (
         *support.check(),
-        *check_discretisation(density.model, idata, posterior.draws),
-        *stored(idata, density.model, OFF),
+        *check_discretisation(model, idata, posterior.draws),
+        *(stored(idata, model, OFF) if exact is None else ()),
     )
     of_chains = tuple(check_convergence(posterior, idata))
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
@@ -70,7 +77,11 @@ def run_estimators(
         """An estimator's random numbers, independent of which others run."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
-    with row_progress(density.calls, enabled=progressbar) as announce:
+    with row_progress(exact or density.calls, enabled=progressbar) as announce:
+        if exact is not None:
+            noise = "refreshed" if exact.n_noisy else "none"
+            announce(AT_DRAWS, MOST_DRAWS)
+            posterior = with_exact_density(posterior, exact, stream(AT_DRAWS))
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
@@ -82,8 +93,9 @@ def run_estimators(
         _warn(LESS_CERTAIN.format(of_which), of_chains)
     for name, refusal in refusals.items():
         _warn(f"no estimate by {name}", [str(refusal)])
-    of_model = _model_fields(density.model, posterior, support)
+    of_model = _model_fields(model, posterior, support)
     of_model |= {"max_log_likelihood": largest, "noise": noise}
+    of_model["approximate"] = exact is None and not exactness(model)
     found = {}
     for name, estimate in estimates.items():
         for message, reasons in _problems(name, estimate):
@@ -114,7 +126,6 @@ def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> di
         "log_volume": support.log_volume,
         "uniform": support.uniform,
         "improper": support.improper,
-        "approximate": not exactness(model),
     }
 
 

@@ -130,6 +130,22 @@ def check_system_and_filter(system: Any, filter: Any) -> None:
         raise ModelError(f"{refusal}; {alternatives(compiled, filter)}") from None
 
 
+def check_unbiased(system: Any, filter: Any) -> None:
+    """Raise unless a filter can treat a system, and its mean likelihood is the exact one."""
+    check_system_and_filter(system, filter)
+    compiled = compile_system(system)
+    if not _is_unbiased(compiled, filter):
+        others = listed(f for f in filters_for(compiled) if _is_unbiased(compiled, f))
+        raise ModelError(
+            f"filter must be exact or unbiased for this system, got {short_form(filter)}, whose "
+            f"likelihood has a bias; {others or 'no filter of the package'} has none"
+        )
+
+
+def _is_unbiased(system: System, filter: Any) -> bool:
+    return getattr(filter, "unbiased", False) or filter.is_exact_for(system)
+
+
 def _followers(system: System, filter: Any) -> list[Filter]:
     """The other filters that take a system, without the guided one where an equation jumps.
 

@@ -50,21 +50,19 @@ Array = NDArray[np.float64]
 
 
 class ConstrainedValues:
-    """The free variables of a model as a function of its unconstrained vector.
+    """Variables of a model as a function of its unconstrained vector.
 
-    Attributes
-    ----------
-    names : list of str
-        Of the free variables, in the order of the vector.
+    ``variables`` are by default the free ones, in the order of the vector; ``names`` are theirs.
     """
 
-    def __init__(self, model: pm.Model) -> None:
+    def __init__(self, model: pm.Model, variables: Sequence[TensorVariable] | None = None) -> None:
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        outputs = model.replace_rvs_by_values(model.free_RVs)
+        chosen = model.free_RVs if variables is None else variables
+        outputs = model.replace_rvs_by_values(chosen)
         # Machine code would take seconds to compile.
         mode = "FAST_COMPILE"
         self._function, _ = compile_raveled(model.initial_point(), outputs, values, mode=mode)
-        self.names = [rv.name for rv in model.free_RVs]
+        self.names = [variable.name for variable in chosen]
 
     def __call__(self, x: Array) -> dict[str, np.ndarray]:
         """Values by name at the unconstrained point x (k,)."""

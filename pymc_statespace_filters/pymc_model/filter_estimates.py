@@ -4,8 +4,10 @@ Parameters and inputs at the points are computed once, and each filter is evalua
 machine code, so that another filter compiles what is new about it alone and not the model again.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from typing import Self
 
 import numpy as np
 import pymc as pm
@@ -48,14 +50,26 @@ class VariableAtPoints:
         free = [model.rvs_to_values[rv] for rv in model.free_RVs]
         graphs = model.replace_rvs_by_values([theta, *given])
         varying = [i for i, graph in enumerate(graphs) if set(ancestors([graph])) & set(free)]
-        constant = _values_at(model, graphs, x[:1])[0]
-        at_points = _values_at(model, [graphs[i] for i in varying], x)
-        self._arguments = [
-            [values[varying.index(i)] if i in varying else constant[i] for i in range(len(graphs))]
-            for values in at_points
-        ]
+        self._constant = _at_points(model, graphs)(x[:1])[0]
+        self._varying, self._evaluate = varying, _at_points(model, [graphs[i] for i in varying])
+        self._arguments = self._arguments_at(x)
         self._form = PANEL if steps.type.ndim == 2 else ONE_RECORD
         self._scored = scored_rows(node)
+
+    def moved_to(self, x: Array) -> Self:
+        """The same at other points x (m, k), with what has been compiled."""
+        moved = copy(self)
+        moved._arguments = self._arguments_at(x)
+        return moved
+
+    def _arguments_at(self, x: Array) -> list[list[np.ndarray]]:
+        found = []
+        for values in self._evaluate(x):
+            arguments = list(self._constant)
+            for i, value in zip(self._varying, values, strict=True):
+                arguments[i] = value
+            found.append(arguments)
+        return found
 
     def __len__(self) -> int:
         """The number of points."""
@@ -111,8 +125,11 @@ class VariableAtPoints:
         return np.reshape(found, seeds.shape)
 
 
-def _values_at(model: pm.Model, graphs: list[Variable], x: Array) -> list[list[np.ndarray]]:
-    """The values of graphs at every point; machine code would take longer to compile."""
+def _at_points(model: pm.Model, graphs: list[Variable]) -> Callable[[Array], list]:
+    """A function of points that gives the values of graphs at each of them.
+
+    Machine code would take longer to compile.
+    """
     free = [model.rvs_to_values[rv] for rv in model.free_RVs]
     function, _ = compile_raveled(model.initial_point(), graphs, free, mode="FAST_COMPILE")
-    return [[np.array(value) for value in function(point)] for point in x]
+    return lambda x: [[np.array(value) for value in function(point)] for point in x]

@@ -46,11 +46,11 @@ from typing import Any
 import numpy as np
 from arviz_stats import ess, mcse
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import expit, log_expit, logsumexp
+from scipy.special import expit, log_expit
 from scipy.stats import Covariance, multivariate_normal
 
 from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ..pooled import bridge_constant
 from ..posterior.draws import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
@@ -247,11 +247,11 @@ def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _F
     `pooled` is what `at_draws` would be under the q fitted to all draws.
     """
     log_odds = math.log(at_draws.size / at_proposals.size)
-    shift = log_odds - _fixed_point(at_draws, at_proposals, log_odds)
+    shift = log_odds - bridge_constant(at_draws, at_proposals, log_odds)
     # One fixed-point step suffices: the effective sample size depends only weakly on itself.
     n_effective = float(ess(expit(-at_draws - shift), method="mean"))
     log_odds = math.log(n_effective / at_proposals.size)
-    log_evidence = _fixed_point(at_draws, at_proposals, log_odds)
+    log_evidence = bridge_constant(at_draws, at_proposals, log_odds)
     shift = log_odds - log_evidence
 
     terms = expit(-at_draws - shift)
@@ -265,23 +265,6 @@ def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _F
         n_effective=n_effective,
         zero_density=float(np.isneginf(at_proposals).mean()),
     )
-
-
-def _fixed_point(at_draws: Array, at_proposals: Array, log_odds: float) -> float:
-    """The unique log-evidence that is consistent with the optimal h which it implies."""
-
-    def excess(log_evidence: float) -> float:
-        shift = log_odds - log_evidence
-        upper = logsumexp(log_expit(at_proposals + shift)) - math.log(at_proposals.size)
-        lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
-        return float(upper - lower - log_odds)
-
-    # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
-    possible = at_proposals[~np.isneginf(at_proposals)]
-    log_fraction = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
-    least = min(at_draws.min(), possible.min()) + log_fraction - 1
-    most = max(at_draws.max(), possible.max()) + 1
-    return float(brentq(excess, least, most, xtol=1e-9))
 
 
 def _normal(fitted: Whitening) -> Any:

@@ -1,0 +1,144 @@
+"""Draws of an approximate posterior, weighted to represent the exact one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ...importance import normalised
+from ..estimators.student_mixture import choose_mixture
+from ..pooled import Pooled
+from ..posterior.draws import Posterior, check_overlap
+from ..posterior.exact_density import fresh_seeds
+from .defence import N_ROUNDS, N_SEARCHED, defensive_mixture
+
+FEWEST_POINTS = 200
+POINTS_PER_DRAW = 0.25
+# Draws and seeds with which the noise of an estimate is measured.
+N_MEASURED, N_MEASURING = 16, 8
+MOST_SEEDS = 16
+# Relative variance that the noise of the averaged estimates of a point may have; it is one where
+# half of the effective draws are lost.
+MAX_NOISE = 1.0
+BEYOND = 0.01  # share of the corrected draws that lie further out than all others
+
+Array = NDArray[np.float64]
+Seeds = NDArray[np.int64]
+Evaluate = Callable[[Array, Seeds], Array]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Draws and defensive points with their weights for the exact posterior.
+
+    Attributes
+    ----------
+    x : ndarray (n + m, k)
+        The n draws, chain by chain, and m defensive points.
+    seeds : ndarray (n + m, r, v)
+        Of the noise of the r estimates of a point, for each of v variables.
+    log_estimates : ndarray (n + m, r)
+        The log-density of the exact posterior by these estimates.
+    pooled : Pooled
+        Weights for the mean of the estimates.
+    log_fit : ndarray (n + m,)
+        Log-density of the mixture fitted to the draws.
+    """
+
+    x: Array
+    seeds: Seeds
+    log_estimates: Array
+    pooled: Pooled
+    log_fit: Array
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the log weights of the draws, those of zero left out."""
+        log_weights = self.pooled.log_draw_weights
+        return float(log_weights[np.isfinite(log_weights)].std())
+
+    @cached_property
+    def beyond_draws(self) -> tuple[float, float]:
+        """The share of the exact posterior where there are no draws, and its standard error.
+
+        By the defensive points alone, weighted by their own density: further out, in terms of the
+        density fitted to the draws, than all but a hundredth of the corrected draws.
+        """
+        n = self.pooled.n_draws
+        level = _weighted_quantile(self.log_fit[:n], self.pooled.log_draw_weights.ravel(), BEYOND)
+        weights = normalised(self.pooled.log_target[n:] - self.pooled.log_q[n:])
+        outside = self.log_fit[n:] < level
+        share = float(weights @ outside)
+        error = float(np.sqrt(weights**2 @ (outside - share) ** 2))
+        return max(share - BEYOND, 0.0), error
+
+
+def correct(
+    posterior: Posterior,
+    kept: Posterior,
+    evaluate: Evaluate,
+    n_noisy: int,
+    rng: np.random.Generator,
+    announce: Callable[[str, int], None] = lambda task, total: None,
+) -> Correction:
+    """Weight draws of a posterior, and points that defend against what they miss.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        The approximate one.
+    kept : Posterior
+        The same with those draws that are weighted.
+    evaluate : callable
+        ``evaluate(x, seeds)`` estimates the exact log-density at points x (m, k), r times each:
+        from seeds (m, r, n_noisy) to estimates (m, r).
+    n_noisy : int
+        Number of noisy likelihoods in it.
+    rng : numpy.random.Generator
+    announce : callable, optional
+        Told what is evaluated next, and the number of estimates.
+    """
+    fit = choose_mixture(posterior, rng)
+    draws = kept.draws.reshape(-1, kept.draws.shape[-1])
+    level = float(np.quantile(fit.log_density(draws), BEYOND))
+
+    def once(x: Array) -> Array:
+        return evaluate(x, fresh_seeds((len(x), 1, n_noisy), rng))[:, 0]
+
+    announce("search beyond the draws", N_ROUNDS * N_SEARCHED)
+    q = defensive_mixture(posterior, fit, level, once, rng)
+    points = q.sample(max(FEWEST_POINTS, int(POINTS_PER_DRAW * len(draws))), rng)
+    x = np.concatenate([draws, points])
+    n_seeds = _seeds_needed(draws, evaluate, n_noisy, rng) if n_noisy else 1
+    seeds = fresh_seeds((len(x), n_seeds, n_noisy), rng)
+    announce("weights", n_seeds * len(x))
+    log_estimates = evaluate(x, seeds)
+    log_target = logsumexp(log_estimates, axis=1) - np.log(n_seeds)
+    check_overlap(log_target)
+    approximate = np.append(kept.log_density.ravel(), posterior.evaluate(points, rng))
+    pooled = Pooled(kept.log_density.shape, log_target, approximate, q.log_density(x))
+    return Correction(x, seeds, log_estimates, pooled, fit.log_density(x))
+
+
+def _seeds_needed(draws: Array, evaluate: Evaluate, n_noisy: int, rng: np.random.Generator) -> int:
+    """How many estimates of a point are averaged, so that their noise decides no weight.
+
+    If the log of an estimate has the variance v, the mean of r of them has the relative variance
+    (exp(v) - 1) / r.
+    """
+    measured = draws[np.linspace(0, len(draws) - 1, N_MEASURED).astype(int)]
+    found = evaluate(measured, fresh_seeds((N_MEASURED, N_MEASURING, n_noisy), rng))
+    finite = found[np.isfinite(found).all(axis=1)]
+    variance = float(finite.var(axis=1, ddof=1).mean()) if len(finite) else np.inf
+    most = np.log1p(MAX_NOISE * MOST_SEEDS)
+    return max(1, int(np.ceil(np.expm1(min(variance, most)) / MAX_NOISE)))
+
+
+def _weighted_quantile(values: Array, log_weights: Array, probability: float) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(normalised(log_weights)[order])
+    place = int(np.searchsorted(below, probability))
+    return float(values[order[min(place, len(values) - 1)]])

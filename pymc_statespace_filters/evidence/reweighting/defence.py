@@ -1,0 +1,117 @@
+"""Points that defend a reweighted posterior against what its draws have missed.
+
+Draws have weights only where they are, so that no weight shows a mode that the approximate
+posterior lacks or its chains have missed. Further points come from a density that is known
+everywhere and much wider, a mixture of equal parts:
+
+* the prior, if it can be sampled;
+* the Student mixture fitted to the draws, three times as wide;
+* this mixture as it is, which joins the points to the draws;
+* a Student mixture fitted to a flattened copy of the approximate posterior;
+* one fitted to a flattened copy of the exact posterior where there are no draws.
+
+A flattened copy is a cloud of points, weighted by a power of the posterior density over the density
+of the cloud: the largest power that leaves a fifth of the cloud. It enters by way of the fit alone,
+so that the mixture has a known density whatever was found. The first cloud consists of the two wide
+parts and costs evaluations of the approximate likelihood. The second one grows in rounds, each of
+them guided by the fit to those before, and its points serve for nothing else.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ...errors import ModelError
+from ...importance import normalised, systematic
+from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ...tempering import next_temperature
+from ..posterior.draws import Posterior
+
+SCALE = 3.0  # of the wide part, in widths of the fit to the draws
+N_CLOUD = 2000
+N_ROUNDS, N_SEARCHED = 10, 50  # of the search by the exact likelihood; points in each
+ESS_FRACTION = 0.2  # of a cloud, left by the power of its weights
+N_FITTED, N_COMPONENTS = 1000, 10  # of the fit to a flattened copy
+
+Array = NDArray[np.float64]
+
+
+class Law(Protocol):
+    """A distribution on the unconstrained space."""
+
+    def log_density(self, x: Array) -> Array:
+        """Normalised log-density at points (m, k), shape (m,)."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Independent points, shape (count, k)."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Several laws with equal weights."""
+
+    parts: Sequence[Law]
+
+    def log_density(self, x: Array) -> Array:
+        """Log-density of points x (m, k), shape (m,)."""
+        of_parts = [part.log_density(x) for part in self.parts]
+        return np.asarray(logsumexp(of_parts, axis=0) - np.log(len(self.parts)))
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Points (count, k), as many of each part, or one more, in random order."""
+        shares = np.array_split(np.arange(count), len(self.parts))
+        points = [p.sample(len(share), rng) for p, share in zip(self.parts, shares, strict=True)]
+        return rng.permutation(np.concatenate(points))
+
+
+def defensive_mixture(
+    posterior: Posterior,
+    fit: StudentMixture,
+    level: float,
+    exact: Callable[[Array], Array],
+    rng: np.random.Generator,
+) -> Mixture:
+    """The mixture of wide parts.
+
+    ``fit`` is the mixture fitted to the draws, whose log-density is below ``level`` where there are
+    none; ``exact`` evaluates the exact log-density, or estimates it.
+    """
+    cloud = Mixture([*_proper_prior(posterior, rng), fit.widened(SCALE)])
+    x = cloud.sample(N_CLOUD, rng)
+    copy = _flattened(x, posterior.evaluate(x, rng) - cloud.log_density(x), rng)
+    found: list[Law] = []
+    x, log_ratio = x[:0], np.empty(0)
+    for _ in range(N_ROUNDS):
+        search = Mixture([*cloud.parts, *found, *found])
+        new = search.sample(N_SEARCHED, rng)
+        new = new[fit.log_density(new) < level]
+        x = np.concatenate([x, new])
+        log_ratio = np.append(log_ratio, exact(new) - search.log_density(new))
+        found = _flattened(x, log_ratio, rng)
+    return Mixture([*cloud.parts, fit, *copy, *found])
+
+
+def _proper_prior(posterior: Posterior, rng: np.random.Generator) -> list[Law]:
+    """The prior, unless it is improper or its density is not that of its draws."""
+    prior = posterior.required_prior
+    try:
+        prior.sample(N_CLOUD, rng)
+    except ModelError:
+        return []
+    return [prior]
+
+
+def _flattened(x: Array, log_ratio: Array, rng: np.random.Generator) -> list[Law]:
+    """The fit to points x (m, k) weighted by a power of a ratio of densities, if there is one."""
+    if not np.isfinite(log_ratio).any():
+        return []
+    power = next_temperature(0.0, log_ratio, ESS_FRACTION)
+    chosen = x[systematic(normalised(power * log_ratio), N_FITTED, rng)]
+    if (copy := standardised(chosen)) is None:
+        return []
+    mixture = fit_mixture(copy.z, place_components(copy.z, N_COMPONENTS, rng))
+    return [mixture.affine(copy.mean, copy.chol)]
