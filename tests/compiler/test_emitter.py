@@ -133,6 +133,18 @@ def test_negative_infinite_and_whole_constants():
         np.testing.assert_array_equal(out, [expected, np.nan, 3.0])
 
 
+def test_the_same_code_is_kept_under_each_of_its_names():
+    """As what does nothing is, of a system that stays where it is."""
+    code, _ = vector_code([7.0])
+    out = np.zeros(1)
+    for name in ("one", "another"):
+        entry = ModuleEntryPoint(code, {"given": F64_PTR, "out": F64_PTR}, name)
+        entry.compile()
+        assert entry.address
+        CFUNCTYPE(None, c_void_p, c_void_p)(entry.address)(out.ctypes.data, out.ctypes.data)
+        assert out[0] == 7.0
+
+
 def test_a_deep_expression_is_emitted_without_recursion():
     arena = Arena()
     value = arena.input("x.0")

@@ -154,7 +154,8 @@ class ModuleEntryPoint(EntryPoint):
         for needed in self.code.needs:
             needed.compile()
         with held_interrupts(), global_compiler_lock:
-            content = kept(self.key, self._machine_code)
+            # By its symbol: code of another name may be the same, as that which does nothing.
+            content = kept(self.key and self.symbol, self._machine_code)
             engine = _codegen()._engine._ee
             engine.add_object_file(llvm.ObjectFileRef.from_data(content))
             engine.finalize_object()
