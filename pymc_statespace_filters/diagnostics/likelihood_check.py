@@ -7,7 +7,7 @@ import pandas as pd
 import pymc as pm
 import xarray as xr
 
-from ..filter_checks.checks import check_model, draws_to_check, outcomes_of, store
+from ..filter_checks.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
 from ..system.checks import check_count, check_random_seed
 
@@ -139,8 +139,8 @@ def check_filter(
     if filter is not None:
         check_is_filter(filter)
     table = check_model(
+        idata,
         model,
-        draws_to_check(idata, model),
         filter=filter,
         n_points=check_count("n_draws", n_draws, _LEAST_POINTS),
         seconds=_SECONDS,

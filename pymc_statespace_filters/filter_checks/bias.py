@@ -98,12 +98,13 @@ def reference_of(found: Comparison) -> Estimates | None:
     if plain is None or not plain.is_usable:
         return None
     for guided in found.guided:
-        if not guided.is_usable:
-            continue
         gap = guided.mean - plain.mean
-        spread = float(gap.std(ddof=1) / np.sqrt(gap.size)) if gap.size > 1 else np.inf
+        gap = gap[np.isfinite(gap)]
+        if not guided.is_usable or gap.size < 2:
+            continue
+        spread = float(gap.std(ddof=1) / np.sqrt(gap.size))
         if abs(gap.mean()) <= 3.0 * spread + _HIGHER:
-            return min(plain, guided, key=lambda one: float(np.median(one.error)))
+            return min(plain, guided, key=lambda one: one.typical_error)
         return guided if gap.mean() > 0.0 else plain
     return plain
 

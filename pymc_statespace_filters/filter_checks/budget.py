@@ -7,7 +7,7 @@ _PLAIN_NS = 5.0
 # The number of particles of the plain filter, at least and at most.
 _LEAST, _MOST = 200, 20_000
 # Of the time, for the estimates of plain particles; the rest is for compilation and other filters.
-_SHARE = 0.35
+_SHARE = 0.3
 
 
 class Budget:

@@ -37,7 +37,7 @@ _SLACK = 3.0
 _MOST_DRAWS = 500  # of each chain, from which mean and spread are taken
 
 
-def needs_check(system: Any, filter: Filter) -> bool:
+def _needs_check(system: Any, filter: Filter) -> bool:
     """Whether the likelihood of a filter may be off for reasons that its noise does not show."""
     compiled = compile_system(system)
     if isinstance(filter, BootstrapPF):
@@ -45,7 +45,7 @@ def needs_check(system: Any, filter: Filter) -> bool:
     return not filter.is_exact_for(compiled) or (filter.noisy and not compiled.is_linear)
 
 
-def draws_to_check(idata: xr.DataTree, model: pm.Model) -> Array:
+def _draws_of(idata: xr.DataTree, model: pm.Model) -> Array:
     """Draws (n, k) on the unconstrained space, all or some hundred of each chain."""
     posterior = posterior_group(idata)
     every = max(1, posterior.sizes["draw"] // _MOST_DRAWS)
@@ -55,15 +55,15 @@ def draws_to_check(idata: xr.DataTree, model: pm.Model) -> Array:
 
 
 def check_model(
+    idata: xr.DataTree,
     model: pm.Model,
-    draws: Array,
     *,
     filter: Filter | None,
     n_points: int,
     seconds: float,
     rng: np.random.Generator,
 ) -> pd.DataFrame:
-    """Check the filters of all observed StateSpace variables, at draws (n, k) unconstrained.
+    """Check the filters of all observed StateSpace variables, at draws of the posterior.
 
     ``filter`` is checked in their place; None: their own. ``seconds`` of CPU time are for all
     variables together.
@@ -78,12 +78,14 @@ def check_model(
         raise ModelError("model must have an observed StateSpace variable, got none")
     for name, one in chosen.items():
         check_system_and_filter(nodes[name].op.system, one)
+    checked = {n for n, one in chosen.items() if _needs_check(nodes[n].op.system, one)}
+    draws = _draws_of(idata, model) if checked else np.empty((0, 0))
     rows = []
-    n_checked = sum(needs_check(nodes[name].op.system, one) for name, one in chosen.items())
     for name, one in chosen.items():
-        if needs_check(nodes[name].op.system, one):
-            budget = Budget(seconds / n_checked)
-            findings = _check_variable(model, name, one, draws, n_points, budget, rng)
+        if name in checked:
+            budget = Budget(seconds / len(checked))
+            with np.errstate(invalid="ignore"):  # minus infinity minus itself: failures
+                findings = _check_variable(model, name, one, draws, n_points, budget, rng)
         else:
             findings = [_plain_row(one)]
         rows += [{"variable": name, "filter": short_form(one)} | f._asdict() for f in findings]
@@ -136,7 +138,8 @@ def _is_relevant(
     factor = np.where(points.spread == 0.0, points.spread.max(), points.spread)
     allowed = _SLACK + points.x.shape[1] * np.log(factor)
     is_draw = points.spread == 1.0
-    return ~is_draw & (density >= density[is_draw].min() - allowed)
+    lowest = density[is_draw & np.isfinite(density)].min(initial=np.inf)
+    return ~is_draw & (density >= lowest - allowed)
 
 
 def _density_of_others(model: pm.Model, name: str, x: Array) -> Array:

@@ -22,7 +22,7 @@ from .budget import Budget
 
 Array = NDArray[np.float64]
 
-N_SEEDS, N_GUIDED_SEEDS = 4, 8  # of noisy filters at each point; guided ones take less time
+N_SEEDS, N_GUIDED_SEEDS = 6, 8  # of noisy filters at each point; guided ones take less time
 _AT_ONCE = 4  # points, after which the time is looked at
 _MORE = 4  # times as many particles has the second guided witness
 # Standard deviation of the logs of estimates, in nats, above which their mean is not trusted.
@@ -49,6 +49,12 @@ class Estimates(NamedTuple):
         with np.errstate(invalid="ignore"):
             ratios = np.exp(self.logs - self.mean[:, None])
         return ratios.std(axis=1, ddof=1) / np.sqrt(n)
+
+    @property
+    def typical_error(self) -> float:
+        """The median of the standard errors; infinite where all estimates failed."""
+        known = self.error[np.isfinite(self.error)]
+        return float(np.median(known)) if known.size else np.inf
 
     @property
     def scatter(self) -> float:

@@ -36,7 +36,7 @@ def shortfall(found: Comparison, bounds: NDArray[np.float64]) -> float:
 def low_at(found: Comparison, where: str) -> Finding:
     """Test the estimates of an unbiased filter at some points, ``where`` in words."""
     checked, name = found.checked, short_form(found.checked.filter)
-    error = float(np.median(checked.error))
+    error = checked.typical_error
     proved = shortfall(found, checked.mean) - _N_ERRORS * error
     statistic, se = _difference(found)
     visible = _visible(found)
@@ -74,7 +74,7 @@ def _difference(found: Comparison) -> tuple[float, float]:
 
 def _visible(found: Comparison) -> float:
     if found.exact is not None:
-        return _N_ERRORS * float(np.median(found.checked.error)) + TOLERATED
+        return _N_ERRORS * found.checked.typical_error + TOLERATED
     known = np.isfinite(found.checked.mean)
     if found.plain is None or not found.plain.is_usable or not known.any():
         return np.inf
@@ -82,7 +82,7 @@ def _visible(found: Comparison) -> float:
     seen = visible_shortfall(
         found.plain.logs[known], found.checked.mean[known], ALPHA / n_witnesses
     )
-    return seen + _N_ERRORS * float(np.median(found.checked.error))
+    return seen + _N_ERRORS * found.checked.typical_error
 
 
 def _why(found: Comparison) -> str:

@@ -19,6 +19,7 @@ from ..filters.signatures import PANEL
 from ..ops.likelihood import LogLikelihood, vectorized
 from ..ops.unplanned import cache_key, check_panel, check_record, end_of_record, single_record
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
+from .held_seed import warn_of_held_seed
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
@@ -102,6 +103,7 @@ def _log_density(
     """log p(d_j | d_1 .. d_{j-1}), one term per observation, 0 for those that are not scored."""
     (value,) = values
     theta, steps, inputs, t0, seed = params
+    warn_of_held_seed(op.filter)
     likelihood = LogLikelihood(op.system, op.filter)
     terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
     if op.score_from == 0:
@@ -119,6 +121,7 @@ def _log_density_of_panel(
     """The same for every record; the first rows of each are not scored."""
     (value,) = values
     theta, rows, inputs, t0, seed = params
+    warn_of_held_seed(op.filter)
     likelihood = LogLikelihood(op.system, op.filter, PANEL)
     terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
     if op.score_from == 0:

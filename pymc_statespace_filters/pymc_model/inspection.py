@@ -30,6 +30,12 @@ def state_space_nodes(model: pm.Model) -> dict[str, Any]:
     }
 
 
+def observes_state_space(model: pm.Model) -> bool:
+    """Whether a model has an observed StateSpace variable."""
+    nodes = state_space_nodes(model).values()
+    return any(node.outputs[1] in model.observed_RVs for node in nodes)
+
+
 def panel_variables(model: pm.Model) -> list[str]:
     """The names of the StateSpace variables that hold several records."""
     nodes = state_space_nodes(model)

@@ -299,12 +299,17 @@ def test_gradient_samplers_stop_and_name_the_right_one(filter, sample):
 
 def test_other_samplers_run_on_estimates_and_leave_the_seed_alone():
     with pair_model(PF) as model:
-        for step in (psf.DRAM(), pm.DEMetropolisZ()):
-            idata = pm.sample(step=step, **SHORT)
-            assert len(np.unique(idata["posterior"]["a"])) > 5
-            assert model["d_seed"].get_value() == 3
-            assert idata["constant_data"]["d_seed"] == 3
+        idata = pm.sample(step=psf.DRAM(), **SHORT)
+        assert len(np.unique(idata["posterior"]["a"])) > 5
+        assert model["d_seed"].get_value() == 3
+        assert idata["constant_data"]["d_seed"] == 3
+        with pytest.warns(psf.FilterWarning, match="one noise seed throughout") as caught:
+            idata = pm.sample(step=pm.DEMetropolisZ(), **SHORT)
+        assert caught[0].filename == __file__
+        assert len(np.unique(idata["posterior"]["a"])) > 5
+        assert model["d_seed"].get_value() == 3
         settings = {k: SHORT[k] for k in ("draws", "chains", "random_seed", "progressbar")}
-        idata = pm.sample_smc(**settings, cores=1, compute_convergence_checks=False)
+        with pytest.warns(psf.FilterWarning, match="one noise seed throughout"):
+            idata = pm.sample_smc(**settings, cores=1, compute_convergence_checks=False)
         assert len(np.unique(idata["posterior"]["a"])) > 5
         assert model["d_seed"].get_value() == 3

@@ -35,9 +35,9 @@ def draw_key(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, np.iinfo(np.uint64).max, size=2, dtype=np.uint64, endpoint=True)
 
 
-def side_generator(key: np.ndarray) -> np.random.Generator:
-    """Make a generator from the chain's key that overlaps none of its blocks."""
-    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, 1]))
+def side_generator(key: np.ndarray, number: int = 1) -> np.random.Generator:
+    """Make a generator from the chain's key that overlaps none of its blocks, nor another one."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, number]))
 
 
 def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

@@ -19,9 +19,11 @@ from xarray import DataTree
 from ...parallel.communicator import Communicator
 from ...pymc_model.inspection import element_names, filters_used
 from ..checkpoint.checkpoint import Checkpoint
+from ..kernel.random_numbers import side_generator
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
 from ..output.datatree import to_datatree
+from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.likelihood_variance import is_measured, spread_at_highest_draw
 from ..output.report import closing_report, left_out_warnings, until_ess_warning
 from ..output.sample_stats import stat_dims, whole_chain
@@ -263,6 +265,7 @@ class ModelTask:
         results = [self._results.pop(index) for index in range(self.request.chains)]
         warnings = chain_warnings(target, results, request.tune)
         attrs, noise_warnings = self._measure_noise(target, results)
+        key = results[0][1].key
         warnings += noise_warnings
         chains = []
         while results:
@@ -289,9 +292,20 @@ class ModelTask:
                 np.errstate(invalid="ignore", divide="ignore"),  # chains that never moved
             ):
                 warnings += run_convergence_checks(tree, self.model)
-        warnings += closing
+        check = self._check_filters(tree, key) if check_convergence else FilterCheck()
+        warnings += [*closing, *check.messages(report_level)]
         log_warnings([replace(w, message=self._said(w.message)) for w in warnings])
+        warn_of_filters([self._said(text) for text in check.warned])
         return tree
+
+    def _check_filters(self, tree: DataTree, key: np.ndarray) -> FilterCheck:
+        """Compare the filters with unbiased ones at some draws."""
+        if "posterior" in tree:
+            with suppress(KeyboardInterrupt):
+                rng = side_generator(key, 2)
+                seconds = self._ended - self._began
+                return check_filters(tree, self.model, self.n_iterations, seconds, rng)
+        return FilterCheck()
 
     def _said(self, message: str) -> str:
         """A message about this model, with its name if there are several."""
