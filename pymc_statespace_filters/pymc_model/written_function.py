@@ -154,6 +154,8 @@ class _Parts:
             for condition in np.concatenate([c.ravel() for c in conditions]):
                 self.holds = self.arena.apply(ps.and_, self.holds, condition)
             return [value]
+        if _adds_truth_values(node):
+            raise NotUnrollableError("a sum of truth values")
         return [objects(result) for result in evaluate(self.arena, node, arguments)]
 
     def _of_terms(self, op: Op, arguments: list[Any]) -> Any:
@@ -197,6 +199,14 @@ class _Parts:
         if isinstance(values, _Terms) or variable.type.dtype != "float64":
             raise NotUnrollableError("an argument of a filter that is not made of parameters")
         return _Source(computed=values)
+
+
+def _adds_truth_values(node: Apply) -> bool:
+    """Whether an operation adds truth values: a number for numba, a truth value for NumPy."""
+    op = node.op.scalar_op if isinstance(node.op, Elemwise) else node.op
+    nodes = op.fgraph.toposort() if isinstance(op, ps.Composite) else [node]
+    sums = [each for each in nodes if isinstance(op if each is node else each.op, ps.Add)]
+    return any(each.outputs[0].type.dtype == "bool" for each in sums)
 
 
 def _are_zero(values: Any) -> bool:
