@@ -5,9 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import xarray as xr
 from arviz_stats import ELPDDataLFO, SamplingWrapper, ess, lfo_cv
 from numpy.typing import NDArray
+from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning, ModelError
@@ -17,7 +19,6 @@ from ..states.draws import select_draws
 from ..states.variable import select_variables
 from ..system.checks import is_integer
 from .pointwise_log_likelihood import SEQUENTIAL, sequential_terms
-from .truncated_data import observed_values, truncate_data
 
 Refit = Callable[[pm.Model], xr.DataTree]
 
@@ -296,3 +297,24 @@ class _Refits(SamplingWrapper):
         """Terms of later rows, with the noise of each draw."""
         terms = sequential_terms(self.model, self._variable, select_draws(idata__i, None))
         return terms.isel({self._variable.dims[0]: excluded_obs})
+
+
+def observed_values(model: pm.Model, name: str) -> NDArray[np.float64]:
+    """The observations (J, p) of a StateSpace variable."""
+    return np.asarray(model.rvs_to_values[model[name]].eval(mode="FAST_COMPILE"), np.float64)
+
+
+def truncate_data(model: pm.Model, name: str, n_rows: int) -> pm.Model:
+    """Copy a model, keeping only the first `n_rows` observations of a StateSpace variable.
+
+    The later rows are set to missing, so that dimensions, coordinates and noise seeds stay, and an
+    estimate uses the same noise as one from all observations at the same seed.
+    """
+    observed = observed_values(model, name)
+    observed[n_rows:] = np.nan
+    graph, copies = fgraph_from_model(model)
+    node = copies[model[name]].owner
+    _, old = node.inputs
+    new = old.type.filter_variable(pt.as_tensor(observed))
+    graph.change_node_input(node, 1, new, import_missing=True)
+    return model_from_fgraph(graph, mutate_fgraph=True)

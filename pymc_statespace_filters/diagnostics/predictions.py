@@ -7,12 +7,12 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
-from ..pymc_model.prediction_graphs import (
+from ..pymc_model.state_graphs import (
+    StateSpaceVariable,
     exact_predictions,
     gaussian_predictions,
     observations_given,
 )
-from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.record import Array, Graphs, RecordAtDraws, States
 from .calibration import pit_of, residual_limit
 

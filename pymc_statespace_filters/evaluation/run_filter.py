@@ -12,7 +12,7 @@ import xarray as xr
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
-from ..filters.protocol import Filter
+from ..filters.protocol import Filter, properties
 from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun
@@ -22,6 +22,8 @@ from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_seed, checked_record
 from ..system.steps import check_at, rows_at
 from .filter_warnings import warn_about, warn_of_choice
+
+STATE, _RECORD = "filter_state", "filter_state_record"
 
 
 def run_filter(
@@ -146,7 +148,7 @@ def run_filter(
     at_steps = [each[1] for each in arguments]
     rows = [own[own >= k] for own, k in zip((rows_at(at, s) for s in at_steps), first, strict=True)]
     left: list[np.ndarray] = []
-    if resumes(filter):
+    if properties(filter).resumes:
         evaluate = evaluator(ResumableRun(system, filter))
         parts = zip(arguments, rows, before, strict=True)
         found = [evaluate(*each, own, start) for each, own, start in parts]
@@ -194,14 +196,6 @@ def _dataset(
     return xr.Dataset(found, coords={"state": names, "state_bis": names})
 
 
-STATE, _RECORD = "filter_state", "filter_state_record"
-
-
-def resumes(filter: Filter) -> bool:
-    """Whether a filter can go on from its state after earlier rows."""
-    return getattr(filter, "resumes", False)
-
-
 def attributes(
     system: StateSpaceModel, filter: Filter, thetas: Sequence[np.ndarray], seed: Any, t0: Any
 ) -> dict[str, Any]:
@@ -226,15 +220,13 @@ def states_before(
         If the filter cannot go on, or the earlier run is not one of the same filter, system,
         parameters, seed and records, or failed.
     """
-    if not resumes(filter):
+    of_filter = properties(filter)
+    if not of_filter.resumes:
+        why = "it has no state that holds for the rows to come"
+        if of_filter.needs_record_ahead:
+            why = "its guide needs the record ahead"
         raise ModelError(
-            f"{type(filter).__name__} cannot go on from an earlier run: "
-            + (
-                "its guide needs the record ahead"
-                if getattr(filter, "needs_record_ahead", False)
-                else "it has no state that holds for the rows to come"
-            )
-            + "; run it over all rows"
+            f"{type(filter).__name__} cannot go on from an earlier run: {why}; run it over all rows"
         )
     if not isinstance(state, xr.Dataset) or STATE not in state:
         raise ModelError(f"state must be what run_filter returned, got {type(state).__name__}")

@@ -18,15 +18,13 @@ from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
 from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
-from ..pymc_model.support import Support
-from .checks.convergence import check_convergence
-from .checks.discretisation import check_discretisation
+from ..pymc_model.prior import Support
+from .checks import check_convergence, check_discretisation
 from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
 from .evidence import Evidence, store_evidence
-from .posterior.draws import Posterior, build_posterior
-from .posterior.exact_density import MOST_DRAWS, ExactDensity, with_exact_density
-from .posterior.observed_data import data_fingerprint, observation_count
+from .exact_density import MOST_DRAWS, ExactDensity, with_exact_density
+from .posterior import Posterior, build_posterior, data_fingerprint, observation_count
 
 MAXIMUM = "maximum likelihood"
 AT_DRAWS = "likelihood of the draws"

@@ -15,7 +15,7 @@ from ..errors import ModelError
 from ..filters.bootstrap import BootstrapPF
 from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter, short_form
-from ..pymc_model.compilation import compile_raveled
+from ..pymc_model.density import compile_raveled
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import element_names, log_density_terms, state_space_nodes
 from ..pymc_model.posterior_draws import posterior_group, unconstrained_draws

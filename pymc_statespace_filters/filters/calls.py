@@ -109,30 +109,42 @@ def _check_record(call):
     """Whether rows, data and inputs are those of a record or a panel of this system."""
     given, plan = call.record, call.plan
     n_rows, width = given[RECORD.n_rows], given[RECORD.row_width]
-    rows = integers_at(given[RECORD.rows], n_rows * width)
-    n_inputs, last_row = plan[PLAN.n_inputs], plan[PLAN.observation_uses_inputs]
-    if width != _SINGLE and width != _PANEL:
-        return np.int64(PANEL_COLUMNS)
-    if n_inputs and given[RECORD.n_inputs] != n_inputs:
-        return np.int64(INPUT_COLUMNS)
-    n_records, step_column = np.int64(0), np.int64(panel.STEP if width == _PANEL else 0)
-    for j in range(n_rows):
-        row = j * width
-        first_input, begins = np.int64(0), j == 0
-        if width == _PANEL:
-            begins = begins or rows[row + panel.RECORD] != rows[row - width + panel.RECORD]
-            first_input = rows[row + panel.FIRST_INPUT]
-        n_records += begins
-        step = rows[row + step_column]
-        if step < 0 or (not begins and step <= rows[row - width + step_column]):
-            return np.int64(STEPS if width == _SINGLE else PANEL_STEPS)
-        if n_inputs and given[RECORD.n_input_rows] < first_input + step + last_row:
-            return np.int64(INPUT_ROWS)
-    if width == _PANEL and n_records != given[RECORD.n_records]:
-        return np.int64(PANEL_RECORDS)
+    status = status_of_rows(
+        integers_at(given[RECORD.rows], n_rows * width), width, given[RECORD.n_records],
+        given[RECORD.n_input_rows], given[RECORD.n_inputs], plan[PLAN.n_inputs],
+        plan[PLAN.observation_uses_inputs],
+    )  # fmt: skip
+    if status != OK:
+        return status
     if given[RECORD.n_observed] != n_rows or given[RECORD.n_observables] != plan[PLAN.p]:
         return np.int64(OBSERVED)
     return OK
+
+
+@njit_callable
+def status_of_rows(rows, width, n_records, n_input_rows, n_columns, n_inputs, last_row):
+    """A status: whether rows, one behind the other, are those of so many records and inputs.
+
+    The inputs have ``n_columns`` and should have ``n_inputs``. The row of the last step is read if
+    ``last_row`` is 1.
+    """
+    if width != _SINGLE and width != _PANEL:
+        return np.int64(PANEL_COLUMNS)
+    if n_inputs and n_columns != n_inputs:
+        return np.int64(INPUT_COLUMNS)
+    found, step_column = np.int64(0), np.int64(panel.STEP if width == _PANEL else 0)
+    for row in range(0, rows.size, width):
+        first_input, begins = np.int64(0), row == 0
+        if width == _PANEL:
+            begins = begins or rows[row + panel.RECORD] != rows[row - width + panel.RECORD]
+            first_input = rows[row + panel.FIRST_INPUT]
+        found += begins
+        step = rows[row + step_column]
+        if step < 0 or (not begins and step <= rows[row - width + step_column]):
+            return np.int64(STEPS if width == _SINGLE else PANEL_STEPS)
+        if n_inputs and n_input_rows < first_input + step + last_row:
+            return np.int64(INPUT_ROWS)
+    return np.int64(PANEL_RECORDS) if width == _PANEL and found != n_records else OK
 
 
 @njit_internal

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from .gaussian.base import GaussianFilterBase
-from .gaussian.tangent import Tangent
+from .gaussian.linearization import Tangent
 from .protocol import System
 
 

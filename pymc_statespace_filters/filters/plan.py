@@ -80,11 +80,6 @@ PLAN = PlanSlots()
 N_WORDS = N_HEADER + len(PLAN)
 VERSION = version_of(PLAN)
 
-SYSTEM_FUNCTIONS = (
-    "prepare", "initialise", "propagate", "observe", "log_density", "step_moments",
-    "propagate_guided", "observation_information", "follow", "look_back", "start_back",
-)  # fmt: skip
-
 NULL = np.int64(0)
 """An address that is not read."""
 
@@ -104,7 +99,7 @@ def make_plan(
     run : EntryPoint
         The function that the plan is for.
     functions : sequence of str
-        Names of `SYSTEM_FUNCTIONS`; the others need `prepare`, which is there with any of them.
+        Names of functions of the system, as in `PLAN`; `prepare` is there with any of them.
     settings : sequence of float
         What the function reads by `settings_of`.
     **others : int or EntryPoint
@@ -133,7 +128,7 @@ def make_plan(
     return Plan(words, VERSION, run, {getattr(PLAN, name): entries[name] for name in names}, key)
 
 
-class PlannedSystem(NamedTuple):
+class SystemPointers(NamedTuple):
     """One evaluation's system: ``c`` its constants, ``inputs`` a row for each step.
 
     ``free`` are the states that an update may move. Functions are addresses.
@@ -166,7 +161,7 @@ def read_system(plan, theta, inputs):
     """Unpack a plan, and prepare the constants of one evaluation."""
     c = np.empty(plan[PLAN.n_constants])
     call_address(plan[PLAN.prepare], (theta, np.int64(theta.size), c))
-    return PlannedSystem(
+    return SystemPointers(
         n=plan[PLAN.n], m=plan[PLAN.m], p=plan[PLAN.p], n_theta=plan[PLAN.n_theta],
         dt=plan.view(np.float64)[PLAN.dt], is_time_invariant=plan[PLAN.is_time_invariant] != 0,
         has_gaussian_observation=plan[PLAN.has_gaussian_observation] != 0,

@@ -6,18 +6,16 @@ and compiles functions for one system, which it is given as a `System`. No base 
 abilities are the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter` and
 `EnsembleFilter`.
 
-Arrays of the compiled functions: ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each
-observation; ``observed`` (J, p), NaN where missing; ``inputs`` (rows, n_inputs), row k holds during
-step k; ``t0`` the time of step 0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a
-row that is wholly missing and -inf from a failing observation on, and ``health`` (3,): the smallest
-effective number of particles behind a term (inf without particles), a failure code of
-`filters.outcomes`, and the index of the failing observation or -1.
+Arguments and results of the compiled functions are those of `filters.signatures`. Their arrays:
+``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each observation; ``observed`` (J, p),
+NaN where missing; ``inputs`` (rows, n_inputs), row k holds during step k; ``t0`` the time of step
+0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a row that is wholly missing and
+-inf from a failing observation on, and ``health`` (3,): the smallest effective number of particles
+behind a term (inf without particles), a failure code of `filters.outcomes`, and the index of the
+failing observation or -1.
 """
 
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.native.plan import Plan
@@ -27,89 +25,10 @@ from ..errors import ModelError
 if TYPE_CHECKING:
     from ..compiler.lowering.compiled_system import CompiledSystem
 
-type Array = NDArray[np.float64]
-type Integers = NDArray[np.int64]
-type Compiled[F] = CompiledFunction[F] | PlannedFunction
+type Compiled = CompiledFunction | PlannedFunction
 """A function that numba compiles for one system, or one of a plan, which needs no compilation."""
 type System = CompiledSystem
 """One system as a filter sees it: sizes, properties, and functions compiled when asked for."""
-
-
-class LogLikelihoodFunction(Protocol):
-    """Terms and health of one evaluation.
-
-    ``noise`` is a seed and a vector of stored normals, of which a deterministic filter reads
-    neither; where the vector is empty the seed counts.
-    """
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float,
-        noise: tuple[int, Array],
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Evaluate."""
-
-
-class HealthFunction(Protocol):
-    """Terms and health of one evaluation, and between them the effective number of each term.
-
-    A term is the log of a mean over members, and the number (J,) that of the weights of this mean;
-    NaN where there is no term.
-    """
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int
-    ) -> tuple[Array, Array, Array]:
-        """Evaluate."""
-
-
-class PredictionsFunction(Protocol):
-    """The law of every observation given those before it.
-
-    Mean (J, p), covariance (J, p, p), and the logs (J, p) of the probabilities that a component is
-    below and above what was observed. NaN for a missing component, and from a failure on.
-    """
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int
-    ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate."""
-
-
-class StatesFunction(Protocol):
-    """Mean, sd and a draw (R, n) of the state at ``rows``; n_effective (R,); and health.
-
-    The draws of one ``draw_seed`` belong together. From a failing observation on all are NaN.
-    """
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
-        rows: Integers, draw_seed: int,
-    ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
-        """Evaluate."""
-
-
-class RunFunction(Protocol):
-    """Terms, health, and the filtered state at the steps ``rows``.
-
-    The state is mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N), given the
-    observations up to each row; N is 0 for a filter without members.
-    """
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
-        rows: Integers,
-    ) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
-        """Evaluate."""
-
-
-class GradientFunction(Protocol):
-    """Vector-Jacobian product: the cotangent of theta (k,) from that of the terms (J,)."""
-
-    def __call__(
-        self, theta: Array, steps: Integers, observed: Array, inputs: Array, t0: float, seed: int,
-        terms_bar: Array,
-    ) -> Array:  # fmt: skip
-        """Evaluate."""
 
 
 @runtime_checkable
@@ -130,19 +49,15 @@ class Filter(Protocol):
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood, or the mean of its estimates, is that of the system."""
 
-    def compile(self, system: System) -> Compiled[LogLikelihoodFunction]:
+    def compile(self, system: System) -> Compiled:
         """Compile the log-likelihood."""
 
 
 @runtime_checkable
 class RunFilter(Filter, Protocol):
-    """A filter that `run_filter` can show.
+    """A filter that `run_filter` can show."""
 
-    With an attribute ``resumes`` that is true, it is planned and can go on from its state after
-    earlier rows, see `plan.RequestSlots`.
-    """
-
-    def compile_run(self, system: System) -> Compiled[RunFunction]:
+    def compile_run(self, system: System) -> Compiled:
         """Compile one run with all that it computes."""
 
 
@@ -150,7 +65,7 @@ class RunFilter(Filter, Protocol):
 class StatesFilter(Filter, Protocol):
     """A filter that gives states at draws: `filtered_states`, `smoothed_states`, `forecast`."""
 
-    def compile_states(self, system: System, moment: str) -> Compiled[StatesFunction]:
+    def compile_states(self, system: System, moment: str) -> Compiled:
         """Compile "predicted", "filtered" or "smoothed" states."""
         ...
 
@@ -162,7 +77,7 @@ class StatesFilter(Filter, Protocol):
 class HealthFilter(Filter, Protocol):
     """A filter that tells how many of its members are behind every term."""
 
-    def compile_health(self, system: System) -> Compiled[HealthFunction]:
+    def compile_health(self, system: System) -> Compiled:
         """Compile the effective number of every term."""
 
 
@@ -170,7 +85,7 @@ class HealthFilter(Filter, Protocol):
 class PredictionFilter(Filter, Protocol):
     """A filter that knows the law of every observation given those before it."""
 
-    def compile_predictions(self, system: System) -> Compiled[PredictionsFunction]:
+    def compile_predictions(self, system: System) -> Compiled:
         """Compile the law of every observation, for systems with additive Gaussian noise."""
 
 
@@ -185,7 +100,7 @@ class DifferentiableFilter(Filter, Protocol):
     deterministic system the mean is enough.
     """
 
-    def compile_gradient(self, system: System) -> Compiled[GradientFunction]:
+    def compile_gradient(self, system: System) -> Compiled:
         """Compile both passes as one function."""
 
     def compile_taped(self, system: System) -> Compiled:
@@ -229,6 +144,24 @@ class EnsembleFilter(Filter, Protocol):
 
     def stored_noise(self, system: System) -> PlannedFunction:
         """Compile the making of these normals: (steps, seed) -> one vector."""
+
+
+class Properties(NamedTuple):
+    """What a filter is beyond its methods: its attributes of these names, False if it has none.
+
+    It ``resumes`` if it has a plan and can go on from its state after earlier rows; its particles
+    move by the rows to come if it ``needs_record_ahead``; and the mean of its estimates is the
+    likelihood, for any number of members, if it is ``unbiased``.
+    """
+
+    resumes: bool
+    needs_record_ahead: bool
+    unbiased: bool
+
+
+def properties(filter: Filter) -> Properties:
+    """Return what a filter says of itself."""
+    return Properties(*(getattr(filter, name, False) for name in Properties._fields))
 
 
 def check_states_filter(filter: Filter) -> StatesFilter:

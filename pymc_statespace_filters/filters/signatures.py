@@ -39,21 +39,33 @@ _TERMS, _HEALTH, _TAPE, _TERMS_BAR = ("terms", 1), ("health", 1), ("tape", 2), (
 
 LIKELIHOOD = Signature(SEEDED, (_TERMS, _HEALTH))
 LIKELIHOOD_OF_NOISE = Signature((*RECORD, ("noise", 0)), (_TERMS, _HEALTH))
-"""A `LogLikelihoodFunction`."""
+"""Of `Filter.compile`. ``noise`` is a seed and a vector of stored normals, of which a deterministic
+filter reads neither; where the vector is empty the seed counts."""
 TAPED = Signature(SEEDED, (_TERMS, _HEALTH, _TAPE))
 PULLBACK = Signature((*SEEDED, _TAPE, _TERMS_BAR), (("theta_bar", 1),))
 GRADIENT = Signature((*SEEDED, _TERMS_BAR), (("theta_bar", 1),))
+"""Vector-Jacobian product: the cotangent of theta (k,) from that of the terms (J,)."""
 TERM_HEALTH = Signature(SEEDED, (_TERMS, ("n_effective", 1), _HEALTH))
+"""A term is the log of a mean over members, and n_effective (J,) is that of the weights of this
+mean; NaN where there is no term."""
 STATES = Signature(
     (*SEEDED, ("wanted", 1), ("draw_seed", 0)),
     (("mean", 2), ("sd", 2), ("drawn", 2), ("n_effective_wanted", 1), _HEALTH),
 )
+"""Mean, sd and a draw (R, n) of the state at the steps ``wanted``; n_effective (R,); and health.
+The draws of one ``draw_seed`` belong together. From a failing observation on all are NaN."""
 RUN = Signature(
     (*SEEDED, ("wanted", 1)),
     (_TERMS, _HEALTH, ("mean", 2), ("cov", 3), ("members", 3), ("weights", 2)),
 )
+"""Terms, health, and the state at the steps ``wanted``, given the observations up to each: mean
+(R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0 without members."""
 RESUMED = Signature((*RUN.arguments, ("state", 1)), (*RUN.results, ("state", 1)))
+"""From a state of the filter, empty at the start, with the state that it leaves."""
 PREDICTIONS = Signature(
     SEEDED, (("predicted", 2), ("predicted_cov", 3), ("log_below", 2), ("log_above", 2))
 )
+"""The law of every observation given those before it: mean (J, p), covariance (J, p, p), and the
+logs (J, p) of the probabilities that a component is below and above what was observed. NaN for a
+missing component, and from a failure on."""
 NORMALS = Signature((("steps", 1), ("seed", 0)), (("normals", 1),))

@@ -61,7 +61,7 @@ class FilterOp(Op):
 
     def __str__(self) -> str:
         # The default would print every equation of the system.
-        form = "" if self.form is ONE_RECORD else f", {self.form.name}"
+        form = "" if self.form == ONE_RECORD else f", {self.form.name}"
         return f"{type(self).__name__}{{{self.filter}{form}}}"
 
     def of(self, system: StateSpaceModel, filter: Filter) -> Self:

@@ -35,7 +35,7 @@ type Shapes = Sequence[tuple[int, ...]]
 @jax_funcify.register(LogLikelihood)
 def _likelihood(op: LogLikelihood, **_: Any) -> Callable:
     """Terms and health; JAX takes their derivative by theta from the machine code."""
-    if op.form is POINTS:
+    if op.form == POINTS:
         of_point = _likelihood(LogLikelihood(op.system, op.filter))
         return jax.vmap(of_point, in_axes=(0, *[None] * (len(op.arguments) - 1)))
 

@@ -55,16 +55,16 @@ class LogLikelihood(FilterOp):
 
     def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The filter's log-likelihood."""
-        if self.form is not ONE_RECORD and isinstance(self.filter, BatchFilter):
+        if self.form != ONE_RECORD and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system)
         compiled = self.filter.compile(system)
-        if self.form is PANEL and isinstance(compiled, CompiledFunction):
+        if self.form == PANEL and isinstance(compiled, CompiledFunction):
             return values_one_by_one(compiled)
         return compiled
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """As many terms as steps, for every point."""
-        points = (input_shapes[0][0],) if self.form is POINTS else ()
+        points = (input_shapes[0][0],) if self.form == POINTS else ()
         return [(*points, input_shapes[1][0]), (*points, HEALTH_SIZE)]
 
     def pullback(
@@ -82,7 +82,7 @@ class LogLikelihood(FilterOp):
 
     def gradient(self) -> FilterOp | Blockwise:
         """The operation of the vector-Jacobian product; point by point for many points."""
-        if self.form is POINTS:
+        if self.form == POINTS:
             return Blockwise(LogLikelihoodGradient(self.system, self.filter))
         return LogLikelihoodGradient(self.system, self.filter, self.form)
 
@@ -113,10 +113,10 @@ class LogLikelihoodGradient(FilterOp):
 
     def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """Both passes of the filter."""
-        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+        if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, leaves_tape=True, goes_back=True)
         compiled = self.filter.compile_gradient(system)
-        if self.form is PANEL and isinstance(compiled, CompiledFunction):
+        if self.form == PANEL and isinstance(compiled, CompiledFunction):
             return gradients_one_by_one(compiled)
         return compiled
 
@@ -133,7 +133,7 @@ class TapedLogLikelihood(FilterOp):
 
     def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The forward pass."""
-        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+        if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, leaves_tape=True)
         return self.filter.compile_taped(system)
 
@@ -147,7 +147,7 @@ class TapePullback(FilterOp):
 
     def compile(self, system: CompiledSystem) -> Compiled | Plan:
         """The backward pass."""
-        if self.form is PANEL and isinstance(self.filter, BatchFilter):
+        if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, goes_back=True)
         return self.filter.compile_pullback(system)
 
@@ -157,7 +157,7 @@ class TapePullback(FilterOp):
 def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
     """Make one forward pass where a graph holds value and gradient at the same inputs."""
     op = node.op
-    if op.form is PANEL and not isinstance(op.filter, BatchFilter):
+    if op.form == PANEL and not isinstance(op.filter, BatchFilter):
         return None
     *inputs, terms_bar = node.inputs
     value_op, taped, pullback = (
@@ -183,7 +183,7 @@ def vectorized(op: LogLikelihood, *inputs: Variable) -> list[Variable]:
         for value, n in zip(record, extra[1:], strict=True)
         for length in value.type.shape[:n]
     )
-    is_batch = op.form is ONE_RECORD and isinstance(op.filter, BatchFilter)
+    is_batch = op.form == ONE_RECORD and isinstance(op.filter, BatchFilter)
     if not (is_batch and one_record and extra[0]):
         return Blockwise(op)(*inputs, return_list=True)
     record = [value[(0,) * n] if n else value for value, n in zip(record, extra[1:], strict=True)]

@@ -28,7 +28,7 @@ def values(op: LogLikelihood, *arguments: np.ndarray) -> list[np.ndarray]:
     if not (record and isinstance(op.filter, BatchFilter)):
         return _in_turn(op, arguments, shape, cores)
     thetas = arguments[0].reshape(-1, *cores[0])
-    if op.form is ONE_RECORD:
+    if op.form == ONE_RECORD:
         results = evaluator(LogLikelihood(op.system, op.filter, POINTS))(thetas, *record)
     else:
         evaluate = evaluator(op)

@@ -9,10 +9,10 @@ from .base import FilterOp
 
 
 class States(FilterOp):
-    """Mean, sd and a draw (R, n) of the state at steps ``wanted``, n_effective (R,), health (3,).
+    """Mean, sd and a draw of the state at steps ``wanted``, n_effective, and health.
 
     ``moment`` is "predicted" (given the observations at earlier steps than the row's), "filtered"
-    (also at the row's) or "smoothed" (all). ``draw_seed`` is the seed of the draw alone.
+    (also at the row's) or "smoothed" (all).
     """
 
     __props__ = ("system", "filter", "moment")
@@ -29,11 +29,7 @@ class States(FilterOp):
 
 
 class FilterRun(FilterOp):
-    """Terms (J,) and health (3,) of the likelihood, and the filtered state at ``wanted`` steps.
-
-    The latter as mean (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0
-    without members.
-    """
+    """Terms and health of the likelihood, and the filtered state at ``wanted`` steps."""
 
     signature = RUN
     filter: RunFilter
@@ -61,7 +57,7 @@ class TermHealth(FilterOp):
 
 
 class Predictions(FilterOp):
-    """The law of every observation before it is seen: see `protocol.PredictionsFunction`."""
+    """The law of every observation before it is seen: see `signatures.PREDICTIONS`."""
 
     signature = PREDICTIONS
     filter: PredictionFilter

@@ -14,26 +14,17 @@ from numba import typeof
 from ..compiler.codegen.function_types import CompiledFunction, jit
 from ..compiler.native.cache_key import key_of
 from ..compiler.native.entry_point import cached_on_disk
-from ..compiler.native.plan import (
-    INPUT_COLUMNS,
-    INPUT_ROWS,
-    OBSERVED,
-    PANEL_COLUMNS,
-    PANEL_RECORDS,
-    PANEL_STEPS,
-    REFUSALS,
-    STEPS,
-)
+from ..compiler.native.plan import OBSERVED, REFUSALS
 from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
-from ..filters.calls import include_health
+from ..filters.calls import include_health, status_of_rows
 from ..filters.outcomes import NONE
 from ..filters.protocol import Compiled, Filter
 from ..filters.signatures import Names
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.model import StateSpaceModel
-from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP
+from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 
 # Arguments that such a function does not read: it is neither replaced nor divided between ranks.
 _OF_PLANS = {"rank", "n_ranks", "exchange", "number", "replacement"}
@@ -48,70 +39,49 @@ class FilterOp(Protocol):
     takes_noise: Any
 
 
-def check_record(system: StateSpaceModel) -> Any:
-    """A compiled check of steps and inputs."""
-    return _check_of_inputs(system.n_input_columns, int(system.observation_uses_inputs))
+def check_of_rows(system: StateSpaceModel, *, of_panel: bool) -> Any:
+    """A compiled check of theta, the steps or the rows of a panel, and inputs."""
+    return _check_of_rows(system.n_input_columns, int(system.observation_uses_inputs), of_panel)
 
 
 # Made once for all systems of one shape: a fresh one would be compiled by the next call.
 @cache
-def _check_of_inputs(n_columns: int, last_row: int) -> Any:
-    wrong_steps, wrong_columns, too_few = (REFUSALS[i] for i in (STEPS, INPUT_COLUMNS, INPUT_ROWS))
+def _check_of_rows(n_inputs: int, last_row: int, of_panel: bool) -> Any:
+    @jit
+    def check_steps(theta, steps, inputs):
+        n_rows, n_columns = inputs.shape
+        _refuse(status_of_rows(steps, 1, 1, n_rows, n_columns, n_inputs, last_row))
 
     @jit
-    def check(steps, inputs):
-        for j in range(steps.size):
-            if steps[j] < 0 or (j > 0 and steps[j] <= steps[j - 1]):
-                raise ModelError(wrong_steps)
-        if n_columns and inputs.shape[1] != n_columns:
-            raise ModelError(wrong_columns)
-        if n_columns and steps.size and inputs.shape[0] < steps[-1] + last_row:
-            raise ModelError(too_few)
+    def check_panel(theta, rows, inputs):
+        n_rows, n_columns = inputs.shape
+        width, table = rows.shape[1], rows.copy().reshape(rows.size)
+        _refuse(status_of_rows(table, width, theta.shape[0], n_rows, n_columns, n_inputs, last_row))
 
-    return check
-
-
-def check_panel(system: StateSpaceModel) -> Any:
-    """A compiled check of the rows of a panel, see `system.panel`."""
-    return _check_of_rows(system.n_input_columns, int(system.observation_uses_inputs))
+    return check_panel if of_panel else check_steps
 
 
 @cache
-def _check_of_rows(n_columns: int, last_row: int) -> Any:
-    no_rows, wrong_columns = REFUSALS[PANEL_COLUMNS], REFUSALS[INPUT_COLUMNS]
-    wrong_steps, too_few = REFUSALS[PANEL_STEPS], REFUSALS[INPUT_ROWS]
-    wrong_records = REFUSALS[PANEL_RECORDS]
-
-    @jit
-    def check(theta, rows, inputs):
-        if rows.shape[1] != N_COLUMNS:
-            raise ModelError(no_rows)
-        if n_columns and inputs.shape[1] != n_columns:
-            raise ModelError(wrong_columns)
-        n_records = 0
-        for j in range(rows.shape[0]):
-            begins = j == 0 or rows[j, RECORD] != rows[j - 1, RECORD]
-            n_records += begins
-            if rows[j, STEP] < 0 or (not begins and rows[j, STEP] <= rows[j - 1, STEP]):
-                raise ModelError(wrong_steps)
-            if n_columns and inputs.shape[0] < rows[j, FIRST_INPUT] + rows[j, STEP] + last_row:
-                raise ModelError(too_few)
-        if n_records != theta.shape[0]:
-            raise ModelError(wrong_records)
-
-    return check
-
-
-@cache
-def _check_observed(p: int) -> Any:
-    wrong_shape = REFUSALS[OBSERVED]
-
+def _check_of_data(p: int) -> Any:
     @jit
     def check(steps, observed):
         if observed.shape[0] != steps.shape[0] or observed.shape[1] != p:
-            raise ModelError(wrong_shape)
+            _refuse(OBSERVED)
 
     return check
+
+
+def _refusal() -> Any:
+    """A compiled function that raises what a status says."""
+    lines = [
+        f"if status == {status}: raise ModelError({REFUSALS[status]!r})" for status in REFUSALS
+    ]
+    scope = {"ModelError": ModelError}
+    exec("def refuse(status):\n" + "".join(f"    {line}\n" for line in lines), scope)
+    return jit(scope["refuse"])
+
+
+_refuse = _refusal()
 
 
 def cache_key(system: StateSpaceModel, compiled: Compiled) -> str | None:
@@ -143,12 +113,9 @@ def checked_call(op: FilterOp, compiled: CompiledFunction) -> tuple[Any, str | N
     time in every call and seconds of compilation.
     """
     ndims = dict(op.arguments)
-    checks = ["check_observed(steps, observed)"]
-    checks.append(
-        "check(steps, inputs)" if ndims["steps"] == 1 else "check_panel(theta, steps, inputs)"
-    )
-    if "tape" in ndims:  # which was made by an operation that checked the record
-        checks = []
+    # A tape was made by an operation that checked the record.
+    is_checked = "tape" in ndims
+    checks = [] if is_checked else ["check(theta, steps, inputs)", "check_data(steps, observed)"]
     codes = {n: f"{n}.copy()" if ndim else f"{n}.item()" for n, ndim in op.arguments}
     if "tape" in codes:
         codes["tape"] = "tape"
@@ -164,9 +131,8 @@ def checked_call(op: FilterOp, compiled: CompiledFunction) -> tuple[Any, str | N
         "__name__": __name__,
         "np": np,
         "run": compiled.function,
-        "check": check_record(op.system),
-        "check_panel": check_panel(op.system),
-        "check_observed": _check_observed(op.system.p),
+        "check": check_of_rows(op.system, of_panel=ndims["steps"] == 2),
+        "check_data": _check_of_data(op.system.p),
         "no_normals": np.empty(0),
     }
     exec(compile(source, f"<call of {type(op).__name__}>", "exec"), namespace)

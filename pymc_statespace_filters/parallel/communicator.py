@@ -21,6 +21,13 @@ from .mpi import check_threads, mpi, mpi_communicator
 
 _MAX_LAYOUTS = 256
 
+# Interval at which a waiting rank polls: polling without a pause takes a core.
+_POLL_SECONDS = 0.005
+# Time for the failed rank to report first, because the first rank to end may end the whole job.
+ABORT_GRACE_SECONDS = 1.0
+_MAX_BYTES = 2**28  # of one message
+_ARRAYS = 1  # tag; messages have 0
+
 
 class ColumnAllgather:
     """Gather the columns of arrays in machine code's memory, in place and on all ranks.
@@ -84,12 +91,6 @@ class ColumnAllgather:
 
 
 Result = TypeVar("Result")
-
-# Interval at which a waiting rank polls: polling without a pause takes a core.
-_POLL_SECONDS = 0.005
-# Time for the failed rank to report first, because the first rank to end may end the whole job.
-ABORT_GRACE_SECONDS = 1.0
-_MAX_BYTES = 2**28  # of one message
 
 
 class Message(NamedTuple):
@@ -300,9 +301,6 @@ def describe_error(error: BaseException) -> str:
     """Describe an error in one line: type, message and notes."""
     notes = "; ".join(getattr(error, "__notes__", ()))
     return f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")
-
-
-_ARRAYS = 1  # tag; messages have 0
 
 
 def _pieces(arrays: Sequence[np.ndarray]) -> "Sequence[memoryview]":

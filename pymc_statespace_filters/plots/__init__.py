@@ -1,10 +1,9 @@
 """Plots of results; each function returns an ``arviz_plots.PlotCollection``."""
 
 from .average import plot_average
-from .evidence import plot_evidence
+from .evidence import plot_evidence, plot_model_probabilities
 from .filter_health import plot_filter_health
 from .forecast import plot_forecast
-from .model_probabilities import plot_model_probabilities
 from .phase import plot_phase
 from .prior_sensitivity import plot_prior_sensitivity
 from .residuals import plot_residuals

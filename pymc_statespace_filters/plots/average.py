@@ -12,9 +12,16 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 
 from ..errors import ModelError
-from .axes import with_unit
-from .canvas import BOUND, band, canvas, curve, format_probability, size_of_panels
-from .legend import add_legend
+from .canvas import (
+    BOUND,
+    add_legend,
+    band,
+    canvas,
+    curve,
+    format_probability,
+    size_of_panels,
+    with_unit,
+)
 
 AVERAGE = "average"
 N_GRID = 512

@@ -1,7 +1,8 @@
-"""Elements shared by the plots: figures, labelled rows, curves, bands and annotations."""
+"""Elements shared by the plots: figures, axes, labelled rows, legends, curves, annotations."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,116 @@ import xarray as xr
 from arviz_base import rcParams
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
+from arviz_plots.visuals import labelled_x
 
-from .axes import STEPS, label_rows
-from .legend import DOTS_PER_INCH
+STEPS = (1.0, 2.0, 5.0, 10.0)  # between ticks, times a power of ten
 
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
 # Of an axis, at most: between them labels of years have room.
 N_TICKS, TICKS_PER_INCH = 8, 1.4
+DOTS_PER_INCH = 100
+# Width in dots of a letter, and of the sample line with the gaps of an entry.
+LETTER = {"matplotlib": 7.5, "bokeh": 6.2}
+TITLE, MARGINS = 30.0, 150.0  # heights in dots, of plotly
+SAMPLE = {"matplotlib": 65.0, "bokeh": 34.0}
+
+
+def with_unit(label: str, unit: str | None) -> str:
+    """Return the label of an axis, with the unit if it is known."""
+    return f"{label} ({unit})" if unit else label
+
+
+def unit_of(name: str, *arrays: xr.DataArray | None) -> str | None:
+    """Return the unit of a state or observable, from the first array that tells it.
+
+    It is ``attrs["units"]`` of the array or of its last coordinate: a text for all names, a list in
+    their order, or a mapping.
+    """
+    for array in arrays:
+        if array is None or name not in array[array.dims[-1]].values:
+            continue
+        names = array[array.dims[-1]]
+        for units in (array.attrs.get("units"), names.attrs.get("units")):
+            if isinstance(units, str):
+                return units
+            if isinstance(units, Mapping):
+                by_name = dict(units)
+            else:
+                by_name = {} if units is None else dict(zip(names.values, units, strict=False))
+            if name in by_name:
+                return str(by_name[name])
+    return None
+
+
+def time_label(*arrays: xr.DataArray | None) -> str:
+    """Return the label of the time axis, with the unit of the first array that has one."""
+    units = (array["time"].attrs.get("units") for array in arrays if array is not None)
+    return with_unit("time", next((str(unit) for unit in units if unit is not None), None))
+
+
+def label_axes(collection: PlotCollection, names: Sequence[str], time: str) -> None:
+    """Label the y axis of each panel, and the time axis below the lowest panels."""
+    (dim,) = collection.viz["plot"].dims
+    texts = xr.DataArray(list(names), coords={dim: collection.data[dim]}, dims=[dim])
+    panels = xr.zeros_like(texts, dtype=float).to_dataset(name=next(iter(collection.data)))
+    collection.map(label_y, "y_label", data=panels, ignore_aes="all", texts=texts)
+    n_columns = int(collection.viz["col_index"].max()) + 1
+    lowest = panels.isel({dim: slice(-n_columns, None)})
+    settings = {"ignore_aes": "all", "store_artist": False}
+    collection.map(labelled_x, data=lowest, text=time, **settings)
+
+
+def label_y(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:
+    """Label the y axis of a panel with its text."""
+    return backend_from_object(target).ylabel(texts.item(), target, **kwargs)
+
+
+def label_x(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:
+    """Label the x axis of a panel with its text."""
+    return backend_from_object(target).xlabel(texts.item(), target, **kwargs)
+
+
+def few_ticks(da: xr.DataArray, target: Any, *, n_ticks: int) -> None:
+    """Set at most `n_ticks` ticks at the x axis of values along the dimension "plot_axis"."""
+    x = da.sel(plot_axis="x").values
+    ticks = linear_ticks(np.nanmin(x), np.nanmax(x), n_ticks)
+    backend_from_object(target).xticks(ticks["values"], ticks["labels"], target)
+
+
+def label_ticks(da: xr.DataArray, target: Any, *, ticks: dict[str, Any]) -> None:
+    """Set positions and labels of the ticks at the y axis."""
+    backend_from_object(target).yticks(ticks["values"], ticks["labels"], target)
+
+
+def label_rows(da: xr.DataArray, target: Any, *, places: np.ndarray, names: list[str]) -> None:
+    """Label the rows at the y axis, with space above and below."""
+    drawing = backend_from_object(target)
+    drawing.ylim((-0.5, len(names) - 0.3), target)
+    drawing.yticks(places, names, target)
+
+
+def linear_ticks(low: float, high: float, n_ticks: int) -> dict[str, Any]:
+    """Return positions and labels of at most `n_ticks` round numbers from `low` to `high`."""
+    width = high - low if high > low else max(abs(high), 1.0) / 10
+    power = 10.0 ** math.floor(math.log10(width / n_ticks))
+    for step in (power * step for step in STEPS):
+        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+        if last - first < n_ticks:
+            break
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    values = np.round(np.arange(first, last + 1) * step, digits) + 0.0  # no -0
+    return {"values": values, "labels": [f"{value:.{digits}f}" for value in values]}
+
+
+def logarithmic_ticks(logs: np.ndarray) -> dict[str, Any]:
+    """Return tick positions (log10) and labels: decades, or finer if there are few decades."""
+    low, high = logs.min() - 1e-9, logs.max() + 1e-9
+    digits = (1,) if high - low > 3 else (1, 3) if high - low > 1.5 else (1, 2, 5)
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    values = [digit * 10.0**decade for decade in decades for digit in digits]
+    shown = [value for value in values if low <= math.log10(value) <= high]
+    return {"values": np.log10(shown), "labels": [f"{value:g}" for value in shown]}
 
 
 def canvas(
@@ -153,3 +256,68 @@ def format_probability(prob: float) -> str:
     if prob < 0.01:
         return f"{prob:.1g}"
     return f"{prob:.2f}" if prob < 0.99 else f"{prob:.4f}"
+
+
+def legend_style(style: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the legend style of points: a dotted line, as legends show lines only."""
+    return {**style, "linestyle": "C2", "width": 4}
+
+
+def add_legend(
+    collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], titled: bool = False
+) -> None:
+    """Write a legend above the panels, and above their titles if they are `titled`."""
+    backend, labels = collection.backend, list(entries)
+    in_line = len(labels)
+    if backend in LETTER:
+        in_line = _entries_in_line(labels, backend, _width(collection))
+    places: dict[str, dict[str, Any]] = {
+        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": in_line},
+        "plotly": {  # which breaks the line itself
+            "legend_orientation": "h",
+            "legend_y": 1.02 if not titled else 1.0 + TITLE / _height(collection),
+            "legend_yanchor": "bottom",
+            "legend_traceorder": "normal",
+            "margin": {"t": 60 + (TITLE if titled else 0), "b": 60, "r": 30},
+        },
+        "bokeh": {  # above one panel, and no wider than it
+            "side": "above",
+            "border_line_alpha": 0.0,
+            "margin": 0,
+            "padding": 0,
+            "ncols": in_line,
+            "label_text_font_size": "11px",
+            "glyph_width": 18,
+        },
+        "none": {},
+    }
+    # arviz_plots does not translate "alpha" for legends.
+    alpha = "opacity" if backend == "plotly" else "alpha"
+    styles = [{alpha if k == "alpha" else k: v for k, v in s.items()} for s in entries.values()]
+    drawing = import_module(f"arviz_plots.backend.{backend}")
+    drawing.legend(collection, styles, labels, update_visuals=False, **places[backend])
+
+
+def _width(collection: PlotCollection) -> float:
+    """Return the room for the legend in dots: the figure's width, or that of a panel of bokeh."""
+    if collection.backend == "bokeh":
+        return float(collection.iget_target(0, -1).width)
+    return float(DOTS_PER_INCH * collection.viz["figure"].item().get_size_inches()[0])
+
+
+def _height(collection: PlotCollection) -> float:
+    """Return the height of the panels of a plotly figure in dots."""
+    if collection.backend != "plotly":
+        return DOTS_PER_INCH
+    height = collection.viz["figure"].item().layout.height
+    return float(max((height or 450) - MARGINS, DOTS_PER_INCH))
+
+
+def _entries_in_line(labels: Sequence[str], backend: str, width: float) -> int:
+    """Return the largest number of legend columns that fit into `width` dots."""
+    lengths = [len(label) for label in labels]
+    for n_columns in range(len(labels), 1, -1):
+        widest = [max(column) for column in np.array_split(lengths, n_columns)]
+        if sum(LETTER[backend] * n + SAMPLE[backend] for n in widest) <= width:
+            return n_columns
+    return 1

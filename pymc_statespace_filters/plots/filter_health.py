@@ -16,9 +16,18 @@ from arviz_stats.ecdf_utils import (
 )
 from scipy.stats import norm
 
-from .axes import label_ticks, logarithmic_ticks, time_label
-from .canvas import PANELS_IN_LINE, band, canvas, curve, interval
-from .legend import add_legend, legend_style
+from .canvas import (
+    PANELS_IN_LINE,
+    add_legend,
+    band,
+    canvas,
+    curve,
+    interval,
+    label_ticks,
+    legend_style,
+    logarithmic_ticks,
+    time_label,
+)
 from .marks import bars, draw_bands, draw_median, over_draws, point_size, points
 from .panels import one_record
 from .results import group_of, rename_last_dims, variable_of

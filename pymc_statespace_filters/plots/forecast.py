@@ -10,23 +10,24 @@ from arviz_plots.visuals import vline
 
 from ..errors import ModelError
 from ..system.checks import check_count
-from .axes import label_axes, time_label
-from .legend import add_legend, legend_style
+from .canvas import add_legend, label_axes, legend_style, time_label
 from .marks import (
     DATA,
     TRUTH,
+    axis_label,
     canvas_over_time,
     draw_bands,
     draw_bars,
     draw_data,
     draw_median,
+    functions_of,
     over_draws,
     point_size,
     points,
+    transformed,
 )
 from .panels import several_records
 from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, truth_of, variable_of
-from .transforms import axis_label, functions_of, transformed
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations

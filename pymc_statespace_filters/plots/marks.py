@@ -1,6 +1,6 @@
-"""Elements of plots over time: bands and bars of draws, points, paths."""
+"""Elements of plots over time: bands and bars of draws, points, paths, and functions of them."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,9 +8,9 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from .canvas import BOUND, band, canvas, curve, interval
-from .legend import legend_style
-from .results import SAMPLE_DIMS
+from ..errors import ModelError
+from .canvas import BOUND, band, canvas, curve, interval, legend_style, unit_of, with_unit
+from .results import SAMPLE_DIMS, check_names
 
 # Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
 DRAWS = {"color": "C0"}
@@ -24,6 +24,8 @@ DIAMETER, LEAST_DIAMETER, LEAST_ALPHA = 4.0, 2.0, 0.6  # of points
 PROBABILITIES = (90, 50)
 OPACITIES = {90: 0.2, 50: 0.4}  # of bands
 WIDTHS = {90: 1.0, 50: 3.5}  # of bars
+
+Functions = Mapping[str, Callable[[Any], Any]]
 
 
 def canvas_over_time(
@@ -169,3 +171,53 @@ def _scatter(x: np.ndarray, y: np.ndarray, target: Any, diameter: float, **kwarg
     size = diameter if drawing.__name__.endswith("bokeh") else diameter**2  # other backends: area
     known = np.isfinite(x) & np.isfinite(y)
     return drawing.scatter(x[known], y[known], target, size=size, **kwargs)
+
+
+def functions_of(transform: Any, names: Sequence[str], others: Sequence[str] = ()) -> Functions:
+    """Return the function of each name: one function for all `names`, or a mapping.
+
+    A mapping may name the `others` too.
+    """
+    if transform is None:
+        return {}
+    if callable(transform):
+        return dict.fromkeys(names, transform)
+    if isinstance(transform, Mapping) and all(callable(one) for one in transform.values()):
+        check_names("transform", transform, list(dict.fromkeys([*names, *others])))
+        return dict(transform)
+    raise ModelError(
+        "transform must be a function of an array, such as numpy.exp, or a mapping of names to "
+        f"such functions, got {transform!r}"
+    )
+
+
+def of_record(transform: Any, functions: Functions) -> Functions:
+    """Return the functions of observations beside states: those that a mapping names."""
+    return {} if callable(transform) else functions
+
+
+def transformed(array: xr.DataArray, along: str, functions: Functions) -> xr.DataArray:
+    """Apply to each entry along the dimension `along` its function, if it has one."""
+    names = [str(name) for name in array[along].values]
+    if not set(names) & set(functions):
+        return array
+    values = np.moveaxis(array.values.astype(float), array.get_axis_num(along), 0)
+    for i, name in enumerate(names):
+        if name not in functions:
+            continue
+        result = np.asarray(functions[name](values[i]))
+        if result.shape != values[i].shape:
+            raise ModelError(
+                "transform must return an array of the shape it is given, "
+                f"{values[i].shape} of {name!r}, got shape {result.shape}"
+            )
+        values[i] = result
+    return array.copy(data=np.moveaxis(values, 0, array.get_axis_num(along)))
+
+
+def axis_label(name: str, functions: Functions, *arrays: xr.DataArray | None) -> str:
+    """Return "exp(name)" if that is drawn, else the name with its unit in the `arrays`."""
+    if name not in functions:
+        return with_unit(name, unit_of(name, *arrays))
+    of_function = getattr(functions[name], "__name__", "")
+    return f"{of_function}({name})" if of_function.isidentifier() else name

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from ..errors import ModelError
-from .axes import unit_of
+from .canvas import unit_of
 from .results import group_of
 
 MOST_RECORDS = 12  # that a figure shows unless others are chosen

@@ -13,9 +13,7 @@ from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, se
 from ..errors import ModelError
 from ..evidence import prior_sensitivity
 from ..evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
-from .axes import logarithmic_ticks
-from .canvas import band, canvas, curve, interval, size_of_panels
-from .legend import add_legend
+from .canvas import add_legend, band, canvas, curve, interval, logarithmic_ticks, size_of_panels
 
 LABELS = {
     "prob": ("exponent", "exponent α of the correction"),

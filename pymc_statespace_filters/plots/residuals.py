@@ -11,9 +11,17 @@ from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
 
 from ..diagnostics.innovations import standardised
 from ..errors import ModelError
-from .axes import few_ticks, label_x, time_label, unit_of, with_unit
-from .canvas import band, canvas, interval
-from .legend import add_legend
+from .canvas import (
+    add_legend,
+    band,
+    canvas,
+    few_ticks,
+    interval,
+    label_x,
+    time_label,
+    unit_of,
+    with_unit,
+)
 from .marks import bars, point_size, points, points_xy
 from .panels import one_record
 from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, variable_of

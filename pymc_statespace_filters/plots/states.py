@@ -8,24 +8,27 @@ from arviz_plots import PlotCollection
 
 from ..errors import ModelError
 from ..system.checks import check_count
-from .axes import label_axes, time_label
-from .canvas import curve
-from .legend import add_legend
+from .canvas import add_legend, curve, label_axes, time_label
 from .marks import (
     DOTS,
     DRAWS,
     FEW,
     PATHS,
     TRUTH,
+    Functions,
+    axis_label,
     canvas_over_time,
     draw_bands,
     draw_bars,
     draw_data,
     draw_median,
+    functions_of,
+    of_record,
     over_draws,
     paths,
     points,
     thin_draws,
+    transformed,
 )
 from .panels import facets_of_simulation, several_records
 from .results import (
@@ -37,7 +40,8 @@ from .results import (
     states_of,
     truth_of,
 )
-from .transforms import Functions, axis_label, functions_of, of_record, transformed
+
+PATH = {**DRAWS, "width": 1.5}
 
 
 def plot_states(
@@ -190,9 +194,6 @@ def _record(
         return None, {}
     there = [str(observable) for observable in record["observable"].values]
     return record, measured_by(observables, states, there)
-
-
-PATH = {**DRAWS, "width": 1.5}
 
 
 def refuse_without_draws(**given: Any) -> None:

@@ -17,7 +17,7 @@ from ..evidence.estimators.maximum_likelihood import maximize_noisy
 from ..evidence.estimators.newton import BatchFunction, EdgeError
 from ..importance import log_mean_of_independent
 from ..sampling.starts.annealing import Population
-from .peak import EDGE, HIDDEN, Lost, Peak, unconstrained_hessian
+from .estimate import EDGE, HIDDEN, Lost, Peak, unconstrained_hessian
 from .smooth import population_scale, rescaled
 
 MIN_CURVATURE = 0.2  # below, a direction counts as one without curvature

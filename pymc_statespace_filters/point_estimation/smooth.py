@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 from ..evidence.estimators.maximum_likelihood import maximize_along_edge
 from ..evidence.estimators.newton import BatchFunction, EdgeError, derivatives, newton_maximize
 from ..sampling.starts.annealing import Population
-from .peak import EDGE, INCREASING, LEVEL, Lost, Peak, unconstrained_hessian
+from .estimate import EDGE, INCREASING, LEVEL, Lost, Peak, unconstrained_hessian
 
 N_STARTS = 5
 LENGTHS = 4.0 ** -np.arange(12)  # tried for a scale, relative to the population

@@ -239,7 +239,7 @@ def _likelihood_of_panel(
     op: LogLikelihood, node: Apply, inputs: Sequence[Any], point: Mapping
 ) -> Aligned | None:
     """From a row of parameters for each record to the terms of its rows."""
-    if op.form is not PANEL or inputs[0] is None or inputs[0].axis != 0 or any(inputs[1:]):
+    if op.form != PANEL or inputs[0] is None or inputs[0].axis != 0 or any(inputs[1:]):
         return None
     return Aligned(0, tuple(records_of_rows(node.inputs[1]).tolist()))
 

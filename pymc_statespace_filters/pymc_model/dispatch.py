@@ -17,7 +17,7 @@ from ..errors import ModelError
 from ..evaluation.simulate import simulator
 from ..filters.signatures import PANEL
 from ..ops.likelihood import LogLikelihood, vectorized
-from ..ops.unplanned import cache_key, check_panel, check_record, end_of_record, single_record
+from ..ops.unplanned import cache_key, check_of_rows, end_of_record, single_record
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
@@ -39,20 +39,16 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
         for p, n in zip((theta, steps, inputs, t0), core_ndims, strict=False)
     )
     is_panel = isinstance(op, PanelRV)
-    simulate, check = simulator(op.system, True).function, _check(op)
+    simulate = simulator(op.system, True).function
+    check = check_of_rows(op.system, of_panel=is_panel)
     draws = np.empty((*batch, steps.shape[len(batch)], op.system.p))
     for i in np.ndindex(batch):
         parts = [np.require(a[i], requirements=("C", "W")) for a in (theta, steps, inputs)]
-        check(*(parts if is_panel else parts[1:]))
+        check(*parts)
         records = _single_records(*parts) if is_panel else iter([(slice(None), *parts)])
         for rows, *record in records:
             _, draws[(*i, rows)] = simulate(rng, *record, float(t0[i]))
     return draws
-
-
-def _check(op: StateSpaceRV) -> Any:
-    """The compiled check of a record (steps, inputs), or of a panel (theta, rows, inputs)."""
-    return check_panel(op.system) if isinstance(op, PanelRV) else check_record(op.system)
 
 
 def _single_records(
@@ -68,11 +64,13 @@ def _single_records(
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
     compiled = simulator(op.system, True).jitted
-    simulate, check, p = compiled.function, _check(op), op.system.p
+    is_panel = isinstance(op, PanelRV)
+    simulate, check = compiled.function, check_of_rows(op.system, of_panel=is_panel)
+    p = op.system.p
 
     @numba_njit
     def draw_record(rng, theta, steps, inputs, t0, seed):
-        check(steps, inputs)
+        check(theta, steps, inputs)
         _, observations = simulate(rng, theta.copy(), steps.copy(), inputs.copy(), t0)
         return observations
 
@@ -90,7 +88,7 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
             first = last
         return observations
 
-    draw, what = (draw_panel, "panel") if isinstance(op, PanelRV) else (draw_record, "record")
+    draw, what = (draw_panel, "panel") if is_panel else (draw_record, "record")
     key = key_of(__name__, what, cache_key(op.system, compiled))
     # PyTensor requires an integer as the cache key of a random variable.
     return draw, None if key is None else int(key[:15], 16)

@@ -21,8 +21,7 @@ from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..parallel.cpu_affinity import available_cores
-from .compilation import compile_raveled
-from .density import check_free_variables
+from .density import check_free_variables, compile_raveled
 from .inspection import scored_rows, state_space_nodes
 
 Array = NDArray[np.float64]

@@ -58,7 +58,7 @@ def with_likelihood_callback(
     normals: dict[TensorVariable, TensorVariable] = {}
     names = {seed: name for name, seed in held.items()}
     nodes = [node for node in likelihood_nodes(graphs) if node.op.filter.noisy]
-    noisy_nodes = [node for node in nodes if node.op.form is not PANEL]
+    noisy_nodes = [node for node in nodes if node.op.form != PANEL]
     for number, node in enumerate(noisy_nodes):
         system, filter = node.op.system, node.op.filter
         steps, seed = node.inputs[1], node.inputs[-1]
@@ -114,7 +114,7 @@ def autoregressive_noise(
         if node.inputs[-1] in names:
             *arguments, seed = node.inputs
             system, noisy, steps = node.op.system, node.op.filter, arguments[1]
-            if node.op.form is PANEL:
+            if node.op.form == PANEL:
                 raise ModelError(
                     "correlation must be None for a panel, whose records keep estimates of their "
                     "own"

@@ -19,10 +19,10 @@ from ..filters.ekf import EKF
 from ..filters.protocol import EnsembleFilter, Filter
 from ..filters.signatures import PANEL
 from ..system.accumulators import without_resets
-from ..system.integrators.coupled_noise import CoupledNoise
+from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
-from .compilation import compile_raveled
+from .density import compile_raveled
 from .inspection import likelihood_nodes
 
 MAX_STEPS = 500
@@ -157,7 +157,7 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
         stable = np.ones(len(x), dtype=bool)
         for i, node in enumerate(nodes):
             system, arguments = node.op.system, columns[4 * i : 4 * i + 4]
-            if node.op.form is PANEL:
+            if node.op.form == PANEL:
                 arguments = _each_record(*arguments)
             eigenvalues = path_eigenvalues(system, *arguments)
             is_stable_at = system.integrator.is_stable_at(eigenvalues).all(axis=1)

@@ -17,8 +17,7 @@ from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
 from ..progress import stat_values, step_columns
-from .kernel.random_numbers import draw_key
-from .kernel.state import ChainState
+from .kernel.state import ChainState, draw_key
 from .output import sample_stats
 from .output.warnings import PhaseStatistics, closing_warning
 from .run.chain import Chain

@@ -23,7 +23,7 @@ from ..evaluation.filter_warnings import warn_about
 from ..filters.outcomes import NONE
 from ..progress import row_progress
 from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables, with_other_filter
-from ..system.panel_inputs import panel_inputs
+from ..system.panel import panel_inputs
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from ..system.record import check_inputs
 from .draws import SAMPLE_DIMS, PosteriorDraws

@@ -14,6 +14,11 @@ from .model import StateSpaceModel
 from .panel import SymbolicPanel
 from .panel_records import Records
 
+_OTHER_NUMBER = (
+    "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
+    "records, change the parameter's dimension too"
+)
+
 
 def check_names(system: StateSpaceModel, params: Mapping[str, Any]) -> None:
     """Raise unless ``params`` is a mapping from names of the system's parameters."""
@@ -105,12 +110,6 @@ def numbers(name: str, value: Any) -> np.ndarray:
     if np.isnan(array).any():
         raise ModelError(f"parameter {name!r} must not be NaN, got {value!r}")
     return array
-
-
-_OTHER_NUMBER = (
-    "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
-    "records, change the parameter's dimension too"
-)
 
 
 def panel_parameters(

@@ -8,7 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics import cross_validation as module
-from pymc_statespace_filters.diagnostics.truncated_data import observed_values, truncate_data
+from pymc_statespace_filters.diagnostics.cross_validation import observed_values, truncate_data
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.diagnostics.records import (

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import multivariate_normal
 
 from pymc_statespace_filters.evidence.estimators.whitening import NormalProposals
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.targets import Regression, autoregressive
 
 __all__ = ["Regression", "autoregressive", "gaussian", "half_normal", "pilot"]

@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from scipy.special import expit, log_expit, logit
 from scipy.stats import gamma, halfnorm, multivariate_normal, norm, uniform
 
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 
 
 def autoregressive(shape, correlation, rng):

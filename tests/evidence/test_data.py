@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence.posterior.observed_data import (
+from pymc_statespace_filters.evidence.posterior import (
     data_fingerprint,
     observation_count,
 )

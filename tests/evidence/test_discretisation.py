@@ -11,8 +11,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.checks import discretisation
-from pymc_statespace_filters.evidence.checks.discretisation import check_discretisation
+from pymc_statespace_filters.evidence import checks
+from pymc_statespace_filters.evidence.checks import check_discretisation
 from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps
@@ -181,9 +181,9 @@ class TestRules:
             pm.Normal("y", 0 * a, 1, observed=np.zeros(size))
         value = model.rvs_to_values[a]
         densities = model.logp(), model.logp() - lost(value)
-        monkeypatch.setattr(discretisation, "densities_by_steps", lambda model: densities)
+        monkeypatch.setattr(checks, "densities_by_steps", lambda model: densities)
         monkeypatch.setattr(
-            discretisation,
+            checks,
             "step_stability",
             lambda model: lambda x: ~overshoots(x[:, 0]),
         )

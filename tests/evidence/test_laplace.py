@@ -8,7 +8,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.laplace import Laplace
 from pymc_statespace_filters.evidence.estimators.newton import EdgeError, derivatives
 from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.analytic import Regression, gaussian, half_normal
 
 

@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
     max_log_likelihood,
 )
 from pymc_statespace_filters.evidence.estimators.newton import newton_maximize
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.targets import (
     Banana,
     Regression,

@@ -11,7 +11,7 @@ from pymc_statespace_filters.evidence.estimators import block_ordinates as multi
 from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate_in_blocks
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.analytic import autoregressive, gaussian, half_normal, pilot
 from tests.evidence.targets import Banana, Regression, TwoModes
 

@@ -5,7 +5,7 @@ import pytest
 
 from pymc_statespace_filters.evidence.estimators import random_walk_proposal as _proposal
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal, plan_proposal
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from tests.evidence.analytic import gaussian, pilot
 
 LOG_EVIDENCE = -3.7  # of `gaussian`

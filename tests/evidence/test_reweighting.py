@@ -13,7 +13,7 @@ from scipy.stats import multivariate_t, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.pooled import Pooled
-from pymc_statespace_filters.evidence.posterior.draws import Posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct
 from pymc_statespace_filters.evidence.reweighting.reweight import _problems
 from tests.evidence.targets import Normals, autoregressive, log_normal

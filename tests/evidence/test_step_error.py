@@ -18,7 +18,7 @@ from pymc_statespace_filters.evidence.shorter_steps import _jackknifed, _log_rat
 from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.inspection import likelihood_nodes
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
-from pymc_statespace_filters.system.integrators.coupled_noise import CoupledNoise
+from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
 
 DT, SIGMA, SENSOR, M0, P0 = 0.2, 0.6, 0.08, 1.0, 0.5
 STEPS = np.arange(0, 101, 4)

@@ -18,8 +18,7 @@ from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.prediction_graphs import gaussian_predictions
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable
+from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, gaussian_predictions
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])

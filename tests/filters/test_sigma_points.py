@@ -12,9 +12,12 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.gaussian.linearization import Linearizations
+from pymc_statespace_filters.filters.gaussian.linearization import (
+    Linearizations,
+    Tangent,
+    linearizations_of,
+)
 from pymc_statespace_filters.filters.gaussian.sigma_points import SigmaPoints
-from pymc_statespace_filters.filters.gaussian.tangent import Tangent, linearizations_of
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood

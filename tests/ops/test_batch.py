@@ -118,7 +118,7 @@ def test_other_batches_are_loops(filter):
     batches = {theta: thetas, data: datas} if not filter.noisy else {theta: thetas}
     nodes = [v.owner for v in ancestors([vectorize_graph(terms, batches)]) if v.owner]
     assert [n for n in nodes if isinstance(n.op, Blockwise)]
-    assert not [n for n in nodes if getattr(n.op, "form", None) is signatures.POINTS]
+    assert not [n for n in nodes if getattr(n.op, "form", None) == signatures.POINTS]
 
 
 def test_gradient_of_a_batch():
@@ -145,7 +145,7 @@ def test_log_density_of_a_batch_of_parameters_in_pymc():
     d = psf.StateSpace.dist(thetas, *record, system=PAIR, filter=psf.EKF())
     logp = pm.logp(d, PAIR_DATA)
     nodes = [v.owner for v in ancestors([logp]) if v.owner]
-    assert [n for n in nodes if getattr(n.op, "form", None) is signatures.POINTS]
+    assert [n for n in nodes if getattr(n.op, "form", None) == signatures.POINTS]
     got = pytensor.function([thetas], logp)(POINTS[:3])
     direct, _ = evaluator(LogLikelihood(PAIR, psf.EKF(), signatures.POINTS))(POINTS[:3], *RECORD)
     np.testing.assert_allclose(got, direct, rtol=1e-12)

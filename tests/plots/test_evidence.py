@@ -9,7 +9,7 @@ import xarray as xr
 
 from pymc_statespace_filters import ModelError, plot_evidence
 from pymc_statespace_filters.evidence.evidence import store_evidence
-from pymc_statespace_filters.plots.axes import linear_ticks
+from pymc_statespace_filters.plots.canvas import linear_ticks
 from tests.plots.conftest import an_evidence
 from tests.plots.drawn import drawn
 

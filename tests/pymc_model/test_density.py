@@ -13,7 +13,7 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native import rows as many_calls
-from pymc_statespace_filters.pymc_model import compilation
+from pymc_statespace_filters.pymc_model import density
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from tests.interrupts import interrupt_in
@@ -84,9 +84,9 @@ def test_other_warnings_of_a_compilation_are_shown(monkeypatch):
         warnings.warn("Loop fusion failed because of the number of operands", stacklevel=1)
         warnings.warn("something else", stacklevel=1)
 
-    monkeypatch.setattr(compilation, "compile_pymc", compile_and_warn)
+    monkeypatch.setattr(density, "compile_pymc", compile_and_warn)
     with pytest.warns(UserWarning, match="something else") as shown:
-        compilation.compile_density([], [])
+        density.compile_density([], [])
     assert [str(warning.message) for warning in shown] == ["something else"]
 
 
@@ -106,8 +106,8 @@ def test_filters_of_warnings_that_another_thread_sets_survive_a_compilation(
 
     with warnings.catch_warnings():
         block, before = warnings.catch_warnings(), list(warnings.filters)
-        monkeypatch.setattr(compilation, "compile_pymc", compile_meanwhile)
-        compilation.compile_density([], [])
+        monkeypatch.setattr(density, "compile_pymc", compile_meanwhile)
+        density.compile_density([], [])
         assert [f[1].pattern for f in warnings.filters[:1]] == ["of another thread"]
         assert warnings.filters[1:] == before
         warnings.warn("of another thread", stacklevel=1)
@@ -117,12 +117,12 @@ def test_filters_of_warnings_that_another_thread_sets_survive_a_compilation(
 
 
 def test_a_filter_of_the_same_warning_survives_a_compilation(monkeypatch):
-    monkeypatch.setattr(compilation, "compile_pymc", lambda inputs, outputs: None)
+    monkeypatch.setattr(density, "compile_pymc", lambda inputs, outputs: None)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "Loop fusion failed", UserWarning)
         warnings.filterwarnings("ignore", "Loop fusion failed", UserWarning)
         before = list(warnings.filters)
-        compilation.compile_density([], [])
+        density.compile_density([], [])
         assert warnings.filters == before
 
 

@@ -10,7 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.philox import seed_of_record
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior.observed_data import (
+from pymc_statespace_filters.evidence.posterior import (
     observation_count,
     scalar_count,
 )

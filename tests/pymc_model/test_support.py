@@ -5,7 +5,7 @@ import pymc as pm
 import pytest
 from pymc.distributions.transforms import log, ordered
 
-from pymc_statespace_filters.pymc_model.support import Support
+from pymc_statespace_filters.pymc_model.prior import Support
 
 DATA = np.array([0.3, 1.2, 0.8])
 

@@ -11,8 +11,7 @@ from pytensor.raise_op import Assert
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction, make_call
-from pymc_statespace_filters.pymc_model.compilation import compile_raveled
-from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.density import ModelDensity, compile_raveled
 from pymc_statespace_filters.pymc_model.inspection import health_outputs, noise_seeds
 from pymc_statespace_filters.pymc_model.written_function import WrittenFunction, native_function
 from tests.systems import autoregression

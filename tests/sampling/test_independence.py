@@ -31,7 +31,6 @@ from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
     next_share,
     warmup_parts,
 )
-from pymc_statespace_filters.sampling.kernel.random_numbers import random_block
 from pymc_statespace_filters.sampling.kernel.state import (
     INDEPENDENT,
     N_COUNTS,
@@ -39,6 +38,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
     N_NUMBERS,
     STAGE,
     Draws,
+    random_block,
 )
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.target.settings import DRAMSettings

@@ -11,7 +11,7 @@ from pytensor.tensor import dscalar
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError, ParallelError
-from pymc_statespace_filters.sampling.kernel.random_numbers import draw_key
+from pymc_statespace_filters.sampling.kernel.state import draw_key
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.target import leader_follower
 from pymc_statespace_filters.sampling.target.leader_follower import follow, release_followers

@@ -10,7 +10,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.kernel import proposal_mixture
 from pymc_statespace_filters.sampling.kernel.independence import N_COMPONENTS, SHARE
-from pymc_statespace_filters.sampling.run import warm_up
+from pymc_statespace_filters.sampling.run import population_search
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 
 RNG = np.random.default_rng(3)
@@ -52,7 +52,7 @@ def start(chain, draw):
 @pytest.fixture
 def walk_alone(monkeypatch):
     """Chains without independence proposals."""
-    for module in (warm_up, proposal_mixture):
+    for module in (population_search, proposal_mixture):
         monkeypatch.setattr(module, "fitted_mixture", lambda *of: None)
 
 
@@ -262,7 +262,7 @@ def test_a_mixture_is_fitted_to_the_pilots_draws_before_the_first_iteration(mode
     rows = np.concatenate(np.swapaxes(unconstrained, 0, 1))
     np.testing.assert_allclose(tasks[0].population, rows, rtol=1e-11)
     population = tasks[0].population
-    first = warm_up.WarmUp(tasks[0].request, population.shape[1], population).mixture
+    first = population_search.WarmUp(tasks[0].request, population.shape[1], population).mixture
     assert first[SHARE] == 0.5
     assert first[N_COMPONENTS] >= 2
     assert found["sample_stats"]["independent"].values.any()

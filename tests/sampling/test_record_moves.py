@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pymc_statespace_filters.sampling.kernel.records.moves import accept_all, accept_records
+from pymc_statespace_filters.sampling.kernel.record_moves import accept_all, accept_records
 
 # Log2 of p(x | m) of both records, by the population's value, and of the estimates L(x, u).
 PRIOR = np.array([[0.0, -1.0], [-2.0, 0.0]])

@@ -17,14 +17,14 @@ MEMBER_INPUTS = frozenset({"x", "z"})
 
 
 @dataclass(frozen=True)
-class CompiledFunction[F]:
-    """A compiled function of the type F, and the key that identifies its code.
+class CompiledFunction:
+    """A compiled function, and the key that identifies its code.
 
     Without a key the code cannot be cached on disk. A ``large`` one becomes machine code in its
     callers only, and cannot be called from Python.
     """
 
-    function: F
+    function: Any
     key: str | None = None
     large: bool = False
 

@@ -17,6 +17,9 @@ import numba
 import pytensor
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
+# Numba's own index on disk tells processors and versions of Python apart.
+_COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
+
 
 class _File(NamedTuple):
     content: bytes
@@ -147,8 +150,6 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-# Numba's own index on disk tells processors and versions of Python apart.
-_COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
 _SOURCES = Sources(Path(__file__).parents[2], NUMBA_CACHE_PATH)
 
 

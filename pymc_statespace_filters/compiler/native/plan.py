@@ -32,7 +32,6 @@ class RecordSlots(NamedTuple):
     """Parameters (G, k), rows (J,) or (J, 3), data (J, p), inputs and starts, by address and size.
 
     Rows of width 1 are the steps of a single record, rows of width 3 those of `system.panel`.
-    Lengths, times and flags of steps are for records that no grid of equal steps holds.
     """
 
     theta: int = 0
@@ -49,10 +48,6 @@ class RecordSlots(NamedTuple):
     n_inputs: int = 11
     starts: int = 12  # time of step 0 of each record, or of all
     n_starts: int = 13
-    step_lengths: int = 14
-    step_times: int = 15
-    step_flags: int = 16
-    n_steps: int = 17
 
 
 class RequestSlots(NamedTuple):

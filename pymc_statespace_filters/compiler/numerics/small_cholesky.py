@@ -1,7 +1,7 @@
 """Cholesky factors, triangular solves and the Gaussian log-density of small matrices, in place.
 
 The factorisations differ on purpose. `covariance_root` takes covariances given by the user, and
-returns NaN for a matrix that is no covariance. `codegen.scalarize` and `codegen.array_linalg`
+returns NaN for a matrix that is no covariance. `codegen.scalarize` and `codegen.array_fallback`
 implement PyTensor's Cholesky in generated code, with its conventions.
 """
 

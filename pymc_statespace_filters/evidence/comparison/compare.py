@@ -12,10 +12,8 @@ from scipy.stats import norm
 
 from ...errors import EvidenceWarning, ModelError
 from ..evidence import Evidence
-from .probabilities import check_ci_prob, prior_weights, probabilities
-from .selection import EvidenceLike, select_evidences
-from .sentences import needs_warning, sentences
-from .step_errors import step_error_columns
+from .selection import EvidenceLike, check_ci_prob, prior_weights, probabilities, select_evidences
+from .sentences import needs_warning, sentences, step_error_columns
 from .table import EvidenceTable
 
 # Kass and Raftery (1995), section 3.2: lower limits of twice the log Bayes factor.

@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from ...errors import EvidenceWarning, ModelError
 from ...pymc_model.posterior_draws import unconstrained_draws
 from .compare import DimensionCorrection, compare_evidence
-from .probabilities import check_ci_prob, prior_weights, probabilities
-from .scaled_prior import ReweightedEvidence
-from .selection import EvidenceLike
-from .width_curve import WidthCurves, width_curves
+from .scaled_prior import ReweightedEvidence, WidthCurves, width_curves
+from .selection import EvidenceLike, check_ci_prob, prior_weights, probabilities
 
 EXPONENTS = np.linspace(0, 4, 41)
 WIDTHS = np.geomspace(0.25, 4, 17)

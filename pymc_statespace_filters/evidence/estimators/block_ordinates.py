@@ -46,7 +46,7 @@ from scipy.special import softmax
 
 from ...errors import DataMismatchError
 from ...importance import log_mean, mcse_of_chains, mcse_of_walkers
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .random_walk_proposal import Proposal
 from .whitening import Whitening
 

@@ -51,7 +51,7 @@ from scipy.stats import Covariance, multivariate_normal
 
 from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ..pooled import bridge_constant
-from ..posterior.draws import Posterior, check_overlap
+from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
 from .whitening import NormalProposals, Whitening, moments, normal_proposals

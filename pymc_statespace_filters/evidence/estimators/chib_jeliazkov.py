@@ -42,7 +42,7 @@ import numpy as np
 from ...errors import ModelError
 from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
 from ...system.checks import check_count
-from ..posterior.draws import Posterior, check_overlap
+from ..posterior import Posterior, check_overlap
 from .block_ordinates import BlockEstimate, estimate_in_blocks
 from .protocol import Estimate
 from .random_walk_proposal import Proposal, ProposalPlan, plan_proposal

@@ -28,7 +28,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...importance import MIN_EFFECTIVE, log_mean_of_independent, pareto_k
-from ..posterior.draws import Posterior, check_overlap
+from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
 from .student_mixture import choose_mixture

@@ -20,7 +20,7 @@ from arviz_stats import mcse
 from numpy.typing import NDArray
 
 from ...errors import ModelError
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .newton import BatchFunction, EdgeError, best_of_chains, derivatives, newton_maximize
 from .protocol import Estimate
 from .whitening import moments_within_chains

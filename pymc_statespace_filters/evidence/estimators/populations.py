@@ -17,7 +17,7 @@ from scipy.stats import t as student
 
 from ...importance import mcse_of_chains
 from ...student_mixture import fit_mixture, place_components, standardised
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .smc_moves import Particles
 
 FALSE_ALARMS = 0.002  # probability of a difference in any region, if there is none

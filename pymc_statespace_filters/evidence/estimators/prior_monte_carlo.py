@@ -21,7 +21,7 @@ import numpy as np
 from ...errors import ModelError
 from ...importance import MIN_EFFECTIVE, log_mean_of_independent
 from ...system.checks import check_count
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
 

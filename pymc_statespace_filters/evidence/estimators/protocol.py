@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 
 
 @dataclass(frozen=True)

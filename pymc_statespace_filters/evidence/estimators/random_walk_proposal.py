@@ -18,7 +18,7 @@ from scipy.cluster.vq import kmeans2
 
 from ...errors import DataMismatchError
 from ...importance import log_mean, log_mean_of_chains
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .stopping import ratio_of_errors
 from .whitening import BLOCK, NormalProposals, Whitening, moments
 

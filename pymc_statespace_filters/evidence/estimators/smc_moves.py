@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...errors import ModelError
 from ...importance import systematic
 from ...student_mixture import StudentMixture
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .whitening import Whitening
 
 MIN_ALIVE = 50  # prior draws of positive likelihood

@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator
 
 from ...system.checks import check_positive
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 
 FEWEST, MOST = 1000, 16_000  # evaluations with a target
 MOST_WITHOUT_TARGET = 10_000

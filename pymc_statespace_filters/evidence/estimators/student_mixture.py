@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ...student_mixture import StudentMixture, fit_mixture, place_components
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .whitening import moments
 
 MOST_COMPONENTS = 10

@@ -53,7 +53,7 @@ from ...errors import ModelError
 from ...student_mixture import StudentMixture
 from ...system.checks import check_count, is_integer
 from ...tempering import next_temperature
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 from .populations import compare_with_draws
 from .protocol import Estimate
 from .smc_moves import (

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ModelError
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 
 Array = NDArray[np.float64]
+
+BLOCK = 500  # points
 
 
 class Whitening(NamedTuple):
@@ -71,9 +73,6 @@ def _factored(mean: Array, covariance: Array, count: int) -> Whitening:
             "the draws of idata must vary in every direction, got a singular covariance of "
             f"{count} draws of {len(mean)} unconstrained parameters"
         ) from None
-
-
-BLOCK = 500  # points
 
 
 class NormalProposals:

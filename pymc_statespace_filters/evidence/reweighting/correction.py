@@ -10,9 +10,9 @@ from scipy.special import logsumexp
 
 from ...importance import normalised
 from ..estimators.student_mixture import choose_mixture
+from ..exact_density import fresh_seeds
 from ..pooled import Pooled
-from ..posterior.draws import Posterior, check_overlap
-from ..posterior.exact_density import fresh_seeds
+from ..posterior import Posterior, check_overlap
 from .defence import N_ROUNDS, N_SEARCHED, defensive_mixture
 
 FEWEST_POINTS = 200

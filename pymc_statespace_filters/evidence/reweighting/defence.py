@@ -29,7 +29,7 @@ from ...errors import ModelError
 from ...importance import normalised, systematic
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ...tempering import next_temperature
-from ..posterior.draws import Posterior
+from ..posterior import Posterior
 
 SCALE = 3.0  # of the wide part, in widths of the fit to the draws
 N_CLOUD = 2000

@@ -6,8 +6,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...importance import normalised, smoothed, systematic
-from ...pymc_model.compilation import ConstrainedValues
-from ..posterior.exact_density import ExactDensity
+from ...pymc_model.density import ConstrainedValues
+from ..exact_density import ExactDensity
 from .correction import Correction
 
 POINTS = "weighted_posterior"  # the group of draws and defensive points with their weights

@@ -20,8 +20,8 @@ from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...system.checks import check_count, check_random_seed, is_integer
-from ..posterior.draws import build_posterior
-from ..posterior.exact_density import ExactDensity
+from ..exact_density import ExactDensity
+from ..posterior import build_posterior
 from .correction import Correction, correct
 from .result import reweighted_tree
 

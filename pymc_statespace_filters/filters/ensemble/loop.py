@@ -157,7 +157,7 @@ def ensemble_filter(
     name : str
     workspace : njit function ``(system, local, settings) -> tuple``
         Allocates, once per evaluation, what ``update`` needs besides the members, and reads the
-        filter's settings. ``system`` is a `PlannedSystem`, ``local`` a `LocalPartition`: which of
+        filter's settings. ``system`` is a `SystemPointers`, ``local`` a `LocalPartition`: which of
         all members are here.
     update : njit function
         ``(system, j, k, t, d, noise, members, local, work) -> Outcome``. Replaces the forecast

@@ -33,10 +33,6 @@ class RankLayout(NamedTuple):
     exchange: int
 
 
-SINGLE_RANK = (0, 1, 0)
-"""A share of all members."""
-
-
 @inline_always
 def local_range(layout, n_columns, per_block):
     """First and last (exclusive) of the columns that are our own."""

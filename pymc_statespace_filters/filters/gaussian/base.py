@@ -18,12 +18,18 @@ from ..protocol import System
 from ..signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PULLBACK, RUN, STATES, TAPED
 from .backward import BACKWARD
 from .forward import FORWARD
-from .functions import filter_plan
-from .linearization import Linearization, Linearizations, predict, start, state_size, update
-from .recursion import GaussianFilterFunctions
+from .functions import GaussianFilterFunctions, filter_plan
+from .linearization import (
+    Linearization,
+    Linearizations,
+    linearizations_of,
+    predict,
+    start,
+    state_size,
+    update,
+)
 from .states import RUN as RUN_STATES
 from .states import states_plan
-from .tangent import linearizations_of
 
 
 class GaussianFilterBase:

@@ -39,9 +39,8 @@ from pytensor.tensor.variable import TensorVariable
 from ...compiler.codegen.function_types import Graph
 from ...compiler.codegen.semidefinite import semidefinite_root
 from ...compiler.codegen.simd import LaneFunction
-from .functions import covariances_at
+from .functions import GaussianFilterFunctions, covariances_at
 from .linearization import Linearizations, Symbols, innovation_of, pack, unpack
-from .recursion import GaussianFilterFunctions
 
 
 class BrysonFrazier:

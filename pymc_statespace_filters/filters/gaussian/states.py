@@ -20,7 +20,15 @@ from ..plan import PLAN, make_plan, settings_of
 from ..protocol import System
 from .bryson_frazier import BrysonFrazier
 from .forward import forward_pass
-from .functions import ALONG, Functions, checked, compiled, extensions, places_of
+from .functions import (
+    ALONG,
+    Functions,
+    GaussianFilterFunctions,
+    checked,
+    compiled,
+    extensions,
+    places_of,
+)
 from .group import (
     N_OF_RECORD,
     copy,
@@ -33,7 +41,6 @@ from .group import (
 )
 from .linearization import Linearizations
 from .machine import call, read_machine, workspace
-from .recursion import GaussianFilterFunctions
 
 MOMENTS = {"predicted": 0, "filtered": 1, "smoothed": 2}
 _PREDICTED, _, _SMOOTHED = MOMENTS.values()

@@ -11,6 +11,9 @@ PREDICTED, FILTERED, SMOOTHED = range(3)
 MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
 """Given the observations before the step, up to and at the step, or all."""
 
+_HALVINGS = 40  # of the bisection for a draw within a cell
+_STRIDE = 16  # points, in the search for that cell
+
 
 class Rows(NamedTuple):
     """Results: mean, standard deviation and a draw of the state at the steps ``at``."""
@@ -20,10 +23,6 @@ class Rows(NamedTuple):
     mean: np.ndarray
     sd: np.ndarray
     drawn: np.ndarray
-
-
-_HALVINGS = 40  # of the bisection for a draw within a cell
-_STRIDE = 16  # points, in the search for that cell
 
 
 @njit_internal

@@ -1,6 +1,10 @@
-"""Arrays that the machine code of a chain reads and writes, and the meaning of their columns.
+"""Arrays that the machine code of a chain reads and writes, and its random numbers.
 
 They are made in Python, changed in place by machine code, and stored as they are in a checkpoint.
+
+One call of a generator costs microseconds whether it returns one number or a thousand. A block of
+numbers is a function of the chain's key and the block's index, so that a chain can be resumed at
+any iteration, on any rank.
 """
 
 from typing import NamedTuple
@@ -9,6 +13,7 @@ import numpy as np
 
 from ...compiler.native.pytensor_function import Call
 from ...filters.outcomes import FAILURES
+from ...student_mixture import DEGREES_OF_FREEDOM
 from .adaptation_state import unpack
 
 HEALTH_SIZE = 3
@@ -26,6 +31,8 @@ N_COUNTS = 7
 N_COMMON_BLOCKS = 2
 # Cells of the control block that a running chain shares with the main thread.
 PAUSE_REQUESTED, N_DONE = range(2)
+
+BLOCK = 256
 
 
 class NativeLogDensity(NamedTuple):
@@ -117,3 +124,35 @@ def failure_reason(code: int) -> str:
     if code == NOT_A_NUMBER:
         return "the log-density is NaN or plus infinity"
     return FAILURES.get(code, f"failure {code}")
+
+
+def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:
+    """Draw a chain's random numbers for iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``."""
+    rng = generator_of_block(key, index)
+    return RandomBlock(
+        rng.standard_normal((BLOCK, n_stages, dim)),
+        -rng.standard_exponential((BLOCK, n_stages + 1)),
+        draw_seeds(rng, (BLOCK, n_stages, n_noisy)),
+        rng.random((BLOCK, 2)),
+        np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, BLOCK)),
+    )
+
+
+def generator_of_block(key: np.ndarray, index: int) -> np.random.Generator:
+    """Make the generator of a block; consecutive ones start 2^128 numbers apart."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, index, 0]))
+
+
+def draw_key(rng: np.random.Generator) -> np.ndarray:
+    """Draw the key of a chain."""
+    return rng.integers(0, np.iinfo(np.uint64).max, size=2, dtype=np.uint64, endpoint=True)
+
+
+def side_generator(key: np.ndarray, number: int = 1) -> np.random.Generator:
+    """Make a generator from the chain's key that overlaps none of its blocks, nor another one."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, number]))
+
+
+def draw_seeds(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Draw noise seeds, non-negative int64 of the given shape."""
+    return rng.integers(0, np.iinfo(np.int64).max, size=shape, dtype=np.int64)

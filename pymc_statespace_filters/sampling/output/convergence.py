@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from arviz_stats.base import array_stats
 
 from .datatree import most_iterations
 
@@ -57,6 +56,10 @@ def convergence(chains: Sequence[np.ndarray], most_draws: int | None = None) -> 
 
 def _of_element(draws: np.ndarray) -> tuple[float, float]:
     """Effective sample size and R-hat of draws of one number, shape (chains, n)."""
+    # It takes as long to import as the rest of what sampling needs, and the first diagnostics are
+    # wanted while chains run.
+    from arviz_stats.base import array_stats
+
     if np.ptp(draws) == 0.0:  # ArviZ takes these for independent draws
         return 0.0, np.inf
     halves = draws[0, : draws.shape[1] // 2 * 2].reshape(2, -1)

@@ -38,7 +38,7 @@ from pytensor.tensor.type import TensorType
 from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import Rows, at_points
-from ...pymc_model.compilation import compile_raveled
+from ...pymc_model.density import compile_raveled
 from ...pymc_model.written_function import native_function
 from ..target.variables import RaveledVariables
 

@@ -23,10 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
-from ..kernel.random_numbers import draw_seeds, side_generator
-from ..kernel.state import LOG_DENSITY, Draws, Evaluation
+from ..kernel.state import LOG_DENSITY, Draws, Evaluation, draw_seeds, side_generator
 from ..target.sampled_model import SampledModel
 from .warnings import sampler_warning
 
@@ -103,7 +102,7 @@ def spread_of(estimates: np.ndarray) -> SeedSpread:
     if without_one.min() <= 1e-12 * squares.sum():  # all of the variance is due to one estimate
         return SeedSpread(n, mean, variance, 0.0, np.inf, n_failed)
     error = math.sqrt((n - 1) * np.log(without_one).var())
-    factor = math.exp(min(700.0, student_t.ppf(0.5 + 0.5 * _CONFIDENCE, n - 1) * error))
+    factor = math.exp(min(700.0, stdtrit(n - 1, 0.5 + 0.5 * _CONFIDENCE) * error))
     return SeedSpread(n, mean, variance, variance / factor, variance * factor, n_failed)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pymc.stats.convergence import SamplerWarning
 
-from ..kernel.records.arrays import N_POPULATION_MOVES
+from ..kernel.record_arrays import N_POPULATION_MOVES
 from ..kernel.state import (
     ACCEPTANCE,
     FAILURE,

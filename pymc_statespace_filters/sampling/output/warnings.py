@@ -11,7 +11,7 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 from ...filters.outcomes import COLLAPSED
 from ...lower_chains import LowerChain, lower_chains
 from ...progress import MIN_ACCEPT_RATE
-from ..kernel.records.arrays import N_POPULATION_MOVES
+from ..kernel.record_arrays import N_POPULATION_MOVES
 from ..kernel.state import (
     FAILURE,
     LOG_DENSITY,

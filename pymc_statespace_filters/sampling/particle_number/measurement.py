@@ -21,6 +21,11 @@ _NEAR = 4.0
 # Estimates by another filter, and the number of particles from which on it is looked for.
 _OTHER, _MANY = 12, 1000
 
+# The observations named carry this share of the variance together, if so many are enough.
+_SHARE, _MOST = 0.5, 5
+# A variance is concentrated if one in so many observations carries half of it.
+_ONE_IN = 50
+
 
 class Measurement:
     """Rows measured so far, by number of particles, at the centre and tail of a posterior."""
@@ -107,12 +112,6 @@ def _comparison(filter: Filter, found: Estimates, variance: float) -> Sequence[s
         if less < 0.5 * variance
         else []
     )
-
-
-# The observations named carry this share of the variance together, if so many are enough.
-_SHARE, _MOST = 0.5, 5
-# A variance is concentrated if one in so many observations carries half of it.
-_ONE_IN = 50
 
 
 def noisiest_terms(terms: np.ndarray) -> dict[int, float]:

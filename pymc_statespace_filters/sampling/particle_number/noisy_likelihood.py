@@ -7,7 +7,7 @@ import numpy as np
 from pymc.model import Model
 
 from ...errors import ModelError
-from ...filters.protocol import Filter
+from ...filters.protocol import Filter, properties
 from ...pymc_model.aligned_axes import records_of_rows
 from ...pymc_model.density import RowFunction
 from ...pymc_model.graph_rewrites import likelihood_terms, with_filter
@@ -19,7 +19,7 @@ from ...pymc_model.inspection import (
     state_space_nodes,
 )
 from ...pymc_model.panel_structure import panel_structure
-from ..kernel.random_numbers import draw_seeds
+from ..kernel.state import draw_seeds
 from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_of
 from ..target.target import Target
 from ..target.variables import RaveledVariables, continuous_value_vars
@@ -78,7 +78,7 @@ class NoisyLikelihood:
         filter = resized(self.filter, n)
         pilot = self._pilot(filter, self._raveled.ravel(self._point), _FIRST_SHARE)
         centre, variance = self._best(filter, pilot)
-        quiet = self.quiet_filter() if self.filter.unbiased else None
+        quiet = self.quiet_filter() if properties(self.filter).unbiased else None
         if variance > TOO_NOISY and (pilot.is_complete or quiet is not None):
             # The pilot's target was mostly noise.
             filter = quiet or resized(filter, round(n * min(variance, _PILOT_GROWTH)))

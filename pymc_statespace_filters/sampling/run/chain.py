@@ -7,8 +7,7 @@ import numpy as np
 
 from ..kernel.adaptation_state import pack, packed_size, start_adaptation
 from ..kernel.independence import no_mixture
-from ..kernel.random_numbers import draw_seeds
-from ..kernel.state import N_COUNTS, ChainState, Evaluation, PhaseSettings, RandomBlock
+from ..kernel.state import N_COUNTS, ChainState, Evaluation, PhaseSettings, RandomBlock, draw_seeds
 from ..kernel.transition import advance
 from ..output.likelihood_variance import SeedSpread, seed_spread
 from ..target.initial_points import EvaluatedPoint, best_initial_point

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ...parallel.signals import held_interrupts
-from ..kernel.random_numbers import BLOCK
 from ..kernel.state import (
     ACCEPTANCE,
+    BLOCK,
     FAILURE,
     N_DONE,
     N_EVALUATIONS,

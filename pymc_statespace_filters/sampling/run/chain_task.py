@@ -13,8 +13,17 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning, log_warnings
 
 from ..checkpoint.checkpoint import Checkpoint
-from ..kernel.random_numbers import draw_key, draw_seeds
-from ..kernel.state import N_DONE, N_FAILED, PAUSE_REQUESTED, STAGE, ChainState, Draws, has_moved
+from ..kernel.state import (
+    N_DONE,
+    N_FAILED,
+    PAUSE_REQUESTED,
+    STAGE,
+    ChainState,
+    Draws,
+    draw_key,
+    draw_seeds,
+    has_moved,
+)
 from ..output.likelihood_variance import N_SEEDS, N_STUCK, start_warning
 from ..target.record_target import RecordTarget
 from ..target.target import Target

@@ -19,8 +19,7 @@ from xarray import DataTree
 from ...parallel.communicator import Communicator
 from ...pymc_model.inspection import element_names, filters_used
 from ..checkpoint.checkpoint import Checkpoint
-from ..kernel.random_numbers import side_generator
-from ..kernel.state import ChainState, Draws
+from ..kernel.state import ChainState, Draws, side_generator
 from ..output.convergence import Convergence, convergence
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
@@ -33,10 +32,9 @@ from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chain_task import ChainTask
-from .population_search import search_population, searched_cov
+from .population_search import WarmUp, search_population, searched_cov, stops_of
 from .record_chain import chain_of
 from .request import SamplingRequest
-from .warm_up import WarmUp, stops_of
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.

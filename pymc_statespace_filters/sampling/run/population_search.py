@@ -1,6 +1,6 @@
-"""The search for starts of a model's chains: how long it is, and what comes of it."""
+"""The search for starts of a model's chains, and the mixture of proposals that they share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pymc.model import Model
@@ -9,11 +9,16 @@ from pymc.stats.convergence import log_warnings
 from ...errors import ModelError
 from ...student_mixture import standardised
 from ..checkpoint.checkpoint import Checkpoint
+from ..kernel.independence import no_mixture
+from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
+from ..kernel.state import Draws
+from ..starts.annealing import N_SWEEPS
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import N_POINTS, find_population
 from ..target.target import Target
 from .request import SamplingRequest
-from .warm_up import generator_of
+
+_NO_CHAIN = 2**32 - 1
 
 _UNUSABLE_PILOT = (
     "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
@@ -26,6 +31,60 @@ _UNUSABLE_PILOT = (
 _LONG_WARMUP, _SHORT_WARMUP = 4000, 800
 _PER_POINT = 40  # of these iterations
 _FEWEST_POINTS = 32
+
+
+def stops_of(request: SamplingRequest) -> list[int]:
+    """Iterations after which the chains wait for each other, in order; last, the end."""
+    return [*warmup_parts(request.tune), request.n_iterations]
+
+
+def generator_of(request: SamplingRequest, *key: int) -> np.random.Generator:
+    """A generator of a model's own random numbers, which are not those of a chain."""
+    seed = np.random.SeedSequence(request.entropy, spawn_key=(_NO_CHAIN, *key))
+    return np.random.default_rng(seed)
+
+
+class WarmUp:
+    """The mixture, fitted to a population and, after each part of the warm-up, to all chains.
+
+    Parameters
+    ----------
+    request : SamplingRequest
+    dim : int
+        Of the mixture; 0 for chains that have none.
+    population : ndarray, shape (m, d), optional
+
+    Attributes
+    ----------
+    mixture : ndarray
+        Packed, of the current part.
+    """
+
+    def __init__(self, request: SamplingRequest, dim: int, population: np.ndarray | None):
+        self._request = request
+        # The sweeps of a search for starts are nearly the same points; a pilot has one.
+        step = N_SWEEPS if request.initvals is None else 1
+        self._population = np.empty((0, dim)) if population is None else population[::step]
+        fitted = None
+        if population is not None:
+            fitted = fitted_mixture([population], generator_of(request, 0))
+        self.mixture = no_mixture(dim) if fitted is None else fitted
+        self._has_mixture = dim > 0
+
+    def end_part(self, chains: Sequence[Draws], end: int) -> int:
+        """Fit the mixture to draws up to a stop; the next stop."""
+        stops = stops_of(self._request)
+        if self._has_mixture:
+            self.mixture = improved_mixture(
+                self.mixture,
+                chains,
+                max((stop for stop in stops if stop < end), default=0),
+                end,
+                generator_of(self._request, end),
+                population=self._population,
+                tuning=end < self._request.tune,
+            )
+        return min(stop for stop in stops if stop > end)
 
 
 def search_population(

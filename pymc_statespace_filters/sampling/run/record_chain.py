@@ -7,20 +7,20 @@ import numpy as np
 
 from ...errors import ModelError
 from ..kernel.independence import no_mixture
-from ..kernel.random_numbers import draw_seeds
-from ..kernel.records.arrays import (
+from ..kernel.record_arrays import (
     FIRST_ACCEPTED,
     FIRST_ESTIMATE,
     RecordEvaluation,
     RecordRandomBlock,
 )
-from ..kernel.records.moves import advance_records
+from ..kernel.record_moves import advance_records
 from ..kernel.state import (
     LOG_DENSITY,
     N_COMMON_BLOCKS,
     N_EFFECTIVE,
     ChainState,
     PhaseSettings,
+    draw_seeds,
     failure_reason,
 )
 from ..output.likelihood_variance import SeedSpread, spread_of
@@ -35,7 +35,7 @@ N_TRIED = 50
 
 
 class _Terms(NamedTuple):
-    """Terms by record (G + 1,) at a position, as `kernel.records` has them."""
+    """Terms by record (G + 1,) at a position, as `kernel.record_moves` has them."""
 
     position: np.ndarray
     seeds: np.ndarray  # of the evaluation

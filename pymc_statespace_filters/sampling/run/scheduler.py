@@ -40,6 +40,9 @@ _LISTENING_SECONDS = 0.02
 _PROGRESS_SECONDS = 0.25
 _ANSWER_SECONDS = 10.0
 
+# Seconds between two computations, and the part of the time that they may take.
+_SECONDS, _SHARE = 2.0, 0.01
+
 
 def run_chains(
     tasks: Sequence[ModelTask], comm: Communicator, *, n_threads: int, progressbar: bool | str
@@ -289,10 +292,6 @@ class _Worker:
             if message is not None and message.kind == _OVER:
                 return
             time.sleep(_LISTENING_SECONDS)
-
-
-# Seconds between two computations, and the part of the time that they may take.
-_SECONDS, _SHARE = 2.0, 0.01
 
 
 class ConvergenceDisplay:

@@ -5,7 +5,7 @@ from pymc.model import Model, modelcontext
 from pymc.stats.convergence import log_warnings
 
 from ...errors import ModelError
-from ...pymc_model.compilation import ConstrainedValues
+from ...pymc_model.density import ConstrainedValues
 from ...system.checks import check_count, check_flag, check_random_seed
 from .modes import modes_message, modes_warning
 from .population import N_POINTS, population_of

@@ -15,7 +15,7 @@ from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
 from scipy.spatial.distance import cdist
 
-from ...pymc_model.compilation import ConstrainedValues
+from ...pymc_model.density import ConstrainedValues
 from ...student_mixture import fit_mixture, place_components, standardised
 from ..target.variables import RaveledVariables
 

@@ -19,9 +19,9 @@ from pymc.model import Model
 from ...compiler.native.rows import Rows
 from ...errors import ModelError
 from ...progress import row_progress
-from ...pymc_model.support import can_sample
+from ...pymc_model.prior import can_sample
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
-from ..kernel.random_numbers import draw_seeds
+from ..kernel.state import draw_seeds
 from ..target.settings import DRAMSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
@@ -38,6 +38,9 @@ _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 Array = NDArray[np.float64]
 # From points (m, d) to log-densities (m,) of the prior and of the posterior.
 Densities = Callable[[Array], tuple[Array, Array]]
+
+_N_COMPONENTS = 4  # of the known draws, which may have several modes
+_PRIOR_WEIGHT = 0.2
 
 
 def population_of(
@@ -212,10 +215,6 @@ def _from_ekf(cheap: Densities, full: Densities) -> Densities:
 def _number(values: Array) -> Array:
     """The values, with minus infinity for NaN and plus infinity."""
     return np.where(values < np.inf, values, -np.inf)
-
-
-_N_COMPONENTS = 4  # of the known draws, which may have several modes
-_PRIOR_WEIGHT = 0.2
 
 
 def nested_reference(known: Array, prior: Array, rng: np.random.Generator) -> StudentMixture:

@@ -17,8 +17,7 @@ from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.graph_rewrites import expensive_variables, pilot_filters
 from ...pymc_model.inspection import state_space_nodes
-from ..kernel.random_numbers import random_block
-from ..kernel.state import ChainState, RandomBlock
+from ..kernel.state import ChainState, RandomBlock, random_block
 from ..kernel.transition import evaluate
 from .leader_follower import check_group
 from .log_density import LogDensity, screening_density, tempered_density

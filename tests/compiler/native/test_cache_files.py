@@ -66,7 +66,7 @@ def test_a_module_is_used_where_no_file_can_be_written(tmp_path, monkeypatch):
 SUM = """
 import sys
 import numba, pytensor, pytensor.tensor as pt
-from pymc_statespace_filters.pymc_model.compilation import compile_density
+from pymc_statespace_filters.pymc_model.density import compile_density
 
 x = pt.dvector()
 graph = pt.sum(pt.exp(x))

@@ -8,13 +8,13 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from ...errors import ModelError
-from ...filters.protocol import Filter
-from ...filters.recommendation import check_unbiased, short_form
-from ...pymc_model.density import RowFunction, check_free_variables
-from ...pymc_model.filter_estimates import VariableAtPoints
-from ...pymc_model.inspection import state_space_nodes
-from .draws import Posterior, check_overlap
+from ..errors import ModelError
+from ..filters.protocol import Filter
+from ..filters.recommendation import check_unbiased, short_form
+from ..pymc_model.density import RowFunction, check_free_variables
+from ..pymc_model.filter_estimates import VariableAtPoints
+from ..pymc_model.inspection import state_space_nodes
+from .posterior import Posterior, check_overlap
 
 BLOCK = 64  # points between two reports of progress
 MOST_DRAWS = 1000

@@ -29,12 +29,13 @@ computations. Annals of Statistics 37, 697-725.
 
 import numpy as np
 
-from ....compiler.native.entry_point import njit_cached
-from ....compiler.native.jit import copy_into, linked
-from ..adaptation import learn
-from ..adaptation_state import packed_size, unpack
-from ..delayed_rejection import log_ratio_to_one
-from ..state import (
+from ...compiler.native.entry_point import njit_cached
+from ...compiler.native.jit import copy_into, linked
+from .adaptation import learn
+from .adaptation_state import packed_size, unpack
+from .delayed_rejection import log_ratio_to_one
+from .record_arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, evaluate_likelihoods, evaluate_priors
+from .state import (
     ACCEPTANCE,
     FAILURE,
     LOG_DENSITY,
@@ -47,7 +48,6 @@ from ..state import (
     SCALING,
     STAGE,
 )
-from .arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, evaluate_likelihoods, evaluate_priors
 
 _internal = linked()
 

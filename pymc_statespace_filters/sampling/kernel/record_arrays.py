@@ -1,4 +1,4 @@
-"""Arrays of a chain that moves the records of a panel one by one, and one evaluation, see `moves`.
+"""Arrays and evaluations of a chain that moves the records of a panel one by one: `record_moves`.
 
 A position has three blocks: the own parameters of every record, the shared ones, and those of the
 population. `ChainState` and `Draws` have the same arrays as for other chains, with more columns:
@@ -11,12 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ....compiler.native.entry_point import njit_cached
-from ....compiler.native.jit import linked
-from ....compiler.native.pytensor_function import Call, make_call
-from ..adaptation_state import pack, packed_size, start_adaptation, unpack
-from ..random_numbers import BLOCK, draw_seeds, generator_of_block
-from ..state import HEALTH_SIZE, N_COUNTS, NOT_A_NUMBER, RAISED
+from ...compiler.native.entry_point import njit_cached
+from ...compiler.native.jit import linked
+from ...compiler.native.pytensor_function import Call, make_call
+from .adaptation_state import pack, packed_size, start_adaptation, unpack
+from .state import (
+    BLOCK,
+    HEALTH_SIZE,
+    N_COUNTS,
+    NOT_A_NUMBER,
+    RAISED,
+    draw_seeds,
+    generator_of_block,
+)
 
 # Of a chain's numbers, the first estimate: G of the records, then that of other data.
 FIRST_ESTIMATE = 3

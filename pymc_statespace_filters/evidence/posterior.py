@@ -1,20 +1,25 @@
-"""The posterior as estimators see it: unconstrained draws, log-densities, and the prior.
+"""The posterior as estimators see it: unconstrained draws, log-densities, the prior, and the data.
 
 Log-densities on the unconstrained space include the Jacobians of the transforms.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ...errors import DataMismatchError, ModelError
-from ...pymc_model.density import ModelDensity
-from ...pymc_model.posterior_draws import unconstrained_draws
-from ...pymc_model.prior import ModelPrior
+from ..errors import DataMismatchError, ModelError
+from ..pymc_model.aligned_axes import records_of_rows
+from ..pymc_model.density import ModelDensity
+from ..pymc_model.inspection import scored_rows
+from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.prior import ModelPrior
+from ..pymc_model.random_variable import PanelRV
 
 N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
 STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie
@@ -243,3 +248,80 @@ def _stored_log_density(
         f"{expected[worst]:.6g} where the model gives {recomputed[worst]:.6g}: the draws "
         "belong to another model, other data or other settings"
     )
+
+
+class _Observed(NamedTuple):
+    """Observed values of a variable, and whether an observation is a vector (the last axis).
+
+    The first ``score_from`` rows, of each record in a panel, have no term in the log-density;
+    ``is_scored`` are the others.
+    """
+
+    values: NDArray[np.float64]
+    records: list[NDArray[np.float64]]  # the values, by record in a panel
+    is_vector: bool
+    score_from: int
+    is_scored: Any
+
+    @property
+    def scored(self) -> NDArray[np.float64]:
+        """The values that have a term."""
+        return self.values[self.is_scored]
+
+
+def _observed(model: pm.Model) -> list[_Observed]:
+    """What every observed variable has for data."""
+    found = []
+    for rv in model.observed_RVs:
+        values = np.asarray(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"), dtype=np.float64)
+        op = rv.owner.op
+        is_vector, score_from = getattr(op, "ndim_supp", 0) > 0, getattr(op, "score_from", 0)
+        records = _records(rv.owner, values)
+        found.append(_Observed(values, records, is_vector, score_from, scored_rows(rv.owner)))
+    return found
+
+
+def _records(node: Any, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The values of each record of a panel; all together of any other variable."""
+    if not isinstance(node.op, PanelRV):
+        return [values]
+    return np.split(values, np.flatnonzero(np.diff(records_of_rows(node.inputs[3]))) + 1)
+
+
+def observation_count(model: pm.Model) -> int:
+    """Count the observations J of a model that are scored and not entirely missing.
+
+    A vector-valued observation (a row of a state-space or multivariate variable) counts once, like
+    a scalar one; the counts of several observed variables are added.
+    """
+    return sum(
+        int((~np.isnan(one.scored).all(axis=-1) if one.is_vector else ~np.isnan(one.scored)).sum())
+        for one in _observed(model)
+    )
+
+
+def scalar_count(model: pm.Model) -> int:
+    """Count the observed scalars of a model that are scored and not missing."""
+    return sum(int((~np.isnan(one.scored)).sum()) for one in _observed(model))
+
+
+def data_fingerprint(model: pm.Model) -> str:
+    """Hash the observed values of a model.
+
+    Returns
+    -------
+    str
+        Hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows that
+        are not scored: reproducible across processes, and independent of the structure of the model
+        and the names of its variables. The records of a panel count like variables, so that neither
+        their order nor their labels matter. Axes of length one are ignored, so that a vector of J
+        values equals a table of one column.
+    """
+    hashes = []
+    for one in _observed(model):
+        unscored = f" scored from {one.score_from}" if one.score_from else ""
+        for values in map(np.squeeze, one.records):
+            canonical = np.where(np.isnan(values), np.nan, values + 0.0)  # one NaN, one zero
+            content = repr(values.shape).encode() + canonical.astype("<f8").tobytes()
+            hashes.append(hashlib.sha256(content + unscored.encode()).digest())
+    return hashlib.sha256(b"".join(sorted(hashes))).hexdigest()

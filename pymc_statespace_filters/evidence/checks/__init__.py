@@ -1,1 +1,0 @@
-"""Checks of an evidence that do not depend on the estimator."""

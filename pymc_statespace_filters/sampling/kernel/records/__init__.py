@@ -1,1 +1,0 @@
-"""Iterations of a chain that moves the records of a panel one by one."""
