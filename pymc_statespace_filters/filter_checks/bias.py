@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from scipy.stats import t as student_t
 
 from ..filters.recommendation import short_form
@@ -23,39 +24,57 @@ Array = NDArray[np.float64]
 
 # Posterior standard deviations by which a parameter may be moved.
 _TOLERATED_SHIFT = 0.5
+_FEWEST = 4  # points of one spread, from which a covariance is taken
 # Nats above the errors by which guided particles must exceed plain ones to be preferred to them.
 _HIGHER = 0.3
+_N_ERRORS = 3.0
 
 
 class _Difference(NamedTuple):
-    """Filter minus reference at draws: values, errors of the reference, mean and its error."""
+    """Filter minus reference at n draws: the mean, its standard error, and the spread.
 
-    values: Array
-    errors: Array
+    The spread is the standard deviation without the part that is due to the noise of both.
+    """
+
+    n: int
     mean: float
     se: float
+    spread: float
+
+    @property
+    def margin(self) -> float:
+        """Half of the confidence interval of the mean."""
+        return float(student_t.ppf(1.0 - ALPHA / 2.0, max(self.n - 1, 1)) * self.se)
+
+    @property
+    def least_spread(self) -> float:
+        """The lower end of an interval for the spread, as if differences were normal."""
+        dof = max(self.n - 1, 1)
+        return float(self.spread * np.sqrt(dof / chi2.ppf(1.0 - ALPHA, dof)))
 
 
 def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> list[Finding]:
     """Compare an approximate filter with the likelihood at the points, of which some are draws."""
     draws = found.at(points.spread == 1.0)
-    name, proved = short_form(found.checked.filter), shortfall(draws, draws.checked.mean)
-    reference = reference_of(draws)
+    name, reference = short_form(found.checked.filter), reference_of(draws)
     if reference is None:
-        return [_without_reference(draws, name, proved)]
+        return [_without_reference(draws, name)]
     bias = _difference(draws.checked, reference)
     moved = _shifts(found, points, names, reference)
-    margin = student_t.ppf(1.0 - ALPHA / 2.0, max(bias.values.size - 1, 1)) * bias.se
-    visible = abs(bias.mean) + margin
+    visible = abs(bias.mean) + bias.margin
     what = (
         f"{name} is {nats(abs(bias.mean))} ± {nats(bias.se)} nats "
         f"{'below' if bias.mean < 0.0 else 'above'} {short_form(reference.filter)} at draws"
     )
     worst = max(moved, key=lambda one: abs(one.statistic), default=None)
     moves = "" if worst is None else f"; {worst.verdict}"
-    is_off = proved > VISIBLE or abs(bias.mean) - margin > TOLERATED
-    if is_off or any(one.outcome == OFF for one in moved):
-        outcome, verdict = OFF, f"{what}, and so is the log-evidence{moves}. {cure(draws)}"
+    is_moved = any(one.outcome == OFF for one in moved)
+    if abs(bias.mean) - bias.margin > TOLERATED or is_moved or bias.least_spread > VISIBLE:
+        outcome = OFF
+        verdict = (
+            f"{what}, by which the log-evidence is off, and this varies by {nats(bias.spread)} "
+            f"between draws{moves}. {cure(draws)}"
+        )
     elif visible <= VISIBLE:
         outcome, verdict = FINE, f"no sign that {name} is off: {what}{moves}"
     else:
@@ -68,15 +87,15 @@ def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> li
 def bias_elsewhere(found: Comparison, draws: Comparison) -> Finding | None:
     """Test whether the filter is lower at other points than at draws, whose chain avoids them.
 
-    None if it is not known by how much it is too low at draws.
+    Lower by more than what is usual between draws. None if that is not known.
     """
     reference = reference_of(draws)
     if reference is None:
         return None
     name = short_form(found.checked.filter)
     usual = _difference(draws.checked, reference)
-    proved = shortfall(found, found.checked.mean - usual.mean) - 3.0 * usual.se
-    if proved <= VISIBLE:
+    proved = shortfall(found, found.checked.mean - usual.mean) - _N_ERRORS * usual.se
+    if not proved > VISIBLE + _N_ERRORS * usual.spread:
         verdict = f"no sign that {name} keeps the chain away from other points"
         return Finding("bias elsewhere", proved, np.nan, ALPHA, np.nan, FINE, verdict)
     verdict = (
@@ -109,7 +128,8 @@ def reference_of(found: Comparison) -> Estimates | None:
     return plain
 
 
-def _without_reference(draws: Comparison, name: str, proved: float) -> Finding:
+def _without_reference(draws: Comparison, name: str) -> Finding:
+    proved = shortfall(draws, draws.checked.mean)
     if proved > TOLERATED:
         verdict = (
             f"{name} is at least {nats(proved)} nats too low at some draws, and so is the "
@@ -138,12 +158,13 @@ def _undecided(draws: Comparison, name: str) -> str:
 def _difference(checked: Estimates, reference: Estimates) -> _Difference:
     values = checked.mean - reference.mean
     known = np.isfinite(values)
-    values = values[known]
-    errors = np.hypot(checked.error, reference.error)[known]
-    if values.size < 2:
-        return _Difference(values, errors, values.sum(), np.inf)
-    scatter = max(float(values.var(ddof=1)), float((errors**2).mean()))
-    return _Difference(values, errors, float(values.mean()), float(np.sqrt(scatter / values.size)))
+    noise = float(np.mean((checked.error**2 + reference.error**2)[known])) if known.any() else 0.0
+    n = int(known.sum())
+    if n < 2:
+        return _Difference(n, np.nan, np.inf, np.nan)
+    variance = float(values[known].var(ddof=1))
+    spread = np.sqrt(max(variance - noise, 0.0))
+    return _Difference(n, float(values[known].mean()), np.sqrt(max(variance, noise) / n), spread)
 
 
 def _shifts(
@@ -151,45 +172,43 @@ def _shifts(
 ) -> list[Finding]:
     """By how many posterior standard deviations the difference moves each parameter.
 
-    To first order, its covariance with the difference over its standard deviation. Points spread
-    out by a factor tell the same with the square of that factor: both are averaged.
+    To first order, its covariance with the difference over its standard deviation. At points spread
+    out by a factor it is larger by the square of that factor.
     """
     kind = type(at_draws.filter)
-    groups = []
-    for spread in np.unique(points.spread[points.spread > 0.0]):
-        rows = points.spread == spread
-        here = found.at(rows)
-        same = [one for one in (here.exact, here.plain, *here.guided) if one is not None]
-        reference = next(one for one in same if type(one.filter) is kind)
-        groups.append((spread, points.z[rows], here.checked.mean - reference.mean))
-    level = 1.0 - ALPHA / (2.0 * max(len(names), 1))
-    rows_found = []
-    for column, name in enumerate(names):
-        parts = [_shift(z[:, column], values, spread) for spread, z, values in groups]
-        weights = np.array([1.0 / se**2 for _, se, _ in parts])
-        if not weights.sum() > 0.0:
-            continue
-        shift = float(weights @ [one for one, _, _ in parts] / weights.sum())
-        se = float(weights.sum() ** -0.5)
-        margin = student_t.ppf(level, max(sum(dof for _, _, dof in parts), 1)) * se
-        outcome = OFF if abs(shift) - margin > _TOLERATED_SHIFT else FINE
-        if outcome == FINE and abs(shift) + margin > VISIBLE:
-            outcome = UNDECIDED
-        verdict = f"{name} moves by {shift:+.1f} ± {se:.1f} of its posterior sd"
-        rows_found.append(
-            Finding(f"shift of {name}", shift, se, ALPHA, abs(shift) + margin, outcome, verdict)
-        )
-    return rows_found
+    witnesses = [one for one in (found.exact, found.plain, *found.guided) if one is not None]
+    reference = next(one for one in witnesses if type(one.filter) is kind)
+    lost = reference.mean - found.checked.mean
+    products = np.concatenate(
+        [
+            _products(points.z[rows], lost[rows], spread)
+            for spread in np.unique(points.spread[points.spread > 0.0])
+            for rows in [(points.spread == spread) & np.isfinite(lost)]
+        ]
+    )
+    if len(products) < _FEWEST:
+        return []
+    shifts = products.mean(axis=0)
+    errors = products.std(axis=0, ddof=1) / np.sqrt(len(products))
+    margin = student_t.ppf(1.0 - ALPHA / (2.0 * len(names)), len(products) - 1)
+    return [
+        _shift(name, float(shift), float(se), float(margin * se))
+        for name, shift, se in zip(names, shifts, errors, strict=True)
+    ]
 
 
-def _shift(z: Array, values: Array, spread: float) -> tuple[float, float, int]:
-    """The shift by points of one spread, its standard error and degrees of freedom."""
-    known = np.isfinite(values)
-    n = int(known.sum())
-    if n < 4:
-        return 0.0, np.inf, 0
-    z, lost = z[known] - z[known].mean(), -(values[known] - values[known].mean())
-    products = z * lost
-    shift = products.sum() / (n - 1) / spread**2
-    se = products.std(ddof=1) / np.sqrt(n) / spread**2
-    return float(shift), float(max(se, 1e-12)), n - 1
+def _products(z: Array, lost: Array, spread: float) -> Array:
+    """Terms (n, k) whose mean is the covariance, scaled to the spread of draws; none of too few."""
+    n = len(lost)
+    if n < _FEWEST:
+        return z[:0]
+    centred = (z - z.mean(axis=0)) * (lost - lost.mean())[:, None]
+    return centred * n / (n - 1) / spread**2
+
+
+def _shift(name: str, shift: float, se: float, margin: float) -> Finding:
+    outcome = OFF if abs(shift) - margin > _TOLERATED_SHIFT else FINE
+    if outcome == FINE and abs(shift) + margin > VISIBLE:
+        outcome = UNDECIDED
+    verdict = f"the posterior of {name} would move by {shift:+.1f} ± {se:.1f} sd without that"
+    return Finding(f"shift of {name}", shift, se, ALPHA, abs(shift) + margin, outcome, verdict)
