@@ -1,7 +1,6 @@
 """Warnings of filters: failed, decided by too few particles, or chosen against the equations."""
 
 import warnings
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,10 +8,11 @@ import numpy as np
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import FilterWarning
-from ..filters.outcomes import COLLAPSED, FAILURES, NO_FINITE_MEMBER
+from ..filters.outcomes import COLLAPSED, Failure
 from ..filters.protocol import HealthFilter
 from ..filters.recommendation import (
     collapse_remedy,
+    elsewhere,
     exact_filter,
     jump_problem,
     repetition_problem,
@@ -22,6 +22,7 @@ from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..ops.states import TermHealth
 from ..system.model import StateSpaceModel
+from ..system.parameters import element_names
 
 type Arguments = tuple[Any, ...]
 
@@ -46,31 +47,70 @@ def warn_about(
     """
     failed = health[:, 1] != 0
     of_each = None if labels is None else np.arange(len(health)) // (len(health) // len(labels))
-    if failed.any():
-        reasons = Counter(FAILURES[int(code)] for code in health[failed, 1])
-        listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common())
-        if NO_FINITE_MEMBER in health[failed, 1] and not system.has_gaussian_steps:
-            listed += "; in process_dist a rate below 0, a probability above 1 or a size that is "
-            listed += "not a whole number is drawn as NaN"
-        warnings.warn(
-            f"{short_form(filter)} gave -inf in {failed.sum()} of {len(health)} evaluations"
-            f"{_named(labels, of_each, failed)}: {listed}",
-            FilterWarning,
-            stacklevel=stacklevel,
+    for code in np.unique(health[failed, 1]):
+        failure, here = Failure.of(code), health[:, 1] == code
+        first = int(np.argmax(here))
+        share = f" in {here.sum()} of {len(health)} evaluations" if len(health) > 1 else ""
+        place = _place(system, failure, health[first, 2], arguments_of(first), bool(share))
+        of_records = _named(labels, of_each, here)
+        sentences = (
+            f"{short_form(filter)} gave -inf{share}{of_records}{place}: {failure.message}",
+            *_cures(system, filter, failure),
         )
+        warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, stacklevel=stacklevel)
     smallest = np.where(failed, np.inf, health[:, 0])
     collapsed = smallest < COLLAPSED
     if collapsed.any():
         worst = int(np.argmin(smallest))
-        warnings.warn(
+        sentences = (
             f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
             f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations"
-            f"{_named(labels, of_each, collapsed)} (smallest effective "
-            f"number {smallest[worst]:.3g}). {_extent(system, filter, arguments_of(worst))}. "
-            f"{collapse_remedy(compile_system(system), filter)}",
-            FilterWarning,
-            stacklevel=stacklevel,
+            f"{_named(labels, of_each, collapsed)} (smallest effective number "
+            f"{smallest[worst]:.3g})",
+            *_about_copies(system, filter),
+            _extent(system, filter, arguments_of(worst)),
+            collapse_remedy(compile_system(system), filter),
         )
+        warnings.warn(". ".join(sentences), FilterWarning, stacklevel=stacklevel)
+
+
+def _about_copies(system: StateSpaceModel, filter: Any) -> list[str]:
+    """Why particles that are copies of one are counted as one, where they are."""
+    undriven = compile_system(system).undriven_states
+    if not (undriven and getattr(filter, "counts_copies", False)):
+        return []
+    states = f"the state{'s' * (len(undriven) > 1)} {', '.join(undriven)}"
+    return [f"Copies of a particle count as one: no noise reaches {states}"]
+
+
+def _place(
+    system: StateSpaceModel, failure: Failure, row: float, arguments: Arguments, of_many: bool
+) -> str:
+    """Where an evaluation failed, the first of many: its row and time, and its parameters."""
+    theta, steps, _, _, t0, *_ = arguments
+    first, parts = ", first" if of_many else "", []
+    if failure.has_row:
+        time = t0 + steps[int(row)] * system.dt
+        parts.append(f" in row {int(row)}, at time {time:.6g}")
+    if of_many and 0 < theta.size <= _MOST_LISTED:
+        named = zip(element_names(system), theta, strict=True)
+        parts.append(f" with {', '.join(f'{name} = {value:.4g}' for name, value in named)}")
+    return first + ",".join(parts) if parts else ""
+
+
+def _cures(system: StateSpaceModel, filter: Any, failure: Failure) -> list[str]:
+    """What to do, for this system where that depends on it."""
+    compiled = compile_system(system)
+    if failure == Failure.STATE_NOT_FINITE and not system.has_gaussian_steps:
+        return [
+            "In process_dist a rate below 0, a probability above 1 or a size that is not a whole "
+            "number is drawn as NaN"
+        ]
+    cures = [failure.cure] if failure.cure else []
+    at_particles = failure in (Failure.ZERO_DENSITY, Failure.OBSERVATION_UNDEFINED)
+    if at_particles and filter.noisy and not compiled.is_deterministic:
+        cures.append(elsewhere(compiled, filter).removesuffix("."))
+    return cures
 
 
 def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> str:

@@ -86,8 +86,9 @@ def log_likelihood(
     Warns
     -----
     FilterWarning
-        Once, on the first rank, if a filter failed or its particles collapsed; and if it
-        linearises an equation that jumps as the state moves, or has members that are all the same.
+        On the first rank, once for each reason why the filter failed, and if its particles
+        collapsed; and if it linearises an equation that jumps as the state moves, or has members
+        that are all the same.
 
     Examples
     --------

@@ -4,8 +4,10 @@ Log-densities on the unconstrained space include the Jacobians of the transforms
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,14 +16,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
+from ..filters.outcomes import Failure
 from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
+from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.inspection import scored_rows
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.random_variable import PanelRV
 
 N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
+N_EXPLAINED = 100  # points of zero likelihood at which the reason is looked for
 STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie
 
 Array = NDArray[np.float64]
@@ -53,6 +58,8 @@ class Posterior:
         likelihood takes fresh noise from `rng` for each point.
     is_noisy : bool
         Whether repeated evaluations at one point differ.
+    failures : callable, optional
+        ``failures(x)`` counts why the likelihood is zero at points x (m, k).
     prior : Prior, optional
         The likelihood is the log-density of `evaluate` minus that of the prior.
     shared_seed : tuple of int, optional
@@ -67,6 +74,7 @@ class Posterior:
     evaluate: Callable[[Array, np.random.Generator], Array]
     is_noisy: bool = False
     prior: Prior | None = None
+    failures: Callable[[Array], Counter[Failure]] | None = None
     shared_seed: tuple[int, ...] | None = None
     shared: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -83,6 +91,16 @@ class Posterior:
         """
         log_prior = self.required_prior.log_density(x)
         return log_prior, log_likelihood_of(self.evaluate(x, rng), log_prior)
+
+    def why_zero(self, x: Array) -> str:
+        """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
+        x = x[:N_EXPLAINED]
+        found = [] if self.failures is None else self.failures(x).most_common(1)
+        if not found:
+            return "narrow the priors to plausible values"
+        (failure, count), *_ = found
+        cure = f". {failure.cure}" if failure.cure else ""
+        return f"in {count} of {len(x)} evaluations {failure.message}{cure}"
 
     def halves(self) -> tuple["Posterior", "Posterior"]:
         """Split every chain into its first and second half."""
@@ -160,7 +178,8 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
         return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
     prior = ModelPrior(density.model)
-    return Posterior(draws, log_density, evaluate, is_noisy=not held, prior=prior), noise
+    failures = partial(failures_at, density.model)
+    return Posterior(draws, log_density, evaluate, not held, prior, failures), noise
 
 
 def _stored_seeds(

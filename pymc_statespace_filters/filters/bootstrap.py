@@ -7,12 +7,12 @@ import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import njit_internal
+from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
 from .ensemble.loop import Outcome, failed
 from .ensemble.particle_filter import ParticleFilter, particle_filter
-from .ensemble.reductions import count
 from .ensemble.weights import normalise_weights
-from .outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .outcomes import NONE
 from .plan import log_density
 
 
@@ -31,12 +31,13 @@ def update(system, j, k, t, d, noise, members, local, work):
     mark_finite(X, X, alive)
     log_density(system, k, t, d, X, members.log_p)
     for i in range(alive.size):
+        alive[i] &= log_w[i] > -np.inf
         log_w[i] = log_w[i] + members.log_p[i] if alive[i] else -np.inf
 
     # Increment of the log-likelihood and effective number (Eq. 4.43)
     increment, n_effective = normalise_weights(log_w, w, local)
     if increment == -np.inf:
-        return failed(NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS)
+        return failed(failure_of_all(system, k, t, d, members, local))
     return Outcome(increment, n_effective, n_effective, NONE)
 
 
@@ -69,6 +70,10 @@ class BootstrapPF(ParticleFilter):
     -----
     A particle with a non-finite state has weight zero.
 
+    Resampled particles are copies. If a state has an uncertain start and no noise reaches it, they
+    stay equal there, so the different ones become fewer with every resampling: `GuidedPF` draws the
+    start given the data, and `EKF` is exact if the system is linear.
+
     Examples
     --------
     >>> BootstrapPF(1000, resampling="multinomial").resample_below
@@ -76,4 +81,5 @@ class BootstrapPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
+    counts_copies: ClassVar[bool] = True
     entry: ClassVar[EntryPoint] = particle_filter("bootstrap_pf", workspace, update)

@@ -14,6 +14,7 @@ from ..compiler.numerics.small_cholesky import log_gaussian
 from ..errors import ModelError
 from .ensemble.ancestral_smoother import CARRY_PAST, NO_LAG, SMOOTH
 from .ensemble.base import EnsembleFilterBase, check_choice, check_count
+from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import (
     Moments,
     check_simulated_observations,
@@ -25,7 +26,7 @@ from .ensemble.kalman_update import (
 )
 from .ensemble.loop import Outcome, ensemble_filter, failed
 from .ensemble.noise import NoiseSizes, observation_normals
-from .outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .outcomes import COVARIANCE_NOT_POSITIVE, NONE
 from .plan import log_density, observe
 from .protocol import System
 
@@ -70,7 +71,8 @@ def update(system, j, k, t, d, noise, members, local, work):
     forecast = forecast_means(members, log_terms, terms, work.is_ensemble, local, moments, False)
     n_alive = forecast.n_alive
     if n_alive == 0.0:
-        return failed(NO_FINITE_MEMBER)
+        mark_finite(X, X, alive)
+        return failed(failure_of_all(system, k, t, d, members, local))
     if not forecast_covariances(members, d, n_alive - 1.0, local, moments):
         return failed(COVARIANCE_NOT_POSITIVE, n_alive)
 
@@ -79,7 +81,8 @@ def update(system, j, k, t, d, noise, members, local, work):
     if not work.is_ensemble:
         increment, n_effective = _gaussian_likelihood(d, work), n_alive
     if not np.isfinite(increment):
-        return failed(ZERO_WEIGHTS)
+        mark_finite(X, X, alive)
+        return failed(failure_of_all(system, k, t, d, members, local))
 
     # Analysis (Eqs. 4.20-4.21)
     kalman_update(d, D, alive, system.free, moments, X)

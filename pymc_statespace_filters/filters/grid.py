@@ -23,7 +23,7 @@ from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from .calls import OK, likelihood_entry
-from .outcomes import COVARIANCE_NOT_POSITIVE
+from .outcomes import NONE
 from .plan import make_plan, read_system, settings_of
 from .point_mass.forward_pass import (
     END,
@@ -37,7 +37,6 @@ from .point_mass.forward_pass import (
 )
 from .point_mass.moments import FILTERED, MOMENTS
 from .point_mass.predictions import GRID_PREDICTIONS
-from .point_mass.recursion import has_valid_covariances
 from .point_mass.segment_pass import discard_segments, pass_on_segments
 from .point_mass.states import GRID_RUN, GRID_STATES
 from .protocol import System
@@ -189,8 +188,8 @@ def _point_mass(plan, record, request, seed, to):
 @njit_internal
 def _evaluate(system, steps, observed, t0, tolerance, terms):
     """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
-    if not has_valid_covariances(system):
-        return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
+    if system.failure != NONE:
+        return np.int64(system.failure), np.int64(0)
     place, settings = ON_GRID, first_grid(system, steps, t0, tolerance)
     while place != END:
         if place == ON_SEGMENTS:

@@ -51,6 +51,9 @@ def _evaluate(plan, record, request, seed, to):
     noise, fits = noise_of_rank(seed, request, given, steps, local)
     if not fits:
         return NORMALS
+    if system.failure != NONE:
+        to.health[0], to.health[1], to.health[2] = 0.0, system.failure, 0.0
+        return OK
     scheme = int(given[N_LEADING + 1])
     resampling = resampler(given[N_LEADING], scheme, plan[PLAN.order], system.n, local)
     particles = guided_particles(system.n, system.m, system.p, local)

@@ -1,34 +1,90 @@
-"""Outcomes of an evaluation: rows that are missing, and failure codes with their descriptions."""
+"""Outcomes of an evaluation: why a filter failed, too few particles, and rows that are missing."""
 
 import numpy as np
 
 from ..compiler.native.jit import inline_always
+from ..compiler.native.outcome_code import OutcomeCode
+
+# Of larger states and covariances the density is not a number, or that of everything is zero.
+LARGEST = 1e150
 
 # Fewer effective particles than this behind a term, and one of them decides it.
 COLLAPSED = 3.0
 
-NONE = 0
-NO_FINITE_MEMBER = 1
-COVARIANCE_NOT_POSITIVE = 2
-ZERO_WEIGHTS = 3
-NO_PROCESS_NOISE = 4
-GRID_TOO_LARGE = 5
-OUT_OF_MEMORY = 6
-TOO_FAR = 7
 
-FAILURES: dict[int, str] = {
-    NONE: "no failure",
-    NO_FINITE_MEMBER: "every member or particle became infinite or NaN",
-    COVARIANCE_NOT_POSITIVE: "a covariance of the system or the forecast is not positive definite",
-    ZERO_WEIGHTS: "the observation has probability zero for every member or particle",
-    NO_PROCESS_NOISE: "the process noise vanished where the state may be",
-    GRID_TOO_LARGE: "the density would need more than 8192 points, for the noise or the sensor is "
-    "so fine beside the spread of the state; a larger tolerance, such as "
-    "GridFilter(tolerance=1e-3), needs fewer",
-    TOO_FAR: "the observation lies where the density of the state is below 1e-265, which this "
-    "filter does not resolve",
-    OUT_OF_MEMORY: "there was not enough memory for the members",
-}
+def _not_semidefinite(name: str) -> tuple[str, str]:
+    return (
+        f"{name} is not positive semidefinite at these parameters",
+        f"Write {name} so that it always is, for example a variance as s**2 with the prior "
+        f"pm.HalfNormal for s",
+    )
+
+
+class Failure(OutcomeCode):
+    """Why an evaluation has no finite likelihood; compiled code uses the integers below."""
+
+    RAISED = -2, "the model raised an exception"
+    NOT_A_NUMBER = -1, "the log-density is NaN or plus infinity"
+    NONE = 0, "no failure"
+    STATE_NOT_FINITE = (
+        1,
+        "the state overflowed or became NaN",
+        "If the equations are stable there, make their steps shorter; if not, give a prior that "
+        "excludes such parameters",
+    )
+    COVARIANCE_NOT_POSITIVE = (
+        2,
+        "by rounding errors, the covariance of the predicted state or observation is not positive "
+        "definite",
+        "Use units in which states and observables have similar sizes, or a larger "
+        "observation_noise",
+    )
+    ZERO_DENSITY = (
+        3,
+        "the observation has density zero wherever this filter has the state",
+        "Check the observation, and whether the observation noise is wide enough",
+    )
+    NO_PROCESS_NOISE = 4, "the process noise vanished where the state may be"
+    GRID_TOO_LARGE = (
+        5,
+        "the density would need more than 8192 points, for the noise or the sensor is so fine "
+        "beside the spread of the state",
+        "A larger tolerance, such as GridFilter(tolerance=1e-3), needs fewer",
+    )
+    OUT_OF_MEMORY = 6, "there was not enough memory for the members"
+    TOO_FAR = (
+        7,
+        "the observation lies where the density of the state is below 1e-265, which this filter "
+        "does not resolve",
+        "Check the observation",
+    )
+    INITIAL_COV = 8, *_not_semidefinite("initial_cov")
+    PROCESS_NOISE = 9, *_not_semidefinite("process_noise")
+    OBSERVATION_NOISE = 10, *_not_semidefinite("observation_noise")
+    OBSERVATION_UNDEFINED = (
+        11,
+        "the observation has no density wherever this filter has the state: its mean is infinite "
+        "or NaN, or a parameter of its distribution is outside its domain, such as a negative mean "
+        "of a Poisson distribution",
+        "Write the observation so that it is defined at every state, for example with "
+        "pt.softplus(x[0]), which is positive and does not overflow",
+    )
+
+    @property
+    def has_row(self) -> bool:
+        """Whether it belongs to a row of the record, not to parameters or the machine."""
+        return self not in _WITHOUT_ROW
+
+
+_WITHOUT_ROW = (
+    Failure.INITIAL_COV, Failure.PROCESS_NOISE, Failure.OBSERVATION_NOISE, Failure.OUT_OF_MEMORY
+)  # fmt: skip
+
+(
+    RAISED, NOT_A_NUMBER, NONE, STATE_NOT_FINITE, COVARIANCE_NOT_POSITIVE, ZERO_DENSITY,
+    NO_PROCESS_NOISE, GRID_TOO_LARGE, OUT_OF_MEMORY, TOO_FAR, INITIAL_COV, PROCESS_NOISE,
+    OBSERVATION_NOISE, OBSERVATION_UNDEFINED,
+) = map(int, Failure)  # fmt: skip
 
 
 @inline_always

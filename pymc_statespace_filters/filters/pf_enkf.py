@@ -10,6 +10,7 @@ from ..compiler.native.jit import njit_internal
 from ..errors import ModelError
 from .bootstrap import BootstrapPF
 from .ensemble.base import check_choice
+from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import (
     copy_members,
     forecast_covariances,
@@ -20,10 +21,9 @@ from .ensemble.kalman_update import (
 from .ensemble.loop import Outcome, failed
 from .ensemble.noise import observation_normals
 from .ensemble.particle_filter import ParticleFilter, particle_filter
-from .ensemble.reductions import count
 from .ensemble.weights import log_sum, normalise_weights
 from .kernel_density.density import density_method, importance_workspace, reweight
-from .outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from .outcomes import NONE
 from .plan import log_density, observe
 from .protocol import System
 
@@ -52,7 +52,8 @@ def update(system, j, k, t, d, noise, members, local, work):
         log_w[i] = log_w[i] if alive[i] else -np.inf
     log_alive, n_previous = normalise_weights(log_w, members.w, local)
     if log_alive == -np.inf:
-        return failed(NO_FINITE_MEMBER if count(alive, local) == 0.0 else ZERO_WEIGHTS)
+        mark_finite(X, X, alive)
+        return failed(failure_of_all(system, k, t, d, members, local))
 
     # Predicted density of the observation: previous weights on the forecast particles
     log_density(system, k, t, d, X, members.log_p)
@@ -87,7 +88,8 @@ def update(system, j, k, t, d, noise, members, local, work):
     else:  # Eq. 4.42 as printed: the ratio of two means
         increment, n_effective = log_printed - log_total, min(n_printed, n_weighted)
     if not (np.isfinite(increment) and np.isfinite(log_total)):
-        return failed(ZERO_WEIGHTS)
+        mark_finite(X, X, alive)
+        return failed(failure_of_all(system, k, t, d, members, local))
     return Outcome(increment, n_effective, n_weighted, NONE)
 
 

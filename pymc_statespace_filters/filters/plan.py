@@ -12,8 +12,9 @@ import numpy as np
 from ..compiler.codegen.arguments import FollowArguments, LookBackArguments, MemberArguments
 from ..compiler.native.cache_key import key_of
 from ..compiler.native.entry_point import EntryPoint, call_address
-from ..compiler.native.jit import njit_internal
+from ..compiler.native.jit import inline_always, njit_internal
 from ..compiler.native.plan import N_HEADER, Plan, version_of
+from .outcomes import INITIAL_COV, NONE, OBSERVATION_NOISE, PROCESS_NOISE
 from .protocol import System
 
 
@@ -74,6 +75,11 @@ class PlanSlots(NamedTuple):
     along_back: int = N_HEADER + 47
     extend: int = N_HEADER + 48
     extend_back: int = N_HEADER + 49
+    # where in the constants the square root of each covariance begins, 0 if there is none
+    root_of_start: int = N_HEADER + 50
+    root_of_process_noise: int = N_HEADER + 51
+    root_of_observation_noise: int = N_HEADER + 52
+    follows_origins: int = N_HEADER + 53  # of particles that no noise tells apart
 
 
 PLAN = PlanSlots()
@@ -115,6 +121,9 @@ def make_plan(
         "n_settings": len(settings), "has_gaussian_observation": system.gaussian_observation,
         "observation_uses_inputs": system.observation_uses_inputs,
         "is_time_invariant": "step_moments" in used and system.is_time_invariant,
+        "root_of_start": system.square_roots.get("initial_cov", 0),
+        "root_of_process_noise": system.square_roots.get("process_noise", 0),
+        "root_of_observation_noise": system.square_roots.get("observation_noise", 0),
     }  # fmt: skip
     for name, number in (sizes | numbers).items():
         words[getattr(PLAN, name)] = number
@@ -131,8 +140,11 @@ def make_plan(
 class SystemPointers(NamedTuple):
     """One evaluation's system: ``c`` its constants, ``inputs`` a row for each step.
 
-    ``free`` are the states that an update may move. Functions are addresses.
+    ``failure`` says which covariance is none at these parameters, and is `outcomes.NONE` if all
+    are. ``free`` are the states that an update may move. Functions are addresses.
     """
+
+    failure: int
 
     n: int
     m: int
@@ -162,6 +174,7 @@ def read_system(plan, theta, inputs):
     c = np.empty(plan[PLAN.n_constants])
     call_address(plan[PLAN.prepare], (theta, np.int64(theta.size), c))
     return SystemPointers(
+        failure=_failure(plan, c),
         n=plan[PLAN.n], m=plan[PLAN.m], p=plan[PLAN.p], n_theta=plan[PLAN.n_theta],
         dt=plan.view(np.float64)[PLAN.dt], is_time_invariant=plan[PLAN.is_time_invariant] != 0,
         has_gaussian_observation=plan[PLAN.has_gaussian_observation] != 0,
@@ -173,6 +186,21 @@ def read_system(plan, theta, inputs):
         follow=plan[PLAN.follow], look_back=plan[PLAN.look_back],
         start_back=plan[PLAN.start_back],
     )  # fmt: skip
+
+
+@njit_internal
+def _failure(plan, c):
+    """Which covariance is none: the square root of such a one is NaN."""
+    if _is_none(plan[PLAN.root_of_start], c):
+        return INITIAL_COV
+    if _is_none(plan[PLAN.root_of_process_noise], c):
+        return PROCESS_NOISE
+    return OBSERVATION_NOISE if _is_none(plan[PLAN.root_of_observation_noise], c) else NONE
+
+
+@inline_always
+def _is_none(root, c):
+    return root != 0 and np.isnan(c[root])
 
 
 @njit_internal

@@ -14,7 +14,7 @@ from numba import typeof
 from ..compiler.codegen.function_types import CompiledFunction, jit
 from ..compiler.native.cache_key import key_of
 from ..compiler.native.entry_point import cached_on_disk
-from ..compiler.native.plan import OBSERVED, REFUSALS
+from ..compiler.native.plan import Refusal
 from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
 from ..filters.calls import include_health, status_of_rows
@@ -63,19 +63,19 @@ def _check_of_rows(n_inputs: int, last_row: int, of_panel: bool) -> Any:
 
 @cache
 def _check_of_data(p: int) -> Any:
+    of_data = int(Refusal.OBSERVED)
+
     @jit
     def check(steps, observed):
         if observed.shape[0] != steps.shape[0] or observed.shape[1] != p:
-            _refuse(OBSERVED)
+            _refuse(of_data)
 
     return check
 
 
 def _refusal() -> Any:
     """A compiled function that raises what a status says."""
-    lines = [
-        f"if status == {status}: raise ModelError({REFUSALS[status]!r})" for status in REFUSALS
-    ]
+    lines = [f"if status == {int(r)}: raise ModelError({r.message!r})" for r in Refusal]
     scope = {"ModelError": ModelError}
     exec("def refuse(status):\n" + "".join(f"    {line}\n" for line in lines), scope)
     return jit(scope["refuse"])

@@ -4,6 +4,7 @@ Parameters and inputs at the points are computed once, and each filter is evalua
 machine code, so that another filter compiles what is new about it alone and not the model again.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
+from ..filters.outcomes import Failure
 from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter
 from ..filters.signatures import ONE_RECORD, PANEL
@@ -80,6 +82,11 @@ class VariableAtPoints:
         op = LogLikelihood(self.system, self.filter, self._form)
         return op.n_steps(self._arguments[0]) if self._arguments else 0
 
+    def failures(self) -> list[Failure]:
+        """Why the filter of the variable has no likelihood at each point, or that it has one."""
+        evaluate = evaluator(LogLikelihood(self.system, self.filter, self._form))
+        return [Failure.of(evaluate(*each, np.asarray(0))[1][1]) for each in self._arguments]
+
     def log_likelihood(self, filter: Filter, seeds: NDArray[np.int64]) -> Array:
         """The log-likelihood by a filter at every point for every seed, (m, r); -inf if it fails.
 
@@ -122,6 +129,14 @@ class VariableAtPoints:
                 pool.shutdown(cancel_futures=True)
                 raise
         return np.reshape(found, seeds.shape)
+
+
+def failures_at(model: pm.Model, x: Array) -> Counter[Failure]:
+    """How many evaluations of all filters of a model fail at points (m, k), for each reason."""
+    found = (VariableAtPoints(model, name, x).failures() for name in state_space_nodes(model))
+    counted = Counter(failure for of_variable in found for failure in of_variable)
+    del counted[Failure.NONE]
+    return counted
 
 
 def _at_points(model: pm.Model, graphs: list[Variable]) -> Callable[[Array], list]:

@@ -120,7 +120,7 @@ class DRAM(BlockedStep):
         continuous variables; and the geometric mean of its standard deviations
     ``n_evaluations``, ``n_failed``, ``failure``
         evaluations of the model; how many failed, so that the proposal was rejected; and the last
-        failure code, a key of ``outcomes.FAILURES`` or -1: NaN or plus infinity
+        failure code, a code of ``filters.outcomes.Failure``
     ``n_effective``
         with a noisy likelihood: the smallest effective number of particles of the estimate ``lp``
     ``n_screened``, ``n_screen_failed``

@@ -56,6 +56,15 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     return np.concatenate([np.broadcast_to(p, (*batch, p.shape[-1])) for p in parts], axis=-1)
 
 
+def element_names(system: StateSpaceModel) -> list[str]:
+    """Names of the elements of flat parameters (k,), such as "k[0]"."""
+    return [
+        name + (f"[{', '.join(map(str, index))}]" if index else "")
+        for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
+        for index in np.ndindex(shape)
+    ]
+
+
 def symbolic_parameters(
     system: StateSpaceModel, values: Mapping[str, Any], others: Sequence[str]
 ) -> TensorVariable:

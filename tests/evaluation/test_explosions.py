@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters.outcomes import FAILURES
+from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -33,8 +33,8 @@ def evaluate(filter, points):
     counted = sum(
         int(count)
         for w in caught
-        for count, reason in re.findall(r"(\d+) times ([^;]+)", str(w.message))
-        if reason in FAILURES.values()
+        for count in re.findall(r"gave -inf in (\d+) of", str(w.message))
+        if any(failure.message in str(w.message) for failure in Failure)
     )
     return terms, counted
 
@@ -92,9 +92,9 @@ def test_a_covariance_that_no_observation_depends_on_must_exist(filter):
     record = {"observed": [0.5, np.nan, -0.3], "steps": [0, 1, 2]}
     with pytest.warns(psf.FilterWarning, match="-inf in 1 of 2"):
         terms = psf.log_likelihood(system, filter, {"r": [0.5, 2.0]}, **record)
-    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 1"):
+    with pytest.warns(psf.FilterWarning, match="gave -inf in row 2"):
         alone = psf.log_likelihood(system, filter, {"r": 2.0}, **record)
-    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 1"):
+    with pytest.warns(psf.FilterWarning, match="gave -inf in row 2"):
         run = psf.run_filter(system, filter, {"r": 2.0}, **record)
     panel = {
         "panel": [0, 0, 0, 1, 1, 1],

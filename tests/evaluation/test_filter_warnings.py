@@ -9,7 +9,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evaluation import filter_warnings
 from pymc_statespace_filters.evaluation.filter_warnings import warn_about
-from pymc_statespace_filters.filters.outcomes import COLLAPSED, FAILURES
+from pymc_statespace_filters.filters.outcomes import COLLAPSED, Failure
 
 # Health that does not come from a filter: smallest effective number, failure, observation.
 SYSTEM = psf.StateSpaceModel(
@@ -32,21 +32,27 @@ BENT = psf.StateSpaceModel(
 )
 
 
+RECORD = (np.empty(0), np.arange(5, 10), np.zeros((5, 1)), np.empty((0, 0)), 5.0, 0)
+
+
 def warned(rows, filter="a filter", system=SYSTEM):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about(system, filter, np.array(rows), lambda i: asked.append(i) or ())
+        warn_about(system, filter, np.array(rows), lambda i: asked.append(i) or RECORD)
     return [str(w.message) for w in caught], asked
 
 
 def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
-    failure = max(FAILURES)
+    failure = Failure.TOO_FAR
     rows = [[5.0, 0.0, -1.0], [2.0, 0.0, -1.0], [0.0, failure, 3.0], [1.25, 0.0, -1.0]]
     (failed, collapsed), asked = warned(rows)
-    assert failed == f"a filter gave -inf in 1 of 4 evaluations: 1 times {FAILURES[failure]}"
+    assert failed == (
+        f"a filter gave -inf in 1 of 4 evaluations, first in row 3, at time 13: {failure.message}. "
+        f"{failure.cure}."
+    )
     assert "in 2 of 4 evaluations (smallest effective number 1.25)" in collapsed
-    assert asked == [3]
+    assert asked == [2, 3]
 
 
 def test_a_filter_is_not_its_own_remedy(monkeypatch):

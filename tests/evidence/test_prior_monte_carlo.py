@@ -3,10 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pymc as pm
 import pytest
+from pymc_statespace_filters.evidence.posterior.draws import build_posterior
 
+import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
+from pymc_statespace_filters.evidence.estimators.smc_moves import sample_prior_particles
+from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.evidence.targets import Regression, TwoModes, bounded, half_normally_distributed
 
 TARGETS = {
@@ -79,3 +84,21 @@ def test_a_likelihood_that_is_nowhere():
     )
     with pytest.raises(ModelError, match="likelihood is zero at all 10000 draws of the prior"):
         PriorMonteCarlo().estimate(posterior, rng=np.random.default_rng(79))
+
+
+def test_a_likelihood_of_zero_is_explained():
+    """A variance whose prior is negative: no prior of it is too wide."""
+    system = psf.StateSpaceModel(
+        lambda x, q: [0.9 * x[0] + q[0]], lambda x: [x[0]], process_noise=[[1.0]],
+        observation_noise=lambda v: [[v]], initial_mean=[0.0], initial_cov=[[1.0]],
+    )  # fmt: skip
+    with pm.Model() as model:
+        pm.Normal("v", -5.0, 1.0)
+        psf.StateSpace("d", system, psf.EKF(), steps=[1, 2], observed=[0.5, -1.0])
+        idata = psf.sample_dram(60, tune=60, chains=2, initvals={"v": 1.0}, progressbar=False)
+    posterior, _ = build_posterior(idata, ModelDensity(model))
+    because = "in 100 of 100 evaluations observation_noise is not positive semidefinite"
+    with pytest.raises(ModelError, match=f"at all 100 draws of the prior: {because}"):
+        PriorMonteCarlo(100).estimate(posterior, rng=np.random.default_rng(1))
+    with pytest.raises(ModelError, match=f"positive at 0 of 100 .*: {because}"):
+        sample_prior_particles(posterior, 100, np.random.default_rng(1))

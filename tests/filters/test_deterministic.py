@@ -13,7 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.evaluation.filter_warnings import warn_of_choice
-from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER
+from pymc_statespace_filters.filters.outcomes import STATE_NOT_FINITE
 from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
@@ -183,7 +183,7 @@ def test_a_path_that_explodes_fails_from_there_on():
     terms, health, mean, cov, *_ = compiled("compile_run", KNOWN)(theta, *RECORD, ROWS)
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()
-    np.testing.assert_array_equal(health[1:], [NO_FINITE_MEMBER, 1.0])
+    np.testing.assert_array_equal(health[1:], [STATE_NOT_FINITE, 1.0])
     assert np.isnan(mean[-1]).all()
     assert np.isnan(cov[-1]).all()
 

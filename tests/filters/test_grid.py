@@ -11,12 +11,13 @@ from scipy.stats import norm, poisson
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    FAILURES,
     GRID_TOO_LARGE,
-    NO_FINITE_MEMBER,
+    INITIAL_COV,
     NO_PROCESS_NOISE,
+    OBSERVATION_NOISE,
+    STATE_NOT_FINITE,
     TOO_FAR,
+    Failure,
 )
 from pymc_statespace_filters.pymc_model.inspection import exactness, noise_seeds
 from pymc_statespace_filters.testing import kalman_log_likelihood
@@ -228,19 +229,19 @@ def test_observations_beyond_the_rounding_of_the_density(deviations, spread):
 def reason(observed=(1.0, 0.8), steps=(5, 10), **changes):
     """Terms of a double well and the code of the failure that the warning names."""
     parameters = double_well_parameters(DOUBLE_WELL) | changes
-    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 1") as caught:
+    with pytest.warns(psf.FilterWarning, match="-inf") as caught:
         terms = psf.log_likelihood(
             DOUBLE_WELL_SYSTEM, psf.GridFilter(), parameters, observed, steps=steps
         )
-    (code,) = (c for c, words in FAILURES.items() if words in str(caught[0].message))
+    (code,) = (f for f in Failure if f.message in str(caught[0].message))
     return terms, code
 
 
 def test_failures_are_minus_infinity_and_a_reason():
     assert reason(sigma=0.0)[1] == NO_PROCESS_NOISE
-    assert reason(initial_var=-0.1)[1] == COVARIANCE_NOT_POSITIVE
-    assert reason(noise_var=-0.1)[1] == COVARIANCE_NOT_POSITIVE
-    assert reason(alpha=np.inf)[1] == NO_FINITE_MEMBER
+    assert reason(initial_var=-0.1)[1] == INITIAL_COV
+    assert reason(noise_var=-0.1)[1] == OBSERVATION_NOISE
+    assert reason(alpha=np.inf)[1] == STATE_NOT_FINITE
     assert reason(initial_var=1e8)[1] == GRID_TOO_LARGE
     terms, code = reason(observed=[1.0, 50.0, 1.0], steps=[5, 10, 15])
     assert code == TOO_FAR

@@ -27,7 +27,7 @@ from pymc_statespace_filters.filters.ensemble.reductions import (
 )
 from pymc_statespace_filters.filters.ensemble.resampling import SCHEMES
 from pymc_statespace_filters.filters.ensemble.weights import normalise_weights
-from pymc_statespace_filters.filters.outcomes import NO_FINITE_MEMBER, NONE, ZERO_WEIGHTS
+from pymc_statespace_filters.filters.outcomes import NONE, STATE_NOT_FINITE, ZERO_DENSITY
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import (
     DistributedLogLikelihood,
@@ -239,7 +239,7 @@ def test_ranks_of_whose_members_none_is_alive(filter_):
 @pytest.mark.parametrize("filter_", IN_THE_WELL, ids=str)
 @pytest.mark.parametrize(
     ("theta", "outlier", "code"),
-    [(LOST_START, 1000.0, NO_FINITE_MEMBER), (PLAIN_START, 1e200, ZERO_WEIGHTS)],
+    [(LOST_START, 1000.0, STATE_NOT_FINITE), (PLAIN_START, 1e200, ZERO_DENSITY)],
 )
 def test_failures_of_all_members(filter_, theta, outlier, code):
     """Whether none is finite, or all weights are zero: every rank gives up at the same place."""
@@ -247,7 +247,7 @@ def test_failures_of_all_members(filter_, theta, outlier, code):
     observed[2] = outlier
     terms, health = everywhere(filter_, WELL, steps + 1, observed, theta)
     assert health[1] == code
-    assert health[2] == 2 or code != ZERO_WEIGHTS
+    assert health[2] == 2 or code != ZERO_DENSITY
     assert np.all(terms[int(health[2]) :] == -np.inf)
 
 

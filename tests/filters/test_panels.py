@@ -15,9 +15,9 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.gaussian import functions as gaussian_functions
 from pymc_statespace_filters.filters.gaussian.machine import STRETCH
 from pymc_statespace_filters.filters.outcomes import (
-    COVARIANCE_NOT_POSITIVE,
-    NO_FINITE_MEMBER,
     NONE,
+    PROCESS_NOISE,
+    STATE_NOT_FINITE,
 )
 from pymc_statespace_filters.filters.protocol import BatchFilter
 from pymc_statespace_filters.filters.signatures import PANEL
@@ -183,9 +183,9 @@ def test_linear_algebra_of_parameters_is_that_of_each_record():
 @pytest.mark.parametrize(
     ("column", "value", "code"),
     [
-        (V, -5.0, COVARIANCE_NOT_POSITIVE),  # known before the first row
-        (A, 60.0, COVARIANCE_NOT_POSITIVE),  # explodes on the way
-        (A, np.nan, NO_FINITE_MEMBER),
+        (V, -5.0, PROCESS_NOISE),  # known before the first row
+        (A, 60.0, STATE_NOT_FINITE),  # explodes on the way
+        (A, np.nan, STATE_NOT_FINITE),
     ],
 )
 def test_a_failing_record_leaves_the_others_their_terms(column, value, code):
@@ -208,7 +208,7 @@ def test_the_health_is_that_of_the_first_failing_record_in_the_order_of_rows():
     theta[1, A], theta[2, V] = 60.0, -5.0
     health, healths, _ = check(BENT, psf.EKF(), theta, panel)
     np.testing.assert_array_equal(health, healths[1])
-    assert healths[2, 1] == COVARIANCE_NOT_POSITIVE
+    assert healths[2, 1] == PROCESS_NOISE
 
 
 def test_value_and_gradient_are_those_of_the_tape():

@@ -20,9 +20,9 @@ from pymc_statespace_filters.compiler.native.plan import (
     N_REQUEST,
     N_RESULTS,
     RECORD,
-    REFUSALS,
     REQUEST,
     RESULTS,
+    Refusal,
     plan_entry,
 )
 from pymc_statespace_filters.compiler.native.planned_function import PlannedFunction
@@ -167,7 +167,7 @@ def test_a_record_that_does_not_fit_is_refused_from_python_and_from_compiled_cod
     for function in (likelihood, likelihood.function):
         with pytest.raises(psf.ModelError) as error:
             function(*arguments)
-        assert str(error.value) == REFUSALS[status]
+        assert str(error.value) == Refusal(status).message
 
 
 def test_python_and_compiled_code_give_the_same_bits():

@@ -12,7 +12,7 @@ from scipy.stats import kstest, norm, poisson
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.outcomes import FAILURES, NONE, TOO_FAR
+from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR, Failure
 from pymc_statespace_filters.filters.point_mass.segments import POINTS, draw, points_of, weight
 from tests.references.fixed_nodes import FixedNodes
 
@@ -279,7 +279,7 @@ def test_a_fine_sensor_that_loses_the_sign_reads_both_densities(sd):
 
 @pytest.mark.parametrize("far", [30.0, 1e6])
 def test_an_observation_beyond_what_doubles_hold_is_named(far):
-    with pytest.warns(psf.FilterWarning, match=FAILURES[TOO_FAR]):
+    with pytest.warns(psf.FilterWarning, match=Failure(TOO_FAR).message):
         terms = psf.log_likelihood(LOG, psf.GridFilter(), {}, [0.4, far, 0.3], steps=np.arange(3))
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()

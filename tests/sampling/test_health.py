@@ -121,9 +121,11 @@ def test_a_stay_of_a_fifth_of_the_draws_is_said():
     moving = np.tile([1, 0], 400)
     stuck = np.concatenate([moving, [1], np.zeros(205, dtype=int), [1]])
     assert closing_warning(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
-    warning = closing_warning(PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck)))
+    phase = PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck))
+    warning, of_noise = closing_warning(phase), closing_warning(phase, remedy="Use more.")
     assert "stayed at one point for 206 of 1007 draws" in warning.message
-    assert "more particles" in warning.message
+    assert "more particles" not in warning.message
+    assert "more particles" in of_noise.message
     # Of few draws a fifth is soon passed by chance.
     few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])
     assert closing_warning(PhaseStatistics.from_draws(draws_with(few), 0, len(few))) is None

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.kernel.state import Evaluation
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     MIDDLE,
@@ -106,17 +107,30 @@ def test_too_much_noise_names_chain_place_and_cure():
     assert ": 40 times as many" in text
 
 
-def test_too_little_noise_names_the_factor_to_be_saved():
-    text = variance_advice(of_variance(MIDDLE / 250.0), "at the highest-density draw", 1)
-    assert text.startswith("Chain 1, at the highest-density draw: ")
-    assert "250 times fewer" in text
+def test_a_number_that_no_one_would_take_is_not_named():
+    text = variance_advice(of_variance(1e7), "here", 0, [psf.BootstrapPF(1000)], "Use EKF().")
+    assert "times as many" not in text
+    assert text.endswith("More particles would hardly do. Use EKF().")
 
 
-def test_a_factor_that_cannot_be_saved_is_not_named():
-    text = variance_advice(of_variance(1e-7), "at its highest draw", 0)
-    assert "variance of only 1e-07" in text
-    assert "far fewer particles" in text
-    assert "times fewer" not in text
+@pytest.mark.parametrize(
+    ("filter", "variance", "fewer"),
+    [
+        (psf.BootstrapPF(100_000), MIDDLE / 250.0, 250),
+        (psf.EnKF(2000), 1e-7, 200),  # ten members are left
+        (psf.GuidedPF(5000), MIDDLE / 100.0, 100),
+        (psf.GuidedPF(50), MIDDLE / 540.0, None),  # fewer than ten would be
+        (psf.GuidedPF(100), 1e-4, None),  # its guide takes five times as long as they do
+        (psf.BootstrapPF(100), MIDDLE / 100.0, None),
+    ],
+    ids=str,
+)
+def test_fewer_particles_are_advised_where_they_save_time(filter, variance, fewer):
+    text = variance_advice(of_variance(variance), "at its highest draw", 1, [filter])
+    assert (text is not None) == (fewer is not None)
+    if fewer:
+        assert text.startswith("Chain 1, at its highest draw: ")
+        assert f"about {fewer} times fewer" in text
 
 
 def test_an_estimate_without_noise_needs_no_advice():

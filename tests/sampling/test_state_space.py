@@ -7,7 +7,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.outcomes import FAILURES
+from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.ops.distributed import (
     CallbackLogLikelihood,
     CallbackLogLikelihoodOfNoise,
@@ -131,7 +131,7 @@ def test_failures_come_with_the_filters_reason(filter):
     stats = idata["warmup_sample_stats"]
     codes = set(np.unique(stats["failure"]))
     assert stats["n_failed"].sum() > 0
-    assert codes - {0} <= set(FAILURES) - {0}
+    assert codes - {0} <= set(Failure) - {0}
     assert np.isfinite(stats["lp"]).all()
 
 

@@ -217,7 +217,9 @@ def test_a_bad_parameter_fails_in_a_counted_way():
         observation_noise=[[1.0]],
         initial_dist=lambda: [2],
     )
-    with pytest.warns(psf.FilterWarning, match="1 times every member .* in process_dist"):
+    with pytest.warns(
+        psf.FilterWarning, match="in 1 of 2 evaluations.* overflowed .* In process_dist"
+    ):
         terms = psf.log_likelihood(
             system, psf.BootstrapPF(20), {"rate": [1.0, -1.0]}, [2.0, 4.0], steps=[1, 2]
         )

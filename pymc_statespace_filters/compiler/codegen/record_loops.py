@@ -32,7 +32,8 @@ def forward_loop(step: Written, row: Written, carried: Sequence[str], sizes: Siz
     """The code of `ALONG_ARGUMENTS`: from the state at ``states`` on, write terms and states.
 
     It writes the state before each step and each row, and the last one. The result is the number of
-    rows before the first without a finite state and term. ``carried`` are the names of elements.
+    rows before the first without a finite state and term; its term is
+    written too. ``carried`` are the names of elements.
     The values of a step are theirs; behind those of a row is the term of an update.
     """
     builder = _Builder(step, row, carried, sizes)
@@ -121,6 +122,7 @@ class _Builder:
         build.branch(rows)
 
         build.position_at_end(failed)
+        self._access("terms", j, 0, term)
         ended = build.append_basic_block("ended")
         build.branch(ended)
         build.position_at_end(finish)

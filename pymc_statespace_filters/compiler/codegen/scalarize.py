@@ -241,14 +241,14 @@ def _alloc(arena: Arena, node, arguments: list[np.ndarray]) -> list:
 
 
 def _check(arena: Arena, node, arguments: list[np.ndarray]) -> list:
-    """A parameter check of a PyMC distribution: minus infinity where it fails."""
+    """A parameter check of a PyMC distribution: NaN where it fails, there is no density."""
     value, *conditions = arguments
     for condition in conditions:
         holds: Value = True
         for each in condition.flat:
             holds = arena.apply(ps.and_, holds, each)
         where_it_holds = np.frompyfunc(partial(arena.apply, ps.switch, holds), 2, 1)
-        value = _as_array(where_it_holds(value, float("-inf")))
+        value = _as_array(where_it_holds(value, float("nan")))
     return [value]
 
 

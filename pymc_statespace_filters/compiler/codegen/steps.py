@@ -208,7 +208,6 @@ def _along_on_arrays(
                 at_row(W, states, W, observed, inputs, noises, terms, at, k, j, t0 + k * dt)
                 # A state that no observation depends on may be NaN where the term is finite.
                 if not (np.isfinite(terms[j]) and _is_finite(states, at, size)):
-                    terms[j] = -np.inf
                     W[result] = j
                     return
             at = _next(states, at, size, stride)

@@ -66,6 +66,8 @@ class CompiledSystem:
         and the length of ``c``.
     dt : float
         Length of a step.
+    square_roots : dict
+        Where in ``c`` the square root of each covariance begins, by the name of the covariance.
     free : ndarray of int
         The states that an update may move: all but the carried ones.
     """
@@ -92,8 +94,10 @@ class CompiledSystem:
         self.n_constants = self.n_theta + self.n + sum(size**2 for size in sizes.values())
         self._c = pt.tensor("c", shape=(self.n_constants,), dtype="float64")
         self._symbols = symbols_of(model) | {"theta": self._c[: self.n_theta]}
-        self._square_roots, start = {}, self.n_theta + self.n
+        self.square_roots, self._square_roots = {}, {}
+        start = self.n_theta + self.n
         for name, size in sizes.items():
+            self.square_roots[name] = start
             self._square_roots[name] = self._c[start : start + size**2].reshape((size, size))
             start += size**2
 
@@ -236,6 +240,11 @@ class CompiledSystem:
     def is_deterministic(self) -> bool:
         """Whether the state is a function of the parameters: no noise, and a known start."""
         return structure.is_deterministic(self.model)
+
+    @cached_property
+    def undriven_states(self) -> tuple[str, ...]:
+        """The names of the states with an uncertain start that noise is known never to reach."""
+        return tuple(self.states[i] for i in structure.undriven_states(self.model))
 
     @cached_property
     def with_gaussian_steps(self) -> "CompiledSystem":

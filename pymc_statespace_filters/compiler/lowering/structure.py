@@ -1,6 +1,7 @@
 """Structure found from the Jacobians of a system: linearity, and noises that can be merged."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytensor
@@ -13,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
 from ..codegen.emitter import depends_on
-from ..codegen.expressions import is_constant
+from ..codegen.expressions import in_order, is_constant
 from ..codegen.function_types import Graph
 from ..codegen.functions import unrolled
 from ..codegen.scalarize import NotUnrollableError
@@ -55,6 +56,68 @@ def is_deterministic(system: StateSpaceModel) -> bool:
     ):
         return True
     return noise_cov is not None and _is_zero(call(noise_cov, system, symbols), symbols)
+
+
+def undriven_states(system: StateSpaceModel) -> list[int]:
+    """The states that depend on an uncertain start for good, and that no noise ever reaches.
+
+    A position is reached by a noise of its velocity. Empty where that cannot be decided.
+    """
+    symbols = symbols_of(system)
+    step = _sources(call(system.equations.transition, system, symbols), symbols)
+    start = _sources_of_start(system, symbols)
+    if step is None or start is None:
+        return []
+    still = _still_noises(system, symbols)
+    driven = {i for i in range(system.n) if any(q not in still for q in _of("q", step[i]))}
+    uncertain = {i for i in range(system.n) if start[i]}
+    driven, uncertain = (_reached(step, states) for states in (driven, uncertain))
+    return [i for i in range(system.n) if i not in driven and _of("x", step[i]) & uncertain]
+
+
+def _sources(
+    vector: TensorVariable, symbols: Mapping[str, TensorVariable]
+) -> list[set[str]] | None:
+    """The names of the inputs on which each element depends; None where that is not known."""
+    try:
+        (values,) = unrolled(Graph(symbols, [vector]))
+    except NotUnrollableError:
+        return None
+    return [{str(e.args[0]) for e in in_order([value], {}) if e.op is None} for value in values]
+
+
+def _sources_of_start(
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+) -> list[Any] | None:
+    """For each state something that is true if its start is uncertain."""
+    draw = system.equations.initial_draw
+    if draw is not None:
+        z = draw.inputs[1].type("z")
+        found = _sources(draw.bind([symbols["theta"], z])[0], {**symbols, "z": z})
+        return None if found is None else [_of("z", names) for names in found]
+    variances = _zeros(pt.diagonal(call(system.equations.initial_cov, system, symbols)), symbols)
+    return [not is_zero for is_zero in variances] if len(variances) == system.n else None
+
+
+def _still_noises(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> set[int]:
+    """The noises whose variance is zero."""
+    if system.equations.process_noise is None:
+        return set()
+    variances = pt.diagonal(call(system.equations.process_noise, system, symbols))
+    return {i for i, is_zero in enumerate(_zeros(variances, symbols)) if is_zero}
+
+
+def _of(vector: str, names: set[str]) -> set[int]:
+    """The indices of the elements of a vector among names such as "x.0"."""
+    return {int(name.split(".")[1]) for name in names if name.startswith(f"{vector}.")}
+
+
+def _reached(step: Sequence[set[str]], first: set[int]) -> set[int]:
+    """The states that depend on the first ones after some steps, and these."""
+    found = set(first)
+    for _ in step:
+        found |= {i for i, names in enumerate(step) if _of("x", names) & found}
+    return found
 
 
 def is_linear(system: StateSpaceModel) -> bool:
@@ -154,14 +217,19 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
 
 def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
     """Whether every element is zero whatever the symbols; False where that cannot be decided."""
-    (folded,) = constant_fold([matrix], raise_not_constant=False)
+    return all(_zeros(matrix.ravel(), symbols))
+
+
+def _zeros(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> list[bool]:
+    """Which elements are zero whatever the symbols; none where that cannot be decided."""
+    (folded,) = constant_fold([vector], raise_not_constant=False)
     if not isinstance(folded, Variable):
-        return not np.any(folded)
+        return [not value for value in np.asarray(folded)]
     try:
-        (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
+        (values,) = unrolled(Graph(symbols, [vector]))
     except NotUnrollableError:
-        return False
-    return all(is_constant(value) and value == 0 for value in values)
+        return [False]
+    return [bool(is_constant(value) and value == 0) for value in values]
 
 
 def is_free_of(

@@ -10,7 +10,7 @@ A panel is a record of several parts; a single record is a panel of one.
 
 A call is made twice: with ``sizes_only`` it checks its arguments and writes the sizes of the
 results; then the caller allocates these, and the function writes them. It returns a status, 0 or a
-key of `REFUSALS`.
+`Refusal`.
 """
 
 import ctypes
@@ -26,6 +26,7 @@ from numba import carray, types
 
 from .entry_point import I64_PTR, EntryPoint
 from .jit import njit_internal
+from .outcome_code import OutcomeCode
 
 
 class RecordSlots(NamedTuple):
@@ -191,28 +192,39 @@ DEFAULTS = {
 }
 """Words that are not 0 where nothing is given."""
 
-REFUSALS: dict[int, str] = {
-    1: "the plan of a compiled filter is damaged: its memory was overwritten",
-    2: "steps must not be negative and must increase strictly",
-    3: "inputs must have one column for each input of the system",
-    4: "inputs has too few rows: row k holds during step k",
-    5: "observed must have a row for each step and a column for each observable; for a "
-    "record of another length give the variable steps and observed as pm.Data with "
-    "dims=(..., ...), as StateSpace says, and replace both in one pm.set_data",
-    6: "the rows of a panel must have a column each for record, step, inputs",
-    7: "steps must not be negative and must increase strictly within a record",
-    8: "the parameters must have a row for each record of the panel; for another number "
-    "of records replace the parameters' dimension too",
-    9: "normals must be those of this filter, system and steps",
-    10: "the callback of a likelihood raised an error",
-    11: "the state of the filter must be one that it left after earlier rows of this record",
-}
-"""Why a call was refused, by its status."""
+
+class Refusal(OutcomeCode):
+    """Why a call was refused: its status."""
+
+    DAMAGED = 1, "the plan of a compiled filter is damaged: its memory was overwritten"
+    STEPS = 2, "steps must not be negative and must increase strictly"
+    INPUT_COLUMNS = 3, "inputs must have one column for each input of the system"
+    INPUT_ROWS = 4, "inputs has too few rows: row k holds during step k"
+    OBSERVED = (
+        5,
+        "observed must have a row for each step and a column for each observable; for a record of "
+        "another length give the variable steps and observed as pm.Data with dims=(..., ...), as "
+        "StateSpace says, and replace both in one pm.set_data",
+    )
+    PANEL_COLUMNS = 6, "the rows of a panel must have a column each for record, step, inputs"
+    PANEL_STEPS = 7, "steps must not be negative and must increase strictly within a record"
+    PANEL_RECORDS = (
+        8,
+        "the parameters must have a row for each record of the panel; for another number of "
+        "records replace the parameters' dimension too",
+    )
+    NORMALS = 9, "normals must be those of this filter, system and steps"
+    RAISED = 10, "the callback of a likelihood raised an error"
+    STATE = (
+        11,
+        "the state of the filter must be one that it left after earlier rows of this record",
+    )
+
 
 (
     DAMAGED, STEPS, INPUT_COLUMNS, INPUT_ROWS, OBSERVED, PANEL_COLUMNS, PANEL_STEPS, PANEL_RECORDS,
     NORMALS, RAISED, STATE,
-) = REFUSALS  # fmt: skip
+) = map(int, Refusal)  # fmt: skip
 
 PLAN_ARGUMENTS = {"plan": I64_PTR, "record": I64_PTR, "request": I64_PTR, "results": I64_PTR}
 

@@ -24,13 +24,13 @@ from .plan import (
     N_RESULTS,
     RAISED,
     RECORD,
-    REFUSALS,
     REQUEST,
     RESULTS,
     SHAPES,
     Argument,
     Plan,
     PlanFunction,
+    Refusal,
 )
 
 type Names = Sequence[tuple[str, int]]
@@ -63,7 +63,7 @@ def _exception(status: int) -> type[Exception]:
 
 def refusal(status: int) -> Exception:
     """What the status of a call says."""
-    return _exception(status)(REFUSALS[status])
+    return _exception(status)(Refusal.of(status).message)
 
 
 class BoundCall(NamedTuple):
@@ -331,9 +331,11 @@ class _Emitter:
         status = builder.call(builder.inttoptr(function, kind.as_pointer()), [plan, *vectors])
         is_refused = builder.icmp_signed("!=", status, self._integer(0))
         with builder.if_then(is_refused, likely=False):
-            for code, text in REFUSALS.items():
-                with builder.if_then(builder.icmp_signed("==", status, self._integer(code))):
-                    self._context.call_conv.return_user_exc(builder, _exception(code), (text,))
+            for each in Refusal:
+                with builder.if_then(builder.icmp_signed("==", status, self._integer(each))):
+                    self._context.call_conv.return_user_exc(
+                        builder, _exception(each), (each.message,)
+                    )
 
     def _new(self, name: str, ndim: int) -> tuple[Any, Any]:
         kind = types.Array(types.float64, ndim, "C")

@@ -76,8 +76,8 @@ class PriorMonteCarlo:
                 break
         if np.isneginf(evidence.value):
             raise ModelError(
-                f"the likelihood is zero at all {n_draws} draws of the prior: narrow the priors "
-                "to plausible values"
+                f"the likelihood is zero at all {n_draws} draws of the prior: "
+                f"{posterior.why_zero(x)}"
             )
         n_effective = evidence.kish_ess(n_draws)
         return Estimate(

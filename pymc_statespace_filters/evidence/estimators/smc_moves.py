@@ -43,7 +43,7 @@ def sample_prior_particles(posterior: Posterior, count: int, rng: np.random.Gene
     if alive < MIN_ALIVE:
         raise ModelError(
             f"the likelihood is positive at {alive} of {count} draws of the prior, fewer than "
-            f"{MIN_ALIVE}: narrow the priors to plausible values"
+            f"{MIN_ALIVE}: {posterior.why_zero(x[~np.isfinite(log_likelihood)])}"
         )
     return Particles(x, log_prior, log_likelihood, np.arange(count))
 

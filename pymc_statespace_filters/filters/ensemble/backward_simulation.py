@@ -25,7 +25,7 @@ from ...compiler.numerics.philox import STATES, key_words, open_unit, philox
 from ...compiler.numerics.restricted_domain import exp
 from ...compiler.numerics.small_cholesky import cholesky, solve_lower
 from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
-from ..outcomes import COVARIANCE_NOT_POSITIVE, NONE
+from ..outcomes import NO_PROCESS_NOISE, NONE
 from ..plan import PLAN, propagate, read_system
 from .callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED, run_observed
 from .summaries import choose, finite_weights, write_summaries
@@ -224,7 +224,7 @@ def _smooth(plan, record, request, results):
             call.request[REQUEST.draw_seed],
         )
         if not _simulate_backward(system, data.t0, seed, N, n_steps, stored, rows, reals):
-            health[1], health[2] = COVARIANCE_NOT_POSITIVE, 0.0
+            health[1], health[2] = NO_PROCESS_NOISE, 0.0
     write_summaries(call, reals, health, 0 if health[1] != NONE else ALL_STEPS)
     return status
 

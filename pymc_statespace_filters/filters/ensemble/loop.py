@@ -15,6 +15,7 @@ from ..outcomes import NONE, is_missing
 from ..plan import PLAN, initialise, propagate, read_system, settings_of
 from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
 from .noise import NoiseSizes, initial_normals, n_stored, noise_of, process_normals, sizes_of
+from .origins import effective_number_of_origins, follow_ancestors, new_origins
 from .reductions import RankLayout, local_partition
 
 N_LEADING = 6
@@ -192,7 +193,10 @@ def ensemble_filter(
         width, dt, health = local.width, system.dt, to.health
         observer = observer_of(request)
         health[0], health[1], health[2] = n_members, NONE, -1
+        if system.failure != NONE:
+            health[0], health[1], health[2] = 0.0, system.failure, 0.0
         nothing, ancestors = np.empty(0), resampling.ancestors
+        origins = new_origins(plan[PLAN.follows_origins] != 0, local)
         k, before = np.int64(0), state_given(request)
         if before.size == 0:
             initialise(system, initial_normals(noise), width, members.X)
@@ -201,7 +205,7 @@ def ensemble_filter(
             k = restore(before, members)
         else:
             return STATE
-        for j in range(steps.size):
+        for j in range(steps.size if health[1] == NONE else 0):
             while k < steps[j]:
                 propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
                 k += 1
@@ -211,14 +215,19 @@ def ensemble_filter(
                 to.terms[j] = 0.0
                 continue
             found = update(system, j, k, t0 + k * dt, d, noise, members, local, work)
-            to.n_effective[j] = found.n_effective
-            health[0] = min(health[0], found.n_effective)
+            n_effective = found.n_effective
+            if origins.own.size and found.failure == NONE:
+                n_distinct = effective_number_of_origins(origins, members.w, local)
+                n_effective = min(n_effective, n_distinct)
+            to.n_effective[j] = n_effective
+            health[0] = min(health[0], n_effective)
             if found.failure != NONE:
                 health[1], health[2] = found.failure, j
                 break
             to.terms[j] = found.increment
             emit(observer, UPDATED, j, k, members, d, ancestors)
             if resample(resampling, noise, j, k, found.n_weighted, members, local):
+                follow_ancestors(origins, ancestors)
                 emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
         if health[1] == NONE:
             emit(observer, ENDED, steps.size, k, members, nothing, ancestors)

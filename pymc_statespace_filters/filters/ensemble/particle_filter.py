@@ -1,7 +1,8 @@
 """What particle filters share: when and how they resample, and how they smooth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
+from typing import ClassVar
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import njit_internal
@@ -56,9 +57,13 @@ def particle_filter(
 
 @dataclass(frozen=True)
 class ParticleFilter(EnsembleFilterBase):
-    """A filter of weighted particles that are resampled when few of them carry the weight."""
+    """A filter of weighted particles that are resampled when few of them carry the weight.
+
+    ``counts_copies`` says that copies of a particle count as one where no noise tells them apart.
+    """
 
     n_particles: int
+    counts_copies: ClassVar[bool] = False
     _: KW_ONLY
     resample_below: float = 1 / 3
     resampling: str = "systematic"
@@ -80,6 +85,13 @@ class ParticleFilter(EnsembleFilterBase):
     def check(self, system: System) -> None:
         """Raise if the scheme has to sort particles and cannot sort those of so many states."""
         check_sortable(self.resampling, system.n)
+
+    def plan(
+        self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
+    ) -> Plan:
+        """Return the plan of a function; it follows origins if copies stay equal for good."""
+        follows = int(self.counts_copies and bool(system.undriven_states))
+        return super().plan(system, run, functions, follows_origins=follows, **others)
 
     def smooth(self, system: System) -> "ParticleFilter":
         """Return this filter with an estimate that changes little when its normals do."""

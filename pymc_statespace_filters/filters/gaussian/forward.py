@@ -11,8 +11,9 @@ from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
 from ...compiler.numerics.small_cholesky import covariance_root
 from ..calls import OK, opened, reals_at
-from ..outcomes import COVARIANCE_NOT_POSITIVE, NO_FINITE_MEMBER, NONE, OUT_OF_MEMORY, is_missing
+from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN, settings_of
+from .failures import failure_along, failure_in_lane
 from .group import (
     ALIVE,
     BEGIN,
@@ -95,7 +96,8 @@ def _side_by_side(machine, work, table, records, lanes, n_alive, tape, terms, he
         if _observe(lanes, records, rows, table.observed, k, d, seen, terms):
             force = work.forces[n_steps * m.n_inputs * m.width :]
             call(m.update, m, n_lanes, work, last, force, t0, k, 1)
-            n_alive -= _store_terms(m, lanes, records, last, seen, term, terms, health)
+            made = last, force, t0, k
+            n_alive -= _store_terms(m, work, made, lanes, records, seen, term, table, terms, health)
             last = last[size:]
         copy(last, states[:size])
     return place
@@ -115,18 +117,10 @@ def _along(machine, work, table, record, tape, terms, health):
     place = stride * (j + k - table.first)
     if j == n_rows:
         return place
-    health[point, 1] = _failure(m.n, states[place:], 1)
-    health[point, 2] = record[BEGIN] + j
+    row, at = record[BEGIN] + j, record[SHIFT] + record[BEGIN] + j
+    health[point, 1] = failure_along(m, work.W, table, row, states[place:], terms[at])
+    health[point, 2], terms[at] = row, -np.inf
     return place + stride
-
-
-@njit_internal
-def _failure(n, s, width):
-    """Why an update of a state failed; its numbers are ``width`` apart."""
-    for i in range(n):
-        if not np.isfinite(s[i * width]):
-            return NO_FINITE_MEMBER
-    return COVARIANCE_NOT_POSITIVE
 
 
 @njit_internal
@@ -139,11 +133,12 @@ def _set_out(machine, covariances, W, lanes, records, terms, health):
     for lane in range(records.shape[0]):
         point, first = records[lane, POINT], records[lane, BEGIN]
         is_valid = True
-        for i in range(0, covariances.size, 2):
-            is_valid &= _is_covariance(machine, W, lane, int(covariances[i]), covariances[i + 1])
         health[point, 0], health[point, 1], health[point, 2] = np.inf, NONE, -1.0
-        if not is_valid:
-            health[point, 1], health[point, 2] = COVARIANCE_NOT_POSITIVE, first
+        for i in range(0, covariances.size, 3):
+            row, size, failure = covariances[i : i + 3]
+            if is_valid and not _is_covariance(machine, W, lane, int(row), size):
+                is_valid = False
+                health[point, 1], health[point, 2] = failure, first
         lanes[ALIVE, lane] = is_valid
         n_alive += is_valid
         for j in range(first, first + records[lane, N_ROWS]):
@@ -190,12 +185,13 @@ def _observe(lanes, records, rows, observed, k, d, seen, terms):
 
 
 @njit_internal
-def _store_terms(machine, lanes, records, s, seen, term, terms, health):
+def _store_terms(machine, work, made, lanes, records, seen, term, table, terms, health):
     """Store the finite terms of an update; return how many records have none and fail there.
 
-    ``s`` are the states before it.
+    It was ``made`` of the states and inputs at this step.
     """
-    n_failed, width = 0, machine.width
+    s, force, t0, k = made
+    n_failed, width, n_lanes = 0, machine.width, n_lanes_of(machine, records)
     # A state that no observation depends on may be NaN where the term is finite.
     for i in range(machine.size):
         for lane in range(width):
@@ -209,7 +205,10 @@ def _store_terms(machine, lanes, records, s, seen, term, terms, health):
             continue
         lanes[ALIVE, lane] = 0
         n_failed += 1
-        health[point, 1] = _failure(machine.n, s[lane:], width)
+        d = table.observed[j]
+        health[point, 1] = failure_in_lane(
+            machine, work, n_lanes, lane, s, force, t0, k, d, term[lane]
+        )
         health[point, 2] = j
     return n_failed
 

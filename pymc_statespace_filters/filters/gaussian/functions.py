@@ -32,6 +32,7 @@ from ...compiler.lowering.symbols import call
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
 from ...system.model import StateSpaceModel
+from ..outcomes import Failure
 from ..plan import make_plan
 from ..protocol import System
 from .machine import rows_of_vectors
@@ -185,13 +186,13 @@ def depends_on_theta(graph: FrozenFunctionGraph) -> bool:
 
 
 def checked(system: StateSpaceModel, covs: Covariances, n_theta: int) -> tuple[int, ...]:
-    """The settings of a plan: row in ``W`` and size of the covariances to check."""
+    """The settings of a plan: row in ``W``, size and failure of each covariance to check."""
     graphs = covariances(system)
     return tuple(
         number
         for name, (first, size) in covs.places.items()
         if depends_on_theta(graphs[name])
-        for number in (n_theta + first, size)
+        for number in (n_theta + first, size, Failure[name.upper()])
     )
 
 

@@ -62,6 +62,7 @@ class Machine(NamedTuple):
     width: int
     n_rows: int
     dt: float
+    has_gaussian_observation: bool
     rows: Rows
     start: int
     along: int
@@ -84,6 +85,7 @@ def read_machine(plan):
         n=n, size=size, n_theta=n_theta, n_inputs=plan[PLAN.n_inputs],
         n_noises=plan[PLAN.n_noises], p=p, width=width, n_rows=plan[PLAN.n_rows],
         dt=plan.view(np.float64)[PLAN.dt],
+        has_gaussian_observation=plan[PLAN.has_gaussian_observation] != 0,
         rows=rows_of_vectors(n_theta, plan[PLAN.n_covariances], p, size, n),
         start=plan[PLAN.start], along=plan[PLAN.along], along_back=plan[PLAN.along_back],
         predict=plan[PLAN.predict], update=plan[PLAN.update],

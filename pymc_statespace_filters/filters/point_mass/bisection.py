@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
-from ..outcomes import GRID_TOO_LARGE, NO_FINITE_MEMBER, NO_PROCESS_NOISE, NONE, ZERO_WEIGHTS
+from ..observation_failures import observation_failure
+from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, STATE_NOT_FINITE, ZERO_DENSITY
 from ..plan import log_density, step_moments
 from .recursion import TOO_SHORT
 from .segments import MAX_SEGMENTS, POINTS, density, narrowest_within, points_of, tail, weight
@@ -77,7 +78,7 @@ def known_point(system, step, x):
     segments.predicted[:], segments.mass[:] = 0.0, 0.0
     segments.predicted[0, 0] = segments.mass[0, 0] = 1.0
     term = segments.log_likelihood[0, 0]
-    return NONE if term > -np.inf else ZERO_WEIGHTS, segments, term
+    return NONE if term > -np.inf else _failure(system, step, X), segments, term
 
 
 @njit_internal
@@ -99,7 +100,7 @@ def resolved_segments(system, step, source, accuracy):
         _functions_at(system, step, X, segments, fresh)
         top = _top(segments, n)
         if top == -np.inf:
-            return ZERO_WEIGHTS, segments, top
+            return _failure(system, step, X), segments, top
         total = _weigh(segments, n, top)
         before = n
         split = np.zeros(n, np.bool_)
@@ -135,7 +136,7 @@ def _first_segments(source):
     low, high = np.empty(_DEPTH), np.empty(_DEPTH)
     low[0], high[0], depth = source.low.min(), source.high.max(), 1
     if not low[0] < high[0]:
-        return NO_FINITE_MEMBER, segments, n
+        return STATE_NOT_FINITE, segments, n
     if not high[0] - low[0] < np.inf:
         return GRID_TOO_LARGE, segments, n
     while depth > 0:
@@ -177,6 +178,14 @@ def _functions_at(system, step, X, segments, fresh):
             for i in range(POINTS):
                 segments.mean[fresh[f], i] = M[0, f * POINTS + i]
                 segments.sd[fresh[f], i] = math.sqrt(M[1, f * POINTS + i])
+
+
+@njit_internal
+def _failure(system, step, X):
+    """Why no point has a density."""
+    if not step.observes:
+        return np.int64(ZERO_DENSITY)
+    return observation_failure(system, step.k, step.t, step.d, X)
 
 
 @njit_internal

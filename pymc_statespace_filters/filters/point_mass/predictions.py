@@ -20,7 +20,6 @@ from ..plan import PLAN, observe, read_system, settings_of
 from .forward_pass import END, ON_GRID, ON_SEGMENTS, attempt, first_grid, next_attempt
 from .grid import grid_points
 from .moments import total_mass
-from .recursion import has_valid_covariances
 from .segment_pass import pass_on_segments
 from .segments import POINTS, points_of
 
@@ -49,7 +48,7 @@ def _grid_predictions(plan, record, request, results):
         reals_at(to[RESULTS.log_above], (J, p)),
     )  # fmt: skip
     _forget(laws, 0)
-    if not has_valid_covariances(system):
+    if system.failure != NONE:
         return status
     place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
     terms, tape = np.empty(J), (system, at, observed, t0, laws)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
-from ..outcomes import GRID_TOO_LARGE, NO_FINITE_MEMBER, NO_PROCESS_NOISE, NONE, ZERO_WEIGHTS
+from ..observation_failures import observation_failure
+from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, STATE_NOT_FINITE
 from ..plan import log_density, step_moments
 from .grid import (
     MAX_POINTS,
@@ -73,15 +74,6 @@ def _range_with(first, end, old_first, old_end):
 
 
 @njit_internal
-def has_valid_covariances(system):
-    """Whether every covariance of the system is positive semidefinite."""
-    for root in system.c[system.n_theta + system.n :]:
-        if np.isnan(root):
-            return False
-    return True
-
-
-@njit_internal
 def initial_moments(system):
     """Mean and standard deviation of the state at step 0."""
     return system.c[system.n_theta], system.c[system.n_theta + 1]
@@ -105,7 +97,7 @@ def initialise(system, spacing, reach):
     (mean, sd), one = initial_moments(system), np.full(1, 1.0)
     source = np.full(1, mean), np.full(1, sd), one
     if not (np.isfinite(mean) and np.isfinite(sd)):
-        return NO_FINITE_MEMBER, (np.int64(0), 1.0, one), source
+        return STATE_NOT_FINITE, (np.int64(0), 1.0, one), source
     if is_known(mean, sd):
         return NONE, (np.int64(1), mean, one), source
     spacing = min(spacing, 0.6 * sd)
@@ -128,7 +120,7 @@ def predict(system, k, t, spacing, reach, grid, table):
         target, n = _drop_diverging(system, k, t, mean, sd, mass, spacing, reach)
     source = mean, sd, mass
     if n == 0 or n > MAX_POINTS:
-        code = NO_FINITE_MEMBER if n == 0 else GRID_TOO_LARGE
+        code = STATE_NOT_FINITE if n == 0 else GRID_TOO_LARGE
         return code, grid, source, table, lost
     if tabled:
         first, end = block_of(target), block_of(target + n - 1) + 1
@@ -243,7 +235,8 @@ def update(system, k, t, d, reach, grid, source, n_grids, error, tolerance):
         log_density(system, k, t, d, grid_points(low, mass.size, spacing), log_likelihood)
         term, posterior = weigh(mass, log_likelihood)
         if term == -np.inf:
-            return ZERO_WEIGHTS, grid, term
+            X = grid_points(low, mass.size, spacing)
+            return observation_failure(system, k, t, d, X), grid, term
         first, last = significant(posterior, cut)
         normalise(posterior)
         known = mass.size == 1

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from ...compiler.native.jit import inline_always, njit_internal
-from ..outcomes import NO_FINITE_MEMBER, NONE, TOO_FAR, is_missing
+from ..outcomes import NONE, STATE_NOT_FINITE, TOO_FAR, is_missing
 from .bisection import Accuracy, Step, known_point, resolved_segments
 from .forward_pass import LENGTHENING, LONGEST_REACH, SHORTEST_REACH
 from .recursion import TOO_COARSE, TOO_SHORT, initial_moments, is_known, truncation_of
@@ -71,7 +71,7 @@ def _attempt(system, steps, observed, t0, reach, floor, tolerance, terms, keep, 
         return NONE, np.int64(0), floor
     mean, sd = initial_moments(system)
     if not (np.isfinite(mean) and np.isfinite(sd)):
-        return NO_FINITE_MEMBER, np.int64(0), floor
+        return STATE_NOT_FINITE, np.int64(0), floor
     cut = truncation_of(reach)
     one = np.zeros((1, POINTS))
     one[0, 0] = 1.0

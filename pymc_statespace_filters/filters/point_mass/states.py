@@ -23,7 +23,7 @@ from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.restricted_domain import exp
 from ..calls import OK, opened, reals_at, single_record, wanted_rows
-from ..outcomes import COVARIANCE_NOT_POSITIVE, NONE, OUT_OF_MEMORY, is_missing
+from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import log_density, read_system, settings_of
 from .forward_pass import (
     END,
@@ -36,7 +36,7 @@ from .forward_pass import (
 )
 from .grid import gather, grid_points
 from .moments import PREDICTED, SMOOTHED, Rows, draw, mean_and_sd, total_mass
-from .recursion import TOO_SHORT, empty_table, has_valid_covariances, transition_at, with_sources
+from .recursion import TOO_SHORT, empty_table, transition_at, with_sources
 from .segment_states import states_on_segments
 from .tiles import LANES, block_of, multiply
 
@@ -94,8 +94,8 @@ def _grid_run(plan, record, request, results):
 @njit_internal
 def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
     """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
-    if not has_valid_covariances(system):
-        return np.int64(COVARIANCE_NOT_POSITIVE), np.int64(0)
+    if system.failure != NONE:
+        return np.int64(system.failure), np.int64(0)
     stored = rows.at
     if moment == SMOOTHED and rows.at.size:
         stored = np.arange(rows.at[0], steps[-1] + 1)

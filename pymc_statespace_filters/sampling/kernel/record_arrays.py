@@ -14,13 +14,12 @@ import numpy as np
 from ...compiler.native.entry_point import njit_cached
 from ...compiler.native.jit import linked
 from ...compiler.native.pytensor_function import Call, make_call
+from ...filters.outcomes import NOT_A_NUMBER, RAISED
 from .adaptation_state import pack, packed_size, start_adaptation, unpack
 from .state import (
     BLOCK,
     HEALTH_SIZE,
     N_COUNTS,
-    NOT_A_NUMBER,
-    RAISED,
     draw_seeds,
     generator_of_block,
 )

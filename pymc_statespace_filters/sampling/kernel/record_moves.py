@@ -31,6 +31,7 @@ import numpy as np
 
 from ...compiler.native.entry_point import njit_cached
 from ...compiler.native.jit import copy_into, linked
+from ...filters.outcomes import RAISED
 from .adaptation import learn
 from .adaptation_state import packed_size, unpack
 from .delayed_rejection import log_ratio_to_one
@@ -44,7 +45,6 @@ from .state import (
     N_EVALUATIONS,
     N_FAILED,
     PAUSE_REQUESTED,
-    RAISED,
     SCALING,
     STAGE,
 )

@@ -12,13 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.pytensor_function import Call
-from ...filters.outcomes import FAILURES
 from ...student_mixture import DEGREES_OF_FREEDOM
 from .adaptation_state import unpack
 
 HEALTH_SIZE = 3
-# Failure codes that no filter reports: a log-density of NaN or plus infinity, an exception.
-NOT_A_NUMBER, RAISED = -1, -2
 
 # Columns of a chain's numbers, and of the numbers and counts of its draws.
 LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN = range(3)
@@ -105,7 +102,7 @@ class Evaluation(NamedTuple):
     """Result of one evaluation of a log-density."""
 
     log_density: float  # never NaN or plus infinity; minus infinity after a failure
-    failure: int  # 0, or the failure code: a key of `outcomes.FAILURES`, or `NOT_A_NUMBER`
+    failure: int  # 0, or a code of `outcomes.Failure`
     n_effective: float  # smallest number of particles in any filter, infinity without noisy filters
 
 
@@ -117,13 +114,6 @@ def has_moved(counts: np.ndarray) -> np.ndarray:
     if counts.shape[1] == N_COUNTS:
         return counts[:, STAGE : STAGE + 1] > 0
     return counts[:, N_COUNTS:-N_COMMON_BLOCKS] > 0
-
-
-def failure_reason(code: int) -> str:
-    """Describe a failure code in words."""
-    if code == NOT_A_NUMBER:
-        return "the log-density is NaN or plus infinity"
-    return FAILURES.get(code, f"failure {code}")
 
 
 def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:

@@ -23,6 +23,7 @@ import numpy as np
 from ...compiler.native.entry_point import njit_cached
 from ...compiler.native.jit import copy_into, linked
 from ...compiler.native.pytensor_function import make_call
+from ...filters.outcomes import NOT_A_NUMBER, RAISED
 from .adaptation import learn
 from .adaptation_state import unpack
 from .delayed_rejection import gaussian_log_acceptance
@@ -46,9 +47,7 @@ from .state import (
     N_FAILED,
     N_SCREEN_FAILED,
     N_SCREENED,
-    NOT_A_NUMBER,
     PAUSE_REQUESTED,
-    RAISED,
     SCALING,
     STAGE,
     Evaluation,

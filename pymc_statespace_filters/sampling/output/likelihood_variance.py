@@ -25,6 +25,8 @@ import numpy as np
 from pymc.stats.convergence import SamplerWarning
 from scipy.special import stdtrit
 
+from ...filters.protocol import EnsembleFilter
+from ...filters.recommendation import speed_up
 from ..kernel.state import LOG_DENSITY, Draws, Evaluation, draw_seeds, side_generator
 from ..target.sampled_model import SampledModel
 from .warnings import sampler_warning
@@ -38,8 +40,10 @@ MIDDLE = math.sqrt(TARGET[0] * TARGET[1])
 TOO_NOISY, TOO_QUIET = 10.0, 0.05
 # Below this the estimate is exact, as that of a guided filter on a linear system.
 ROUNDING = 1e-12
-# Above this factor it is extrapolated too far to be named.
-MOST_FEWER = 1000.0
+# Above this factor of particles the variance is extrapolated too far to name it.
+MOST = 1000.0
+# Fewer particles are worth asking for if an evaluation takes half of the time with them.
+WORTHWHILE = 2.0
 
 # Two-sided probability of the intervals.
 _CONFIDENCE = 0.95
@@ -115,11 +119,18 @@ def acceptance_share(variance: float) -> float:
     return math.erfc(0.5 * math.sqrt(variance))
 
 
-def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
+def variance_advice(
+    spread: SeedSpread,
+    where: str,
+    chain: int,
+    filters: Sequence[EnsembleFilter] = (),
+    remedy: str = "",
+) -> str | None:
     """Advise the user if the variance is far outside the range in which chains work best.
 
-    None between variances of 0.05 and 10, and without noise. ``where`` says where it was measured,
-    such as "at the start".
+    None between variances of 0.05 and 10, without noise, and where fewer particles would save
+    little. ``where`` says where it was measured, such as "at the start"; ``filters`` are the noisy
+    ones, and ``remedy`` is what to do if their particles collapse.
     """
     found = f"Chain {chain}, {where}: the estimated log-likelihood{spread.of}"
     if spread.n_failed > spread.n or spread.variance == np.inf:
@@ -132,25 +143,30 @@ def variance_advice(spread: SeedSpread, where: str, chain: int) -> str | None:
         return (
             f"{found} has a variance of {spread.variance:.3g} over {spread.n} noise seeds. "
             f"The chain accepts about {share:.1g} of the moves that it would accept with an exact "
-            "likelihood, and stays long at overestimates. The variance is about proportional to "
-            f"1/N for N particles: {_rounded(spread.variance / MIDDLE)} times as many would bring "
-            f"it between {TARGET[0]:g} and {TARGET[1]:g}; psf.suggest_particles(model) finds the "
-            "number."
+            f"likelihood, and stays long at overestimates. {_more(spread.variance, remedy)}"
         )
-    if ROUNDING < spread.variance < TOO_QUIET:
-        factor = MIDDLE / spread.variance
-        only = f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds."
-        if factor > MOST_FEWER:
-            return (
-                f"{only} Noise does not slow this chain; far fewer particles may make it faster; "
-                "psf.suggest_particles(model) finds the number."
-            )
-        return (
-            f"{only} With about {_rounded(factor)} times fewer particles it would lie "
-            f"between {TARGET[0]:g} and {TARGET[1]:g} and the chain would gain more per unit of "
-            "time; psf.suggest_particles(model) finds the number."
-        )
-    return None
+    if not ROUNDING < spread.variance < TOO_QUIET:
+        return None
+    factor, saved = speed_up(filters, MIDDLE / spread.variance)
+    if saved < WORTHWHILE:
+        return None
+    return (
+        f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
+        f"With about {_rounded(factor)} times fewer particles it would lie below {TARGET[1]:g} and "
+        "the chain would gain more per unit of time; psf.suggest_particles(model) finds the number."
+    )
+
+
+def _more(variance: float, remedy: str) -> str:
+    """Say what brings a variance into the range: so many particles, or something else."""
+    factor = variance / MIDDLE
+    if factor > MOST:
+        return f"More particles would hardly do. {remedy}".rstrip()
+    return (
+        f"The variance is about proportional to 1/N for N particles: {_rounded(factor)} times as "
+        f"many would bring it between {TARGET[0]:g} and {TARGET[1]:g}; "
+        "psf.suggest_particles(model) finds the number."
+    )
 
 
 def is_measured(target: SampledModel, n_iterations: int) -> bool:
@@ -159,7 +175,7 @@ def is_measured(target: SampledModel, n_iterations: int) -> bool:
     return bool(noisy) and n_iterations >= LEAST_ITERATIONS
 
 
-def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
+def start_warning(spread: SeedSpread, chain: int, remedy: str = "") -> SamplerWarning | None:
     """Warn that the noise at a start is such that a chain may never leave it."""
     if not HOPELESS < spread.variance < np.inf:
         return None
@@ -169,7 +185,7 @@ def start_warning(spread: SeedSpread, chain: int) -> SamplerWarning | None:
         f"{acceptance_share(spread.variance):.1g} of the moves that it would accept with an exact "
         "likelihood: it has not left the start yet and may never do so. Start elsewhere "
         "(initvals), or give the filter more particles; psf.suggest_particles(model) finds the "
-        "number."
+        f"number. {remedy if spread.variance > MOST * MIDDLE else ''}".rstrip()
     )
 
 
@@ -178,7 +194,7 @@ def spread_at_highest_draw(
     tune: int,
     measure: Callable[[np.ndarray, np.ndarray], SeedSpread],
     keys: Sequence[np.ndarray],
-    n_noisy: int,
+    target: SampledModel,
 ) -> tuple[SeedSpread, SamplerWarning | None]:
     """Measure the variance at the draw of highest density of all chains, after the warm-up.
 
@@ -189,9 +205,10 @@ def spread_at_highest_draw(
     chain = int(np.argmax([of_chain.max() for of_chain in densities]))
     row = tune + int(densities[chain].argmax())
     # From the chain's key, which a checkpoint stores: a resumed run measures the same.
-    seeds = draw_seeds(side_generator(keys[chain]), (N_SEEDS, n_noisy))
+    seeds = draw_seeds(side_generator(keys[chain]), (N_SEEDS, len(target.seed_names)))
     spread = measure(draws[chain].positions[row], seeds)
-    message = variance_advice(spread, "at its highest draw", chain)
+    filters, remedy = target.noisy_filters, target.collapse_remedy
+    message = variance_advice(spread, "at its highest draw", chain, filters, remedy)
     return spread, None if message is None else sampler_warning(message)
 
 

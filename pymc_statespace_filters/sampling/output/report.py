@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 
 from pymc.stats.convergence import SamplerWarning
 
+from ...filters.outcomes import Failure
 from ...lower_chains import LowerChain
 from ...progress import MIN_ACCEPT_RATE
-from ..kernel.state import failure_reason
 from .convergence import MAX_RHAT, Convergence
 from .datatree import most_iterations
 from .warnings import PhaseStatistics, sampler_warning
@@ -131,7 +131,7 @@ def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:
     if not counts:
         return f"None of {n_evaluations} evaluations after the warm-up failed."
     by_count = sorted(counts.items(), key=lambda item: -item[1])
-    reasons = "; ".join(f"{failure_reason(code)} ({count})" for code, count in by_count)
+    reasons = "; ".join(f"{Failure.of(code).message} ({count})" for code, count in by_count)
     n_failed = sum(counts.values())
     return (
         f"{n_failed} of {n_evaluations} evaluations after the warm-up "
@@ -151,10 +151,7 @@ def _advice(
             "(initvals=psf.find_starts()), or tune longer."
         )
     if min(chain.accept_rate for chain in statistics.values()) < MIN_ACCEPT_RATE:
-        return (
-            "Tune longer, start elsewhere (initvals), give proposal_cov, or, if the likelihood is "
-            "noisy, give its filter more particles."
-        )
+        return "The warnings about single chains say what may help."
     if found is None:
         return ""
     enough = until_ess or _ENOUGH_PER_CHAIN * len(statistics)

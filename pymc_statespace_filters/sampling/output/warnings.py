@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
-from ...filters.outcomes import COLLAPSED
+from ...filters.outcomes import COLLAPSED, Failure
 from ...lower_chains import LowerChain, lower_chains
 from ...progress import MIN_ACCEPT_RATE
 from ..kernel.record_arrays import N_POPULATION_MOVES
@@ -25,7 +25,6 @@ from ..kernel.state import (
     STAGE,
     ChainState,
     Draws,
-    failure_reason,
     has_moved,
 )
 from ..target.record_target import RecordTarget
@@ -140,9 +139,10 @@ def closing_warning(
     collapse. PyMC logs the warning in the main process, in whichever process the chain ran.
     """
     message = (
-        _mobility_problem(statistics)
+        _collapse_problem(statistics, remedy)
+        or _mobility_problem(statistics, is_noisy=bool(remedy))
         or _growth_problem(growth)
-        or _failure_problem(statistics, remedy)
+        or _failure_problem(statistics)
     )
     return None if message is None else sampler_warning(message)
 
@@ -169,14 +169,15 @@ def sampler_warning(message: str) -> SamplerWarning:
     return SamplerWarning(WarningType.BAD_ACCEPTANCE, message, "warn")
 
 
-def _mobility_problem(statistics: PhaseStatistics) -> str | None:
+def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | None:
     n, screened = statistics.iterations, statistics.screened
     if statistics.accept_rate < MIN_ACCEPT_RATE:
-        screen = " or, with a screen, lower screen_power" if screened else ""
+        remedies = ["tune longer", "start elsewhere (initvals)", "give proposal_cov"]
+        remedies += ["give the filter more particles (psf.suggest_particles)"] * is_noisy
+        remedies += ["lower screen_power"] * bool(screened)
         return (
             f"DRAM accepted {statistics.moved:.0f} of {n} proposals after warm-up: the chain "
-            "hardly moves. Tune longer, start elsewhere (initvals), give proposal_cov, or, if the "
-            f"likelihood is noisy, give its filter more particles{screen}."
+            f"hardly moves. One of these may help: {', '.join(remedies)}."
         )
     if statistics.screen_failed > TOLERATED_FAILURES * screened:
         return (
@@ -186,11 +187,16 @@ def _mobility_problem(statistics: PhaseStatistics) -> str | None:
             "screen_power does not help."
         )
     if statistics.longest_dwell > max(LEAST_DWELL, LONG_DWELL * n):
+        begin = "Its"
+        if is_noisy:
+            begin = (
+                "If the estimate there is an overestimate, more particles help "
+                "(psf.suggest_particles). Otherwise its"
+            )
         return (
-            f"DRAM stayed at one point for {statistics.longest_dwell} of {n} draws. If the "
-            "likelihood is noisy, its estimate there is an overestimate: give its filter more "
-            "particles (psf.suggest_particles). Otherwise its proposals do not lead away from "
-            "there: tune longer, start elsewhere (initvals), or give proposal_cov."
+            f"DRAM stayed at one point for {statistics.longest_dwell} of {n} draws. {begin} "
+            "proposals do not lead away from there: tune longer, start elsewhere (initvals), or "
+            "give proposal_cov."
         )
     return None
 
@@ -237,7 +243,7 @@ def _growth_problem(growth: Growth | None) -> str | None:
     )
 
 
-def _failure_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
+def _collapse_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
     if statistics.collapsed > TOLERATED_COLLAPSES * statistics.iterations:
         return (
             f"In {statistics.collapsed} of {statistics.iterations} draws the particles collapsed: "
@@ -245,14 +251,20 @@ def _failure_problem(statistics: PhaseStatistics, remedy: str) -> str | None:
             "observation (sample_stats n_effective; filter_diagnostics shows at which). A chain is "
             f"slow to leave an overestimate. {remedy}".rstrip()
         )
+    return None
+
+
+def _failure_problem(statistics: PhaseStatistics) -> str | None:
     n_failed = sum(count for _, count in statistics.failures)
     if n_failed > TOLERATED_FAILURES * statistics.evaluations:
+        cures = filter(None, [Failure.of(code).cure for code, _ in statistics.failures])
         counted = "; ".join(
-            f"{failure_reason(code)} ({count})" for code, count in statistics.failures
+            f"{Failure.of(code).message} ({count})" for code, count in statistics.failures
         )
         return (
             f"{n_failed} of {statistics.evaluations} evaluations after warm-up failed and were "
             f"rejected: {counted}. If the posterior extends into that region it is truncated there."
+            f"{''.join(f' {cure}.' for cure in cures)}"
         )
     return None
 

@@ -94,6 +94,7 @@ class ChainTask:
         self._rng = np.random.default_rng(seed)
         n_covs = tune if keeps_warmup else 0
         # Pages of these arrays that are never written to take no memory.
+        self._target = target
         self.chain = chain_of(target, draw_key(self._rng), n_rows, n_covs, proposal_cov)
         self.chain.state.mixture[:] = mixture
         self._log = None if checkpoint is None else checkpoint.journal(index)
@@ -180,7 +181,7 @@ class ChainTask:
             state = self.chain.state
             seeds = draw_seeds(self._rng, (N_SEEDS, self._n_noisy))
             spread = self.chain.seed_spread(state.position, seeds)
-            self._start_warning = start_warning(spread, self._index)
+            self._start_warning = start_warning(spread, self._index, self._target.collapse_remedy)
         return failures
 
     def _warn_if_stuck(self) -> None:

@@ -346,7 +346,7 @@ class ModelTask:
                     request.tune if request.draws else 0,
                     chain_of(target, keys[0], 0, 0).seed_spread,
                     keys,
-                    len(target.seed_names),
+                    target,
                 )
                 warnings = [] if warning is None else [warning]
                 return {"log_likelihood_variance": spread.variance}, warnings

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import ModelError
+from ...filters.outcomes import Failure
 from ..kernel.independence import no_mixture
 from ..kernel.record_arrays import (
     FIRST_ACCEPTED,
@@ -21,7 +22,6 @@ from ..kernel.state import (
     ChainState,
     PhaseSettings,
     draw_seeds,
-    failure_reason,
 )
 from ..output.likelihood_variance import SeedSpread, spread_of
 from ..target.initial_points import N_COMPARED
@@ -149,7 +149,7 @@ class RecordChain(ChainArrays):
             return
         label = self._target.labels[int(np.argmin(is_found))]
         reasons = [code for code in failures if code]
-        because = f" ({failure_reason(reasons[-1])})" if reasons else ""
+        because = f" ({Failure.of(reasons[-1]).message})" if reasons else ""
         tried = f", nor at {n_tried - 1} draws from the prior" if n_tried > 1 else ""
         raise ModelError(
             f"the log-density of record {label!r} is not finite at the start{because}{tried}: give "

@@ -15,7 +15,7 @@ from pymc.model import Model
 from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
-from ..kernel.state import failure_reason
+from ...filters.outcomes import Failure
 from .variables import RaveledVariables
 
 N_DRAWS = 200
@@ -133,11 +133,13 @@ def best_initial_point(
     if finite:
         return max(finite, key=lambda point: point.log_density), failures
     tried = f", nor at {len(failures) - 1} draws from the prior" if len(failures) > 1 else ""
-    because = f" ({failure_reason(failures[-1])})" if failures[-1] else ""
+    failure = Failure.of(failures[-1])
+    because = f" ({failure.message})" if failure else ""
+    cure = f". {failure.cure}" if failure.cure else ""
     raise ModelError(
         f"the log-density is not finite at the start, {candidates[-1].tolist()} on the "
         f"unconstrained space{because}{tried}: give a start of finite log-density by initvals, or "
-        "by a pilot of sample_dram whose chains ended at such points"
+        f"by a pilot of sample_dram whose chains ended at such points{cure}"
     )
 
 

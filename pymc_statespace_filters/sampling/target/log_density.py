@@ -21,13 +21,14 @@ from pytensor.tensor.variable import TensorVariable
 from ...compiler.native.pytensor_function import NativeFunction
 from ...compiler.native.rows import Rows
 from ...errors import ModelError
+from ...filters.outcomes import RAISED
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.density import compile_density, compile_raveled
 from ...pymc_model.graph_rewrites import autoregressive_noise, with_filter, with_likelihood_callback
 from ...pymc_model.inspection import health_outputs, log_density_terms, state_space_nodes
 from ...pymc_model.written_function import native_function
-from ..kernel.state import RAISED, Evaluation, NativeLogDensity
+from ..kernel.state import Evaluation, NativeLogDensity
 from ..kernel.transition import evaluate
 from .leader_follower import Leader, leader_errors
 

@@ -15,6 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.pytensor_function import NativeFunction
 from ...errors import ModelError
+from ...filters.outcomes import RAISED
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.density import compile_raveled
@@ -30,7 +31,7 @@ from ..kernel.record_arrays import (
     evaluate_priors,
     record_random_block,
 )
-from ..kernel.state import RAISED, ChainState
+from ..kernel.state import ChainState
 from .sampled_model import Growth, SampledModel
 from .settings import DRAMSettings, checked_proposal_cov
 from .target import Target

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
-from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds
+from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds, noisy_filters
 from .initial_points import PriorDraws
 from .settings import DRAMSettings
 from .variables import RaveledVariables, check_noise_dependencies, continuous_value_vars
@@ -67,6 +67,11 @@ class SampledModel:
     def collapse_remedy(self) -> str:
         """What to do where particles collapse, for every filter of the model that has some."""
         return collapse_remedies(self._model)
+
+    @cached_property
+    def noisy_filters(self) -> list[Any]:
+        """The filters whose likelihood is an estimate."""
+        return list(noisy_filters(self._model).values())
 
     def _read_seeds(self) -> None:
         seeds = [seed.get_value() for seed in self._seeds.values()]
