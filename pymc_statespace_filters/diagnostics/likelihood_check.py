@@ -63,10 +63,11 @@ def check_filter(
         ``variable``, ``filter``
             the variable, and the filter that was checked
         ``check``
-            "bias": the log-likelihood at draws against that of the system; "shift of NAME": what
-            the difference does to the element NAME of the unconstrained parameters; "bias
-            elsewhere": the difference at the other points less that at draws; "low at draws", "low
-            elsewhere": the same for an unbiased filter; "exact" where there is nothing to check
+            "bias": the log-likelihood at draws against that of the system; "shift of NAME": where
+            the element NAME of the unconstrained parameters would lie without the difference, to
+            first order; "bias elsewhere": how much lower the filter is at the other points than at
+            draws; "low at draws", "low elsewhere": whether an unbiased filter is too low; "exact"
+            where there is nothing to check
         ``statistic``, ``se``
             nats, filter minus reference in the mean of the points, or posterior standard
             deviations, and the standard error; of "bias elsewhere" the nats that are proved
@@ -89,18 +90,21 @@ def check_filter(
 
     Notes
     -----
-    The mean difference at draws moves the log-evidence. To first order a parameter moves by its
-    covariance with the difference, over its standard deviation; the spread of the difference that
-    is due to the reference is left out.
+    The mean difference at draws moves the log-evidence. To first order the posterior of a parameter
+    moves by its covariance with the difference, over its standard deviation. What the noise of the
+    reference adds to the spread of the difference is taken out of it.
 
     That a filter is too low is proved without knowing the law of the estimates: if the likelihood
     is at most a bound, the mean of unbiased estimates over that bound is at most 1, and a gambler
-    who bets on more wins a factor of 1 / alpha with probability alpha at most [1]_. A filter is
-    "off" if it is off by more than a nat, or moves a parameter by more than half a standard
-    deviation. It passes if a difference of three nats would have been seen. Where plain particles
-    scatter by more than two nats the check is undecided: guided particles linearise and may be
-    wrong where the other filter is. A model with ``score_from`` is compared on the rows that are
-    scored.
+    who bets on more wins a factor of 1 / alpha with probability alpha at most [1]_.
+
+    A filter is "off" if it is off by more than a nat at draws, if the difference varies by more
+    than three nats between draws, if a parameter is moved by more than half a standard deviation,
+    or if the filter is lower elsewhere by three nats more than is usual between draws. An unbiased
+    one is "off" if it is proved to be a nat too low. A filter passes if a difference of three nats
+    would have been seen. Where plain particles scatter by more than two nats over seeds the check
+    is undecided, unless guided ones prove the filter too low: they linearise, and may be wrong
+    where the other filter is. A model with ``score_from`` is compared on the rows that are scored.
 
     References
     ----------

@@ -3,11 +3,12 @@
 import time
 
 # Nanoseconds of a particle for a step, for each of its states and as much again, as measured.
-_PLAIN_NS = 5.0
+_PLAIN_NS, _GUIDED_NS = 5.0, 25.0
 # The number of particles of the plain filter, at least and at most.
 _LEAST, _MOST = 200, 20_000
-# Of the time, for the estimates of plain particles; the rest is for compilation and other filters.
-_SHARE = 0.3
+# Of the time, for the estimates of plain particles, and at most for those of guided ones; the rest
+# is for compilation and the filter that is checked.
+_SHARE, _GUIDED_SHARE = 0.3, 0.5
 
 
 class Budget:
@@ -27,3 +28,8 @@ class Budget:
         number = min(max(_SHARE * self._seconds / work, _LEAST), _MOST)
         digit = 10 ** (len(str(int(number))) - 1)
         return int(number // digit * digit)
+
+    def affords(self, n_particles: int, n_estimates: int, n_steps: int, n_states: int) -> bool:
+        """Whether there is time for so many estimates with guided particles."""
+        work = n_particles * n_estimates * n_steps * (1 + n_states) * _GUIDED_NS * 1e-9
+        return work <= _GUIDED_SHARE * self._seconds

@@ -5,6 +5,7 @@ a guided filter assumes; both are unbiased, and only where both agree is a diffe
 trusted that does not follow from unbiasedness alone.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.special import logsumexp
 from ..compiler.lowering.compiled_system import compile_system
 from ..filters.bootstrap import BootstrapPF
 from ..filters.guided_pf import GuidedPF
-from ..filters.protocol import Filter, System
+from ..filters.protocol import Filter
 from ..filters.recommendation import exact_filter, filters_for
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import resized
@@ -23,7 +24,7 @@ from .budget import Budget
 Array = NDArray[np.float64]
 
 N_SEEDS, N_GUIDED_SEEDS = 6, 8  # of noisy filters at each point; guided ones take less time
-_AT_ONCE = 4  # points, after which the time is looked at
+_AT_ONCE = 2  # points, after which the time is looked at
 _MORE = 4  # times as many particles has the second guided witness
 # Standard deviation of the logs of estimates, in nats, above which their mean is not trusted.
 USABLE = 2.0
@@ -103,9 +104,7 @@ def compare(
     variable: VariableAtPoints, filter: Filter, budget: Budget, rng: np.random.Generator
 ) -> Comparison:
     """Evaluate the filter and its witnesses, point by point until the budget is spent."""
-    system = compile_system(variable.system)
-    n_particles = budget.n_particles(N_SEEDS * len(variable), variable.n_steps, system.n)
-    filters = [filter, *(_exact(variable, filter) or _unbiased(system, filter, n_particles))]
+    filters = [filter, *(_exact(variable, filter) or _unbiased(variable, filter, budget))]
     found: list[list[Array]] = [[] for _ in filters]
     scored = not is_unbiased(filter)
     for first in range(0, len(variable), _AT_ONCE):
@@ -145,13 +144,23 @@ def is_unbiased(filter: Filter) -> bool:
     return filter.noisy and bool(getattr(filter, "unbiased", False))
 
 
-def _unbiased(system: System, filter: Filter, n_particles: int) -> list[Filter]:
-    """Plain particles, and guided ones unless an equation jumps, which misleads them."""
+def _unbiased(variable: VariableAtPoints, filter: Filter, budget: Budget) -> list[Filter]:
+    """Plain particles, and guided ones if there is time and no equation jumps, which misleads them.
+
+    Of a guided filter, the same with more particles.
+    """
+    system = compile_system(variable.system)
+    n_points, n_steps = len(variable), variable.n_steps
+    n_particles = budget.n_particles(N_SEEDS * n_points, n_steps, system.n)
     taken = filters_for(system)
     found: list[Filter] = [
         resized(one, n_particles) for one in taken if isinstance(one, BootstrapPF)
     ]
-    if isinstance(filter, GuidedPF):
-        return [*found, resized(filter, _MORE * filter.n_particles)]
     guided = [one for one in taken if isinstance(one, GuidedPF) and not system.jumping_equations]
-    return [*found, *guided]
+    if isinstance(filter, GuidedPF):
+        guided = [replace(filter, n_particles=_MORE * filter.n_particles)]
+    n_estimates = N_GUIDED_SEEDS * n_points
+    affordable = (
+        one for one in guided if budget.affords(one.n_particles, n_estimates, n_steps, system.n)
+    )
+    return [*found, *affordable]
