@@ -14,6 +14,7 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
 MIN_EFFECTIVE = 100  # effective terms below which a standard error is unreliable
+MAX_PARETO_K = 0.7  # above which it is, however many terms there are
 SAME = 1e-9  # nats, between weights that count as equal
 NEGLIGIBLE = 700.0  # nats below the largest weight
 
@@ -97,7 +98,7 @@ def pareto_k(log_weights: Array) -> float:
 
 def largest_good_k(count: int) -> float:
     """The Pareto shape up to which the mean of so many weights is reliable (the same source)."""
-    return min(0.7, 1 - 1 / math.log10(count))
+    return min(MAX_PARETO_K, 1 - 1 / math.log10(count))
 
 
 def normalised(log_weights: Array) -> Array:

@@ -24,5 +24,6 @@ def next_temperature(temperature: float, log_likelihood: Array, ess_fraction: fl
 
     if surplus(1 - temperature) >= 0:
         return 1.0
-    # Under a wide prior the step may be smaller than any absolute tolerance.
-    return temperature + brentq(surplus, 0.0, 1 - temperature, xtol=1e-300, rtol=1e-9)
+    # Under a wide prior the step may be smaller than any absolute tolerance, hundreds of halvings.
+    found = brentq(surplus, 0.0, 1 - temperature, xtol=1e-300, rtol=1e-9, maxiter=2000)
+    return temperature + found

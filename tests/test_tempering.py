@@ -21,3 +21,9 @@ def test_a_share_of_the_effective_number_is_left(temperature, spread, share):
 
 def test_the_last_temperature_is_one():
     assert next_temperature(0.3, np.array([-1.0, -1.01, -1.02]), 0.85) == 1.0
+
+
+def test_log_likelihoods_of_all_magnitudes():
+    log_likelihood = -np.logspace(40, 60, 100)
+    weights = np.exp(next_temperature(0.0, log_likelihood, 0.2) * log_likelihood)
+    assert weights.sum() ** 2 / (weights**2).sum() == pytest.approx(20.0, rel=1e-3)

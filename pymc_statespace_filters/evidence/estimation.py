@@ -198,7 +198,7 @@ def estimate_evidence(
     filter : filter, optional
         Another filter than that of the draws, unbiased as `BootstrapPF` or exact: the evidence is
         then that of the model with this filter in every observed StateSpace variable. The draws
-        only say where the posterior lies, so that "importance" is the default and
+        only say where the posterior lies, so that "importance" is the default, and
         "chib_jeliazkov", "bridge", "warp_bridge" and "laplace" are refused. By default the filter
         of the model.
     estimators : str, Estimator, or iterable of them, optional
@@ -260,8 +260,8 @@ def estimate_evidence(
 
     With `filter`, the mean of prior times estimated likelihood over the density of the proposals is
     unbiased, and the noise of the estimates is part of the standard error (Tran, Scharth, Pitt and
-    Kohn 2013). Evaluated are at most 1000 of the draws, and the proposals. An estimate stored
-    before by the same estimator is replaced.
+    Kohn 2013). The proposals are fitted to at most 1000 draws, corrected as by `reweight`, which
+    takes about 2000 evaluations. An estimate stored before by the same estimator is replaced.
 
     References
     ----------

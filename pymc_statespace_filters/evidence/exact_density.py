@@ -1,7 +1,6 @@
 """A model's log-density with an unbiased filter in place of its own."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,8 @@ from ..filters.recommendation import check_unbiased, short_form
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import state_space_nodes
-from .posterior import Posterior, check_overlap
 
 BLOCK = 64  # points between two reports of progress
-MOST_DRAWS = 1000
 
 Array = NDArray[np.float64]
 Seeds = NDArray[np.int64]
@@ -36,6 +33,8 @@ class ExactDensity:
     ----------
     names : tuple of str
         The StateSpace variables.
+    is_exact : bool
+        Whether the filter is exact in the mean for all of them.
     n_noisy : int
         How many seeds an estimate has: one for each variable, or none if the filter has no noise.
     on_progress : callable
@@ -51,8 +50,7 @@ class ExactDensity:
     def __init__(self, model: pm.Model, filter: Filter) -> None:
         check_free_variables(model)
         nodes = _observed_nodes(model)
-        for name, node in nodes.items():
-            _check(name, node.op, filter)
+        self.is_exact = all([_check(name, node.op, filter) for name, node in nodes.items()])
         if all(node.op.filter == filter for node in nodes.values()):
             raise ModelError(
                 f"filter must be another one than that of the model, got {short_form(filter)}: the "
@@ -89,27 +87,6 @@ class ExactDensity:
         return self.evaluate(x, fresh_seeds((len(x), 1, self.n_noisy), rng))[:, 0]
 
 
-def with_exact_density(
-    posterior: Posterior, density: ExactDensity, rng: np.random.Generator
-) -> Posterior:
-    """The draws of an approximate posterior, with the exact density for them and for new points.
-
-    At most `MOST_DRAWS` of them, evenly from every chain, because each takes an evaluation. They
-    say where the exact posterior lies, and are not draws of it.
-    """
-    kept = posterior.thinned(MOST_DRAWS)
-    found = density.evaluate_afresh(kept.draws.reshape(-1, kept.draws.shape[-1]), rng)
-    check_overlap(found)
-    # Zeros become the smallest density that is positive: no quadratic is fitted to infinities.
-    found = np.maximum(found, found[np.isfinite(found)].min())
-    return replace(
-        kept,
-        log_density=found.reshape(kept.log_density.shape),
-        evaluate=density.evaluate_afresh,
-        is_noisy=density.n_noisy > 0,
-    )
-
-
 def fresh_seeds(shape: tuple[int, ...], rng: np.random.Generator) -> Seeds:
     """Seeds of independent noise."""
     return rng.integers(np.iinfo(np.int64).max, size=shape)
@@ -126,12 +103,13 @@ def _observed_nodes(model: pm.Model) -> dict[str, Any]:
     return nodes
 
 
-def _check(name: str, op: Any, filter: Filter) -> None:
-    """Raise unless the mean of a filter's likelihood of a variable is the exact one."""
-    check_unbiased(op.system, filter)
+def _check(name: str, op: Any, filter: Filter) -> bool:
+    """Raise unless a filter has no bias for a variable, and say whether it is exact."""
+    is_exact = check_unbiased(op.system, filter)
     if filter.noisy and op.score_from:
         raise ModelError(
             f"filter must be without noise for {name!r}, whose first {op.score_from} rows are not "
             f"scored, got {short_form(filter)}: its estimate of a part of the record is not "
             "unbiased"
         )
+    return is_exact

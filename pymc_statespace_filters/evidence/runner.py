@@ -23,11 +23,12 @@ from .checks import check_convergence, check_discretisation
 from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
 from .evidence import Evidence, store_evidence
-from .exact_density import MOST_DRAWS, ExactDensity, with_exact_density
+from .exact_density import ExactDensity
 from .posterior import Posterior, build_posterior, data_fingerprint, observation_count
+from .reweighting.correction import exact_posterior
 
 MAXIMUM = "maximum likelihood"
-AT_DRAWS = "likelihood of the draws"
+CORRECTION = "correction of the draws"
 SHARED = "shared proposals"
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
 
@@ -78,8 +79,7 @@ def run_estimators(
     with row_progress(exact or density.calls, enabled=progressbar) as announce:
         if exact is not None:
             noise = "refreshed" if exact.n_noisy else "none"
-            announce(AT_DRAWS, MOST_DRAWS)
-            posterior = with_exact_density(posterior, exact, stream(AT_DRAWS))
+            posterior = exact_posterior(posterior, exact, stream(CORRECTION), announce)
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
@@ -93,7 +93,7 @@ def run_estimators(
         _warn(f"no estimate by {name}", [str(refusal)])
     of_model = _model_fields(model, posterior, support)
     of_model |= {"max_log_likelihood": largest, "noise": noise}
-    of_model["approximate"] = exact is None and not exactness(model)
+    of_model["approximate"] = not (exactness(model) if exact is None else exact.is_exact)
     found = {}
     for name, estimate in estimates.items():
         for message, reasons in _problems(name, estimate):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning
-from ..importance import MIN_EFFECTIVE, mcse_of_chains, pareto_k
+from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse_of_chains, pareto_k
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.posterior_draws import MIN_DRAWS, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
@@ -19,7 +19,6 @@ from ..system.checks import check_count, check_random_seed
 
 N_SEEDS = 8  # of a noisy likelihood, at every draw
 MAX_CORRECTION = 0.1  # nats, of the bias of a ratio of means over these seeds
-MAX_PARETO_K = 0.7
 
 COLUMNS = ("log_lik_change", "log_lik_se", "log_evidence_change", "log_evidence_se")
 

@@ -135,8 +135,11 @@ def check_system_and_filter(system: Any, filter: Any) -> None:
         raise ModelError(f"{refusal}; {alternatives(compiled, filter)}") from None
 
 
-def check_unbiased(system: Any, filter: Any) -> None:
-    """Raise unless a filter can treat a system, and its mean likelihood is the exact one."""
+def check_unbiased(system: Any, filter: Any) -> bool:
+    """Raise unless a filter can treat a system without bias, and say whether it is exact.
+
+    It is not if the density of an observation is itself an approximation.
+    """
     check_system_and_filter(system, filter)
     compiled = compile_system(system)
     if not _is_unbiased(compiled, filter):
@@ -145,6 +148,7 @@ def check_unbiased(system: Any, filter: Any) -> None:
             f"filter must be exact or unbiased for this system, got {short_form(filter)}, whose "
             f"likelihood has a bias; {others or 'no filter of the package'} has none"
         )
+    return bool(filter.is_exact_for(compiled))
 
 
 def _is_unbiased(system: System, filter: Any) -> bool:

@@ -271,7 +271,11 @@ def test_problems_and_their_remedies(by_particles):
         return " ".join(_problems(by_particles.attrs | changes, psf.BootstrapPF(100)))
 
     assert said() == ""
-    assert re.search(r"spread by 2\.5 nats.*BootstrapPF\(100\).*pilot=", said(log_weight_sd=2.5))
+    assert re.search(
+        r"spread by 2\.5 nats.*BootstrapPF\(100\).*pilot=",
+        said(log_weight_sd=2.5, effective_size=150.0),
+    )
+    assert said(log_weight_sd=2.5) == ""
     assert "it has 40 effective draws" in said(effective_size=40.0)
     assert "Pareto k of the weights is 0.90" in said(pareto_k=0.9)
     assert "30% ± 10% of the exact" in said(beyond_draws=0.3, beyond_draws_se=0.1)

@@ -27,13 +27,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...importance import MIN_EFFECTIVE, log_mean_of_independent, pareto_k
+from ...importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_independent, pareto_k
 from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals
 from .student_mixture import choose_mixture
 
-MAX_PARETO_K = 0.7
 MOST_COMPARED = 10_000  # draws whose weights are compared with those of the proposals
 
 

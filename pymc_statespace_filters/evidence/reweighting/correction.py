@@ -1,16 +1,16 @@
 """Draws of an approximate posterior, weighted to represent the exact one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...importance import normalised
+from ...importance import MIN_EFFECTIVE, normalised, smoothed, systematic
 from ..estimators.student_mixture import choose_mixture
-from ..exact_density import fresh_seeds
+from ..exact_density import ExactDensity, fresh_seeds
 from ..pooled import Pooled
 from ..posterior import Posterior, check_overlap
 from .defence import N_ROUNDS, N_SEARCHED, defensive_mixture
@@ -23,6 +23,7 @@ MOST_SEEDS = 16
 # Relative variance that the noise of the averaged estimates of a point may have; it is one where
 # half of the effective draws are lost.
 MAX_NOISE = 1.0
+MOST_DRAWS = 1000  # that are weighted for an evidence
 BEYOND = 0.01  # share of the corrected draws that lie further out than all others
 
 Array = NDArray[np.float64]
@@ -54,6 +55,11 @@ class Correction:
     pooled: Pooled
     log_fit: Array
 
+    @cached_property
+    def weights(self) -> Array:
+        """Pareto-smoothed weights (n + m,) of sum one."""
+        return normalised(smoothed(self.pooled.log_weights)[0])
+
     @property
     def spread(self) -> float:
         """Standard deviation of the log weights of the draws, those of zero left out."""
@@ -74,6 +80,21 @@ class Correction:
         share = float(weights @ outside)
         error = float(np.sqrt(weights**2 @ (outside - share) ** 2))
         return max(share - BEYOND, 0.0), error
+
+    def resampled(self, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers of points (chain, draw) by their smoothed weights, and of an estimate of each.
+
+        Copies of a point are neighbours, and draws keep their order, with the defensive points
+        spread evenly among them: the autocorrelation that ArviZ finds counts the copies as well as
+        the chain's own. Of several estimates of a point one is chosen with the probability that is
+        its share of their sum: the point and its seed then have their joint posterior.
+        """
+        n, m = self.pooled.n_draws, len(self.x) - self.pooled.n_draws
+        place = np.concatenate([np.arange(n), (np.arange(m) + 0.5) * n / m - 0.5])
+        order = np.argsort(place, kind="stable")
+        index = order[systematic(self.weights[order], n, rng)].reshape(self.pooled.shape)
+        logs = self.log_estimates[index]
+        return index, (logs + rng.gumbel(size=logs.shape)).argmax(axis=-1)
 
 
 def correct(
@@ -117,10 +138,41 @@ def correct(
     announce("weights", n_seeds * len(x))
     log_estimates = evaluate(x, seeds)
     log_target = logsumexp(log_estimates, axis=1) - np.log(n_seeds)
-    check_overlap(log_target)
+    for part in np.split(log_target, [len(draws)]):
+        check_overlap(part)
     approximate = np.append(kept.log_density.ravel(), posterior.evaluate(points, rng))
     pooled = Pooled(kept.log_density.shape, log_target, approximate, q.log_density(x))
     return Correction(x, seeds, log_estimates, pooled, fit.log_density(x))
+
+
+def exact_posterior(
+    posterior: Posterior,
+    density: ExactDensity,
+    rng: np.random.Generator,
+    announce: Callable[[str, int], None],
+) -> Posterior:
+    """Draws that say where the exact posterior lies, and its density.
+
+    They are those of the approximate posterior, at most `MOST_DRAWS`, corrected; or as they are, if
+    too few effective ones would be left.
+    """
+    kept = posterior.thinned(MOST_DRAWS)
+    found = correct(posterior, kept, density.evaluate, density.n_noisy, rng, announce)
+    if found.pooled.effective_size(found.x) >= MIN_EFFECTIVE:
+        index, chosen = found.resampled(rng)
+    else:
+        index = np.arange(kept.log_density.size).reshape(kept.log_density.shape)
+        chosen = found.log_estimates[index].argmax(axis=-1)
+    log_density = found.log_estimates[index, chosen]
+    # Zeros become the smallest density that is positive: no quadratic is fitted to infinities.
+    least = log_density[np.isfinite(log_density)].min()
+    return replace(
+        kept,
+        draws=found.x[index],
+        log_density=np.maximum(log_density, least),
+        evaluate=density.evaluate_afresh,
+        is_noisy=density.n_noisy > 0,
+    )
 
 
 def _seeds_needed(draws: Array, evaluate: Evaluate, n_noisy: int, rng: np.random.Generator) -> int:

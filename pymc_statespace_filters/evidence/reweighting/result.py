@@ -3,17 +3,13 @@
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
-from ...importance import normalised, smoothed, systematic
 from ...pymc_model.density import ConstrainedValues
 from ..exact_density import ExactDensity
 from .correction import Correction
 
 POINTS = "weighted_posterior"  # the group of draws and defensive points with their weights
 COPIED = ("observed_data", "constant_data")
-
-Array = NDArray[np.float64]
 
 
 def reweighted_tree(
@@ -28,19 +24,24 @@ def reweighted_tree(
     ``draws`` is the posterior group of ``idata`` with the draws that have been weighted.
     """
     points = _points(draws, correction, density.model)
-    log_weights, _ = smoothed(correction.pooled.log_weights)
-    weights = normalised(log_weights)
-    index = _resampled(weights, correction.pooled.shape, rng)
-    chains, length = correction.pooled.shape
-    coords = {"chain": np.arange(chains), "draw": np.arange(length)}
-    posterior = _at(points, index).assign_coords(coords)
-    stats = _sample_stats(correction, density, index, rng).assign_coords(coords)
+    index, chosen = correction.resampled(rng)
+    coords = {"chain": np.arange(index.shape[0]), "draw": np.arange(index.shape[1])}
+    at = xr.DataArray(index, coords, dims=("chain", "draw"))
+    stats = {"lp": correction.log_estimates[index, chosen]}
+    seeds = np.moveaxis(correction.seeds[index, chosen], -1, 0)
+    stats |= {f"{name}_seed": one for name, one in zip(density.names, seeds, strict=False)}
     weighted = points.assign(
-        weight=("sample", weights),
+        weight=("sample", correction.weights),
         log_weight=("sample", correction.pooled.log_weights),
-        is_draw=("sample", np.arange(len(weights)) < chains * length),
+        is_draw=("sample", np.arange(len(correction.x)) < index.size),
     )
-    groups = {"posterior": posterior, "sample_stats": stats, POINTS: weighted}
+    groups = {
+        "posterior": points.isel(sample=at),
+        "sample_stats": at.to_dataset(name="point").assign(
+            {name: (("chain", "draw"), values) for name, values in stats.items()}
+        ),
+        POINTS: weighted,
+    }
     groups |= {name: idata[name].to_dataset() for name in COPIED if name in idata.children}
     return xr.DataTree.from_dict(groups)
 
@@ -60,43 +61,3 @@ def _points(draws: xr.Dataset, correction: Correction, model: pm.Model) -> xr.Da
     kept = {dim for dims, _ in found.values() for dim in dims}
     coords = {name: one for name, one in draws.coords.items() if set(one.dims) <= kept}
     return xr.Dataset(found, coords=coords)
-
-
-def _resampled(
-    weights: Array, shape: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Indices (chain, draw) of points, each as often as its weight says.
-
-    Copies of a point are neighbours, and draws keep their order, with the defensive points spread
-    evenly among them: the autocorrelation that ArviZ finds counts the copies as well as the chain's
-    own.
-    """
-    n = shape[0] * shape[1]
-    m = len(weights) - n
-    place = np.concatenate([np.arange(n), (np.arange(m) + 0.5) * n / m - 0.5])
-    order = np.argsort(place, kind="stable")
-    return order[systematic(weights[order], n, rng)].reshape(shape)
-
-
-def _at(points: xr.Dataset, index: NDArray[np.int64]) -> xr.Dataset:
-    return points.isel(sample=xr.DataArray(index, dims=("chain", "draw")))
-
-
-def _sample_stats(
-    correction: Correction,
-    density: ExactDensity,
-    index: NDArray[np.int64],
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """The log-density of every draw and the seeds behind it, as of a chain with the exact filter.
-
-    Of several estimates of a point one is chosen with the probability that is its share of their
-    sum: the point and its seed then have their joint posterior.
-    """
-    logs = correction.log_estimates[index]
-    chosen = (logs + rng.gumbel(size=logs.shape)).argmax(axis=-1)[..., None]
-    stats = {"lp": np.take_along_axis(logs, chosen, axis=-1)[..., 0]}
-    seeds = np.take_along_axis(correction.seeds[index], chosen[..., None], axis=-2)[..., 0, :]
-    for name, column in zip(density.names, np.moveaxis(seeds, -1, 0), strict=False):
-        stats[f"{name}_seed"] = column
-    return xr.Dataset({name: (("chain", "draw"), value) for name, value in stats.items()})

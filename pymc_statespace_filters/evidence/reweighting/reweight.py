@@ -25,7 +25,9 @@ from ..posterior import build_posterior
 from .correction import Correction, correct
 from .result import reweighted_tree
 
-MAX_SPREAD = 2.0  # nats
+# Nats, and the share of the draws below which their spread costs too much: it does not where the
+# approximate posterior is only too wide.
+MAX_SPREAD, LEAST_LEFT = 2.0, 0.2
 MAX_BEYOND = 0.05  # share of the posterior where there are no draws
 
 
@@ -81,13 +83,18 @@ def reweight(
         is the evidence; ``weight`` has them Pareto-smoothed and with the sum one, as ``az.extract``
         takes them.
 
-        Attributes: ``log_weight_sd``, the spread of the log-weights of the draws in nats;
-        ``pareto_k`` of all weights; ``effective_size``, the number of independent draws that know
-        the mean of every variable as well; ``n_seeds``, how many estimates of a point were
-        averaged; ``beyond_draws`` and its standard error ``beyond_draws_se``, the share of the
-        exact posterior where there are no draws; ``log_evidence`` of the exact model,
-        ``log_evidence_change``, the same minus that of the model with its own filter, and their
-        standard errors with the suffix ``_se``; ``filter`` and ``exact`` as of `sample_dram`.
+        Of the attributes,
+
+        * ``n_draws``, how many draws were weighted, and ``n_seeds``, how many estimates of each
+          were averaged;
+        * ``log_weight_sd``, the spread of the log-weights of the draws in nats; ``pareto_k`` of all
+          weights; ``effective_size``, the number of independent draws that know the mean of every
+          variable as well;
+        * ``beyond_draws`` and its standard error ``beyond_draws_se``, the share of the exact
+          posterior where there are no draws;
+        * ``log_evidence`` of the exact model, and ``log_evidence_change``, the same minus that of
+          the model with its own filter; standard errors with the suffix ``_se``;
+        * ``filter`` and ``exact``, as of `sample_dram`.
 
     Raises
     ------
@@ -103,9 +110,9 @@ def reweight(
     Warns
     -----
     EvidenceWarning
-        If the log-weights spread by more than 2 nats, if few weights decide (Pareto k or effective
-        size), or if more than a twentieth of the exact posterior lies where there are no draws.
-        The message says what helps.
+        If the log-weights spread by more than 2 nats and are worth less than a fifth of the draws,
+        if few weights decide (Pareto k or effective size), or if more than a twentieth of the exact
+        posterior lies where there are no draws. The message says what helps.
 
     Notes
     -----
@@ -190,7 +197,8 @@ def _attributes(found: Correction, exact: ExactDensity) -> dict[str, Any]:
     evidence, change = pooled.log_evidence(), pooled.log_evidence_change()
     return {
         "filter": json.dumps(dict.fromkeys(exact.names, short_form(exact.filter))),
-        "exact": 1,
+        "exact": int(exact.is_exact),
+        "n_draws": pooled.n_draws,
         "log_weight_sd": found.spread,
         "pareto_k": pareto_k(pooled.log_weights),
         "effective_size": pooled.effective_size(found.x),
@@ -211,16 +219,17 @@ def _problems(attrs: dict[str, Any], filter: Filter) -> Iterator[str]:
         f"sample the model with {name} instead, by psf.sample_dram with these draws as pilot= and "
         "a fast filter as screen="
     )
-    if attrs["log_weight_sd"] > MAX_SPREAD:
+    n_draws, n_effective = attrs["n_draws"], attrs["effective_size"]
+    if attrs["log_weight_sd"] > MAX_SPREAD and n_effective < LEAST_LEFT * n_draws:
         yield (
             f"the log-weights of the draws spread by {attrs['log_weight_sd']:.1f} nats, above "
             f"{MAX_SPREAD:g}: the filter of the draws is too far from {name}, or its estimates are "
             f"too noisy, for weights to make up for it. Give {name} more particles; if that does "
             f"not help, {instead}"
         )
-    elif attrs["effective_size"] < MIN_EFFECTIVE or not attrs["pareto_k"] <= largest_good_k(1000):
+    elif n_effective < MIN_EFFECTIVE or not attrs["pareto_k"] <= largest_good_k(n_draws):
         yield (
-            f"few weights decide the exact posterior: it has {attrs['effective_size']:.0f} "
+            f"few weights decide the exact posterior: it has {n_effective:.0f} "
             f"effective draws, and the Pareto k of the weights is {attrs['pareto_k']:.2f}. Weight "
             f"more draws; if that does not help, {instead}"
         )
