@@ -162,7 +162,7 @@ def exact_posterior(
         index, chosen = found.resampled(rng)
     else:
         index = np.arange(kept.log_density.size).reshape(kept.log_density.shape)
-        chosen = found.log_estimates[index].argmax(axis=-1)
+        chosen = np.zeros_like(index)
     log_density = found.log_estimates[index, chosen]
     # Zeros become the smallest density that is positive: no quadratic is fitted to infinities.
     least = log_density[np.isfinite(log_density)].min()
