@@ -2,8 +2,8 @@
 
 In front of every observation particles are resampled by w psi, the weight given the whole record;
 on the way to the next one their noise is drawn from N(a - K x, R R') instead of N(0, I); weights
-are divided by both. See `ensemble.guide` for psi and the gains, and `ensemble.defence` for the
-particles that stay unguided where the guide is in doubt.
+are divided by both. See `ensemble.guide` for psi and the gains, `ensemble.defence` for the
+particles that stay unguided where the guide is in doubt, and `ensemble.pilot` for how many do.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import njit_internal
-from ..compiler.native.plan import NORMALS
+from ..compiler.native.plan import NORMALS, Plan
 from ..compiler.numerics.normals import FILL_NORMALS
 from ..errors import ModelError
 from .bootstrap import update
 from .calls import OK, likelihood_entry
 from .ensemble.callbacks import ENDED, RESAMPLED, UPDATED, emit
-from .ensemble.defence import NOBODY, UNGUIDED, first_unguided, is_doubtful, unguided_at_start
+from .ensemble.defence import choose_unguided, least_share, place_of_unguided, share_at_start
 from .ensemble.guide import make_guide
 from .ensemble.guided_moves import (
     begin_interval,
@@ -36,11 +36,25 @@ from .ensemble.guided_predictions import copy_again, predict, start_copies
 from .ensemble.loop import N_LEADING, n_sums, noise_of_rank, observer_of, rank_of
 from .ensemble.noise import initial_rows, resampling_normals
 from .ensemble.particle_filter import ParticleFilter
+from .ensemble.pilot import judge
 from .ensemble.reductions import local_partition
 from .ensemble.resampling import resampler
 from .outcomes import NONE, is_missing
 from .plan import PLAN, read_system, settings_of
 from .protocol import System
+
+
+@njit_internal
+def _unguided_shares(plan, system, record, guide):
+    """The share (J + 1,) of unguided particles before every observation and after the last."""
+    J = record.steps.size
+    shares = np.zeros(J + 1)
+    if plan[PLAN.is_linear]:
+        return shares
+    judge(system, record, guide, update, shares)
+    for j in range(J):
+        shares[j] = max(shares[j], least_share(guide, j))
+    return shares
 
 
 @njit_internal
@@ -62,23 +76,24 @@ def _evaluate(plan, record, request, seed, to):
     health[0], health[1], health[2] = given[0], NONE, -1
     nothing, ancestors = np.empty(0), resampling.ancestors
     k = np.int64(0)
-    unguided = np.int64(0) if is_doubtful(guide, 0) else NOBODY
-    share = unguided_at_start(local.n_members)
-    start(system, guide, initial_rows(noise), unguided, particles, local)
+    shares = _unguided_shares(plan, system, record, guide)
+    choose_unguided(shares[0], 0.0, local.first, particles.unguided)
+    share = share_at_start(shares[0], local.n_members)
+    start(system, guide, initial_rows(noise), share, particles, local)
     copies = start_copies(system, noise, members, observer, local)
-    emit_forecast(observer, -1, k, unguided, share, particles, nothing, ancestors)
+    emit_forecast(observer, -1, k, share, particles, nothing, ancestors)
     predict(system, record, noise, -1, k, copies, observer, nothing, ancestors, local)
     for j in range(steps.size):
         while k < steps[j]:
             until = steps[j] if observer[0] == 0 else k + 1
-            move(system, guide, record, noise, k, until, unguided, particles, local)
+            move(system, guide, record, noise, k, until, share, particles, local)
             k = until
-            emit_forecast(observer, j, k, unguided, share, particles, nothing, ancestors)
+            emit_forecast(observer, j, k, share, particles, nothing, ancestors)
             predict(system, record, noise, j, k, copies, observer, nothing, ancestors, local)
         if is_missing(record.observed, j):
             to.terms[j] = 0.0
             continue
-        weigh_moves(particles, unguided, share, members.log_w)
+        weigh_moves(particles, share, members.log_w)
         begin_interval(particles)
         d = record.observed[j]
         found = update(system, j, k, record.t0 + k * dt, d, noise, members, local, ())
@@ -86,16 +101,14 @@ def _evaluate(plan, record, request, seed, to):
             health[0], health[1], health[2], to.n_effective[j] = 0.0, found.failure, j, 0.0
             break
         to.terms[j] = found.increment
-        log_total, to.n_effective[j] = look_ahead(guide, j, k, particles, local)
+        share = shares[j + 1]
+        log_total, to.n_effective[j] = look_ahead(guide, j, k, share, particles, local)
         health[0] = min(health[0], to.n_effective[j])
         emit(observer, UPDATED, j, k, members, d, ancestors)
-        doubtful, unguided, share = is_doubtful(guide, j + 1), NOBODY, UNGUIDED
-        if resampling.always or doubtful or to.n_effective[j] < resampling.threshold:
+        if resampling.always or share > 0.0 or to.n_effective[j] < resampling.threshold:
             z = resampling_normals(noise, j, k)
-            if doubtful:
-                unguided = first_unguided(z)
-            mixed = UNGUIDED if doubtful else 0.0
-            resample_ahead(guide, j, k, log_total, resampling, z, mixed, particles, local)
+            choose_unguided(share, place_of_unguided(z), local.first, particles.unguided)
+            resample_ahead(guide, j, k, log_total, resampling, z, share, particles, local)
             emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
         copy_again(members, copies, observer)
     if health[1] == NONE:
@@ -122,7 +135,7 @@ class GuidedPF(ParticleFilter):
     resample_below : float
         Resample after an observation if the effective number of particles given the whole record is
         below this fraction of N: 1 resamples at every observation, 0 only in front of an interval
-        over which the linear system may be wrong, where all settings do.
+        in which particles are unguided, where all settings do.
     resampling : {"systematic", "multinomial", "sorted"}
         Resampling scheme, see `BootstrapPF`.
 
@@ -140,12 +153,16 @@ class GuidedPF(ParticleFilter):
     Kalman smoother; the gains are the same for all particles. An observation density that
     is not Gaussian enters by its score and information. Where the linear system says little, such
     as in front of a jump over a barrier, weights are uneven but the estimate is right in the mean.
-    In intervals over which the linear system may be wrong one particle in ten moves unguided, so
-    that no weight of such an interval is above ten. Where two states explain the record equally
-    well, as with a sensor of ``abs(x)``, particles follow one of them: most estimates are then too
-    low, a few far too high. So they are where the transition jumps as the state moves
-    (``pt.switch``): with 100 particles 7 to 104 nats too low over 60 observations. Use
-    `BootstrapPF`.
+
+    In intervals over which the linear system may be wrong a share of the particles, a tenth to nine
+    tenths, moves unguided; no weight of such an interval is above the inverse of the share. The
+    share is larger where 128 unguided particles, which run along the record first, find paths that
+    explain it as well as the guide does and that guided particles would miss: the other sign behind
+    a sensor of ``abs(x)``, the other side of a threshold. They have noise of their own, which is
+    always the same, and nothing else of them enters the estimate. A system that is linear is spared
+    them. On records with two explanations the filter is then about as good as a `BootstrapPF` of as
+    many particles, but no better: what 128 unguided particles do not find, such as a narrow way
+    under a precise sensor, can still be missed.
 
     Terms of single observations are noisier than their sum, because particles are where the whole
     record wants them.
@@ -198,3 +215,9 @@ class GuidedPF(ParticleFilter):
         """Return the names of the system's functions that the entry calls."""
         guide = ("observation_information", "follow", "look_back", "start_back")
         return "initialise", "log_density", "propagate_guided", *guide
+
+    def plan(
+        self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
+    ) -> Plan:
+        """Return the plan of a function that reads the settings of this filter."""
+        return super().plan(system, run, functions, is_linear=int(system.is_linear), **others)

@@ -80,6 +80,7 @@ class PlanSlots(NamedTuple):
     root_of_process_noise: int = N_HEADER + 51
     root_of_observation_noise: int = N_HEADER + 52
     follows_origins: int = N_HEADER + 53  # of particles that no noise tells apart
+    is_linear: int = N_HEADER + 54  # of guided filters: one guide is right everywhere
 
 
 PLAN = PlanSlots()
@@ -265,10 +266,10 @@ def follow(system, first, last, t0, path, gains, steps, cov):
 
 
 @njit_internal
-def look_back(address, first, last, path, steps, gains, psi, misfit):
+def look_back(address, first, last, path, steps, gains, psi, sums):
     """Move psi back, and condition the noise on it, see `guide_loops`."""
     arguments = LookBackArguments(
-        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi, misfit=misfit
+        first=first, last=last, path=path, steps=steps, gains=gains, psi=psi, sums=sums
     )
     call_address(address, arguments)
 

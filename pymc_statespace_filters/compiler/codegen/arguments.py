@@ -22,7 +22,7 @@ FOLLOW_ARGUMENTS = {
 
 LOOK_BACK_ARGUMENTS = {
     "first": types.intp, "last": types.intp, "path": F64_PTR, "steps": F64_PTR, "gains": F64_PTR,
-    "psi": F64_PTR, "misfit": F64_PTR,
+    "psi": F64_PTR, "sums": F64_PTR,
 }  # fmt: skip
 """Of a guide that goes back."""
 

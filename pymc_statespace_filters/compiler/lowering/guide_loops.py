@@ -132,23 +132,25 @@ def _residual_cov(n: int, m: int, scale: float) -> Any:
 def look_back_loop(step_back: Any, n: int, m: int) -> Callable:
     """Move psi from step ``last`` back to ``first`` and condition the noise on the way.
 
-    Adds to ``misfit`` how much log psi may be wrong by what the linear equations leave out. If psi
-    is not finite, it is forgotten and the step stays unguided.
+    Adds two numbers to ``sums``: how much log psi may be wrong by what the linear equations leave
+    out, and the log of prior over guided density at the mode, q for the prior and z = 0 for the
+    guide. If psi is not finite, it is forgotten and the step stays unguided.
     """
     n_psi, n_gain = n + n * (n + 1) // 2, n_gains(n, m)
     n_step, n_row = step_size(n, m), 1 + n_gain
+    noise = n + n * n + n * m
     residual_cov = n_step - n * (n + 1) // 2
 
-    def look_back(first, last, path, steps, gains, psi, misfit):
+    def look_back(first, last, path, steps, gains, psi, sums):
         E, ahead = carray(path, ((last + 1) * n,)), carray(psi, (n_psi,))
         all_gains, all_steps = carray(gains, (last, n_row)), carray(steps, (last, n_step))
-        left_out = carray(misfit, (1,))
+        totals = carray(sums, (2,))
         for k in range(last - 1, first - 1, -1):
             place = 0
             for a in range(n):
                 for b in range(a + 1):
                     part = ahead[n + place] * all_steps[k, residual_cov + place]
-                    left_out[0] += 0.5 * part if a == b else part
+                    totals[0] += 0.5 * part if a == b else part
                     place += 1
             values = step_back(all_steps[k], E[k * n : (k + 2) * n], ahead)
             gain, finite = all_gains[k], True
@@ -166,6 +168,9 @@ def look_back_loop(step_back: Any, n: int, m: int) -> Callable:
                 for r in range(m):
                     gain[place] = 1.0
                     place += m - r
+            totals[1] += gain[0]
+            for r in range(m):
+                totals[1] -= 0.5 * all_steps[k, noise + r] ** 2
 
     return look_back
 

@@ -18,6 +18,9 @@ from .intrinsics import float_of
 INITIAL, PROCESS, OBSERVATION, RESAMPLING, STATES = (np.uint64(purpose) for purpose in range(5))
 """Purposes: the independent streams of a step."""
 
+PILOT = 8
+"""The first purpose of a filter's pilot; its others follow in the same order."""
+
 LOW_WORD = np.uint64(0xFFFFFFFF)
 _WORD_BITS = np.uint64(32)
 _ROUNDS = 7

@@ -35,6 +35,7 @@ from .information import mean_information, new_information, newton_update, updat
 
 _MOST_ITERATIONS = 8
 _SETTLED = 0.01  # square of the move of the path, over the variance of the state
+_FALLEN = 1.0  # nats of evidence, below the best iteration
 
 
 class Guide(NamedTuple):
@@ -44,50 +45,86 @@ class Guide(NamedTuple):
     (T, ..) is log det R of a step and what shifts its noise, ``start`` the same for the normals at
     step 0, of which there are n. ``psi`` (J, n + n (n + 1) / 2) is log psi at an observation, lam
     and the lower triangle of Lam, without the observation itself. ``cov`` (J, n (n + 1) / 2) is the
-    covariance around the path there. See `lowering.guidance`. ``misfit`` (J,) says by how much the
-    linear equations may be wrong in the interval that ends at an observation, or at the first one
-    after it that is not missing: the mean of delta' Lam delta / 2 over their residuals, in nats.
+    covariance around the path there. See `lowering.guidance`. A row of ``sums`` (J, 2) is of the
+    interval that ends at an observation, or at the first one after it that is not missing. The
+    first says by how much the linear equations may be wrong there: the mean of delta' Lam delta / 2
+    over their residuals, in nats. The second is the log of the factor of the evidence: the weight
+    of a particle that moves along the path. ``origin`` (n,) are the normals of the path's start.
     """
 
     path: np.ndarray
+    origin: np.ndarray
     steps: np.ndarray
     gains: np.ndarray
     start: np.ndarray
     psi: np.ndarray
     cov: np.ndarray
-    misfit: np.ndarray
+    sums: np.ndarray
 
 
 @njit_internal
 def make_guide(system, record):
     """Compute the guide of a record; one that changes nothing if the equations cannot be followed.
 
-    Where they cannot be followed along the iterated path, the first one is taken.
+    An iteration that diverges goes back to the guide of most evidence.
     """
     n, m, J = system.n, system.m, record.steps.size
     T, n_cov = record.steps[-1] if J else np.int64(0), n * (n + 1) // 2
     guide = Guide(
-        path=np.zeros((T + 1, n)), steps=np.zeros((T, n + n * n + n * m + m + n_cov)),
+        path=np.zeros((T + 1, n)), origin=np.zeros(n),
+        steps=np.zeros((T, n + n * n + n * m + m + n_cov)),
         gains=np.zeros((T, 1 + m + m * n + m * (m + 1) // 2)),
         start=np.zeros(1 + n + n * n + n_cov), psi=np.zeros((J, n + n_cov)),
-        cov=np.zeros((J, n_cov)), misfit=np.zeros(J),
+        cov=np.zeros((J, n_cov)), sums=np.zeros((J, 2)),
     )  # fmt: skip
-    for most_iterations in (_MOST_ITERATIONS, 0):
-        _filter(system, record, guide)
-        _look_back(system, record, guide)
-        for _ in range(most_iterations):
-            moved = _follow(system, record, guide)
-            _look_back(system, record, guide)
-            if moved < _SETTLED:
-                break
-        if np.isfinite(guide.path).all():
-            return guide
+    done, best = _iterate(system, record, guide, _MOST_ITERATIONS)
+    if 0 <= best < done:
+        _iterate(system, record, guide, best)
+    if best >= 0:
+        return guide
     guide.path[:] = 0.0
+    guide.sums[:] = 0.0
     guide.psi[:] = 0.0
     for k in range(T):
         leave_unguided(guide.gains[k], n, m)
     leave_unguided(guide.start, n, n)
     return guide
+
+
+@njit_internal
+def _iterate(system, record, guide, most):
+    """Iterate a guide; how often, and the iteration to go back to, -1 if no guide is finite.
+
+    It stays where it is if it has settled, or has lost little of the evidence. The path of the
+    first guide jumps at observations: its evidence is the filter's, and no interval has a factor.
+    """
+    guide.origin[:] = 0.0
+    evidence = largest = _filter(system, record, guide)
+    _look_back(system, record, guide)
+    best = np.int64(-1 if _evidence(record, guide) == -np.inf else 0)
+    guide.sums[:, 1] = -np.inf
+    for done in range(1, most + 1):
+        moved = _follow(system, record, guide)
+        _look_back(system, record, guide)
+        evidence = _evidence(record, guide)
+        if evidence > largest:
+            largest, best = evidence, np.int64(done)
+        if moved < _SETTLED and evidence > -np.inf:
+            return np.int64(done), np.int64(done)
+    return np.int64(most), np.int64(most) if evidence > largest - _FALLEN else best
+
+
+@njit_internal
+def _evidence(record, guide):
+    """Log-likelihood of the linear system, -inf if it is not finite."""
+    if not np.isfinite(guide.path).all():
+        return -np.inf
+    total, begins = 0.0, True
+    for j in range(record.steps.size):
+        if begins:
+            total += guide.sums[j, 1]
+        begins = not is_missing(record.observed, j)
+    return total if np.isfinite(total) else -np.inf
 
 
 @njit_internal
@@ -100,8 +137,8 @@ def _initial(system):
 
 @njit_internal
 def _filter(system, record, guide):
-    """Take as path the means of a Kalman filter with iterated updates."""
-    n = system.n
+    """Take as path the means of a Kalman filter with iterated updates; its evidence."""
+    n, evidence = system.n, 0.0
     mean, root = _initial(system)
     cov, update, here = np.empty(n * (n + 1) // 2), update_work(n), new_information(n)
     for k in range(guide.gains.shape[0]):
@@ -113,9 +150,10 @@ def _filter(system, record, guide):
         last = record.steps[j]
         follow(system, first, last, record.t0, guide.path, guide.gains, guide.steps, cov)
         if not is_missing(record.observed, j):
-            newton_update(system, record, j, guide.path[last], cov, update, here)
+            evidence += newton_update(system, record, j, guide.path[last], cov, update, here)
         copy_into(guide.cov[j], cov)
         first = last
+    return evidence if np.isfinite(evidence) else -np.inf
 
 
 @njit_internal
@@ -158,10 +196,11 @@ def _guided_start(system, guide, cov):
     n, place = system.n, 1 + system.n + system.n * system.n
     mean, root = _initial(system)
     spread = np.zeros((n, n))
+    copy_into(guide.origin, guide.start[1 : 1 + n])
     for a in range(n):
         guide.path[0, a] = mean[a]
         for b in range(n):
-            guide.path[0, a] += root[a, b] * guide.start[1 + b]
+            guide.path[0, a] += root[a, b] * guide.origin[b]
     for r in range(n):
         for c in range(r, n):
             for a in range(n):
@@ -180,32 +219,43 @@ def _look_back(system, record, guide):
         last, first = record.steps[j], record.steps[j - 1] if j > 0 else np.int64(0)
         copy_into(guide.psi[j], psi)
         if not is_missing(record.observed, j):
-            _add_observation(system, record, j, guide.path[last], guide.cov[j], here, psi)
-            guide.misfit[j] = 0.0
+            guide.sums[j, 0] = 0.0
+            guide.sums[j, 1] = _add_observation(
+                system, record, j, guide.path[last], guide.cov[j], here, psi
+            )
         else:
-            guide.misfit[j] = guide.misfit[j + 1] if j + 1 < guide.misfit.size else 0.0
-        misfit = guide.misfit[j:].ctypes.data
-        look_back(address, first, last, guide.path, guide.steps, guide.gains, psi, misfit)
+            for i in range(2):
+                guide.sums[j, i] = guide.sums[j + 1, i] if j + 1 < guide.sums.shape[0] else 0.0
+        sums = guide.sums[j].ctypes.data
+        look_back(address, first, last, guide.path, guide.steps, guide.gains, psi, sums)
     mean, root = _initial(system)
     start, path = np.zeros(n + 2 * n * n + n + psi.size - n), np.zeros((2, n))
-    copy_into(start[:n], mean)
+    for a in range(n):
+        start[a] = mean[a]
+        for b in range(n):
+            start[a] += root[a, b] * guide.origin[b]
+        start[2 * n * n + n + a] = guide.origin[a]
     copy_into(start[n + n * n : n + 2 * n * n], root.reshape(n * n))
     copy_into(path[1], guide.path[0])
     zero, one = np.int64(0), np.int64(1)
-    misfit = np.zeros(1)
-    look_back(system.start_back, zero, one, path, start, guide.start, psi, misfit.ctypes.data)
+    sums = np.zeros(2)
+    look_back(system.start_back, zero, one, path, start, guide.start, psi, sums.ctypes.data)
+    if record.steps.size:
+        guide.sums[0, 1] += sums[1]
 
 
 @njit_internal
 def _add_observation(system, record, j, x, cov, here, psi):
-    """Add the information of an observation to psi."""
-    if mean_information(system, record, j, x, cov, here):
-        place = n = x.size
-        for a in range(n):
-            psi[a] += here.score[a]
-            for b in range(a + 1):
-                psi[place] += here.matrix[a, b]
-                place += 1
+    """Add the information of an observation to psi; its log-density on the path."""
+    if not mean_information(system, record, j, x, cov, here):
+        return -np.inf
+    place = n = x.size
+    for a in range(n):
+        psi[a] += here.score[a]
+        for b in range(a + 1):
+            psi[place] += here.matrix[a, b]
+            place += 1
+    return here.row[0]
 
 
 @njit_internal

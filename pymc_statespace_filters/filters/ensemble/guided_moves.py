@@ -8,9 +8,10 @@ import numpy as np
 from ...compiler.native.jit import njit_internal
 from ..plan import initialise, propagate_guided
 from .callbacks import FORECAST, emit
-from .defence import NOBODY, STRIDE, mixture_weight, undo_guide
+from .defence import mixture_weight, undo_guide
 from .loop import Members, new_members
 from .noise import process_normals, process_rows
+from .reductions import FIRST_ROW, allgather_sums, sum_squares, total
 from .resampling import resample
 from .weights import normalise_weights
 
@@ -23,6 +24,7 @@ class GuidedParticles(NamedTuple):
     ``log_ratio`` (N,) follows the states in memory: the log density ratios of moves since they were
     last added to the weights. ``log_det`` (1,) is their common term. ``log_v`` and ``v`` (N,) are
     the weights times psi, ``start`` (n, width) the normals of the start, shifted by the guide.
+    ``unguided`` (N,) are the particles that the guide does not move, if there is a share of them.
     ``normals`` (m, width) is scratch.
     """
 
@@ -32,6 +34,7 @@ class GuidedParticles(NamedTuple):
     log_v: np.ndarray
     v: np.ndarray
     start: np.ndarray
+    unguided: np.ndarray
     normals: np.ndarray
 
 
@@ -44,21 +47,22 @@ def guided_particles(n, m, p, local):
     N = local.size
     return GuidedParticles(
         members=members, log_ratio=rows[n], log_det=np.zeros(1), log_v=np.empty(N), v=np.empty(N),
-        start=np.empty((n, local.width)), normals=np.empty((m, local.width)),
+        start=np.empty((n, local.width)), unguided=np.zeros(N, np.bool_),
+        normals=np.empty((m, local.width)),
     )  # fmt: skip
 
 
 @njit_internal
-def start(system, guide, given, unguided, particles, local):
+def start(system, guide, given, share, particles, local):
     """Draw the states at step 0 from normals (n, width), shifted by the guide.
 
     What it does to the weights counts as a move of the first interval.
     """
     n, N = system.n, local.size
     shifted, log_ratio = particles.start, particles.log_ratio
-    if unguided != NOBODY:
-        ours, normals = (unguided - local.first) % STRIDE, np.empty((n, local.width))
-        undo_guide(guide.start[1:], np.zeros((n, N)), given, ours, normals)
+    if share > 0.0:
+        normals = np.empty((n, local.width))
+        undo_guide(guide.start[1:], np.zeros((n, N)), given, particles.unguided, normals)
         given = normals
     place = 1 + n + n * n
     for r in range(n):
@@ -74,13 +78,13 @@ def start(system, guide, given, unguided, particles, local):
 
 
 @njit_internal
-def weigh_moves(particles, unguided, share, out):
+def weigh_moves(particles, share, out):
     """Add the density ratios of the moves to the weights, in ``out``.
 
-    ``share`` is the probability to be unguided, if there is a first ``unguided``.
+    ``share`` is the probability to be unguided.
     """
     log_w, log_ratio, log_det = particles.members.log_w, particles.log_ratio, particles.log_det[0]
-    if unguided == NOBODY:
+    if share == 0.0:
         for i in range(log_w.size):
             out[i] = log_w[i] + (log_ratio[i] + log_det)
     else:
@@ -97,9 +101,9 @@ def begin_interval(particles):
 
 
 @njit_internal
-def _log_psi(guide, j, k, X, out):
+def log_psi(guide, j, k, X, out):
     """Write log psi of every particle after observation j, without its constant."""
-    n, N = X.shape
+    n, N = guide.path.shape[1], out.size
     x, psi, place = guide.path[k], guide.psi[j], n
     for i in range(N):
         out[i] = 0.0
@@ -114,45 +118,51 @@ def _log_psi(guide, j, k, X, out):
 
 
 @njit_internal
-def look_ahead(guide, j, k, particles, local):
-    """Weigh the particles by psi; return the log of the sum of w psi and its effective number."""
-    members, log_v = particles.members, particles.log_v
-    _log_psi(guide, j, k, members.X, log_v)
+def look_ahead(guide, j, k, share, particles, local):
+    """Weigh the particles by psi; the log of the sum of w psi, and an effective number.
+
+    It is that of the probabilities of `resample_ahead`, of which a ``share`` is w alone.
+    """
+    members, log_v, v = particles.members, particles.log_v, particles.v
+    log_psi(guide, j, k, members.X, log_v)
     for i in range(log_v.size):
         log_v[i] = members.log_w[i] + log_v[i] if members.alive[i] else -np.inf
-    return normalise_weights(log_v, particles.v, local)
+    log_total, n_effective = normalise_weights(log_v, v, local)
+    if share > 0.0:
+        for i in range(v.size):
+            v[i] = (1.0 - share) * v[i] + share * members.w[i]
+        sum_squares(v, local, FIRST_ROW)
+        allgather_sums(local, FIRST_ROW + 1)
+        n_effective = 1.0 / total(local, FIRST_ROW)
+    return log_total, n_effective
 
 
 @njit_internal
 def resample_ahead(guide, j, k, log_total, resampling, z, share, particles, local):
     """Draw particles in proportion to w psi, whose sum is given, and divide their weights by it.
 
-    Of the probability a ``share``, which may be zero, is that of w alone.
+    Of the probability a ``share``, which may be zero, is that of w alone, as `look_ahead` left it.
     """
-    w, log_w = particles.members.w, particles.members.log_w
-    v, log_psi = particles.v, particles.log_v
-    if share > 0.0:
-        for i in range(v.size):
-            v[i] = (1.0 - share) * v[i] + share * w[i]
-    resample(resampling, z, v, particles.members.X, local)
-    _log_psi(guide, j, k, particles.members.X, log_psi)
+    log_w, log_v = particles.members.log_w, particles.log_v
+    resample(resampling, z, particles.v, particles.members.X, local)
+    log_psi(guide, j, k, particles.members.X, log_v)
     for i in range(log_w.size):
-        log_ratio = log_total - log_psi[i]
+        log_ratio = log_total - log_v[i]
         if share > 0.0:
             log_ratio = mixture_weight(log_ratio, share)
         log_w[i] = log_ratio - math.log(local.n_members)
 
 
 @njit_internal
-def move(system, guide, record, noise, first, last, unguided, particles, local):
-    """Move the particles from one step to another, every tenth from ``unguided`` on by itself."""
+def move(system, guide, record, noise, first, last, share, particles, local):
+    """Move the particles from one step to another, a share of them without the guide."""
     X, gains, log_det = particles.members.X, guide.gains, 0.0
     row = np.int64(gains.ctypes.data) + _NUMBER_BYTES * (first * gains.shape[1] + 1)
     for k in range(first, last):
         t, z = record.t0 + k * system.dt, process_normals(noise, k)
-        if unguided != NOBODY:
-            ours = (unguided - local.first) % STRIDE
-            undo_guide(gains[k, 1:], X, process_rows(noise, k), ours, particles.normals)
+        if share > 0.0:
+            normals = process_rows(noise, k)
+            undo_guide(gains[k, 1:], X, normals, particles.unguided, particles.normals)
             z = np.int64(particles.normals.ctypes.data)
         propagate_guided(system, k, t, z, local.width, X, row)
         row += _NUMBER_BYTES * gains.shape[1]
@@ -161,12 +171,12 @@ def move(system, guide, record, noise, first, last, unguided, particles, local):
 
 
 @njit_internal
-def emit_forecast(callback, j, k, unguided, share, particles, nothing, ancestors):
+def emit_forecast(callback, j, k, share, particles, nothing, ancestors):
     """Show the particles with the weights that their moves have left them."""
     if callback[0] == 0:
         return
     members, log_v = particles.members, particles.log_v
-    weigh_moves(particles, unguided, share, log_v)
+    weigh_moves(particles, share, log_v)
     shown = Members(
         X=members.X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_v, log_p=members.log_p,
         alive=members.alive,

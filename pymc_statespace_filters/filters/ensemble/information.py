@@ -63,7 +63,7 @@ def mean_information(system, record, j, x, cov, out):
     """As `information_at`, in the mean over a normal distribution around x.
 
     The mean over 2 n + 1 points is a better quadratic form than that at x where the log-density is
-    skewed. That of Gaussian noise is taken at x.
+    skewed. That of Gaussian noise is taken at x. The log-density is the quadratic form's at x.
     """
     if system.has_gaussian_observation or not _take_root(cov, out):
         return information_at(system, record, j, x, out)
@@ -81,6 +81,10 @@ def mean_information(system, record, j, x, cov, out):
             for i in range(out.total.size):
                 out.total[i] += 0.5 / scale * out.row[i]
     copy_into(out.row, out.total)
+    for a in range(n):
+        for b in range(n):
+            for c in range(n):
+                out.row[0] += 0.5 * out.matrix[a, b] * out.root[a, c] * out.root[b, c]
     return True
 
 
@@ -169,7 +173,7 @@ def newton_update(system, record, j, x, cov, work, here):
 
     The iteration is in s with x = mean + P s, so that P may be singular. A step that does not
     raise the density is halved. If the observation has no finite density at the mean, nothing is
-    updated.
+    updated. Returns the log of the observation's evidence by Laplace's approximation.
     """
     n, s, target, P = x.size, work.coordinates, work.target, work.cov
     place = 0
@@ -180,7 +184,7 @@ def newton_update(system, record, j, x, cov, work, here):
     copy_into(work.mean, x)
     s[:] = 0.0
     if not information_at(system, record, j, x, here):
-        return
+        return -np.inf
     cost = -here.row[0]
     for _ in range(_N_NEWTON):
         _fill_target(x, P, work, here)
@@ -194,12 +198,12 @@ def newton_update(system, record, j, x, cov, work, here):
             step *= 0.5
         if not cost <= last + 1e-10 * abs(last):
             copy_into(work.trial, s)
-            _cost_at(system, record, j, x, P, work, here)
+            cost = _cost_at(system, record, j, x, P, work, here)
             break
         copy_into(s, work.trial)
         if last - cost < _CONVERGED:
             break
-    _update_cov(cov, work, here)
+    return -cost - 0.5 * _update_cov(cov, work, here)
 
 
 @njit_internal
@@ -231,7 +235,7 @@ def _cost_at(system, record, j, x, P, work, here):
 
 @njit_internal
 def _update_cov(cov, work, here):
-    """Set the lower triangle ``cov`` to that of (I + P Lam)^-1 P."""
+    """Set the lower triangle ``cov`` to that of (I + P Lam)^-1 P; log det (I + P Lam)."""
     P, new = work.cov, work.new_cov
     n, place = P.shape[0], 0
     for a in range(n):
@@ -241,10 +245,13 @@ def _update_cov(cov, work, here):
             for c in range(n):
                 work.matrix[a, b] += P[a, c] * here.matrix[c, b]
     _solve(work.matrix, new)
+    log_det = 0.0
     for a in range(n):
+        log_det += math.log(abs(work.matrix[a, a]))
         for b in range(a + 1):
             cov[place] = 0.5 * (new[a, b] + new[b, a])
             place += 1
+    return log_det
 
 
 @njit_internal

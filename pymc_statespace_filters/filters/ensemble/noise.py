@@ -49,10 +49,12 @@ class Noise(NamedTuple):
     """Source of one evaluation's normals: ``stored``, or ``seed`` where nothing is stored.
 
     Rows are those of our own members, which begin with ``first_block``. What is stored is of all
-    members: there, all must be our own.
+    members: there, all must be our own. Purposes count from ``first_purpose`` on, so that streams
+    of one seed that begin elsewhere are independent.
     """
 
     seed: int
+    first_purpose: int
     stored: np.ndarray
     buffer: np.ndarray
     sizes: NoiseSizes
@@ -61,11 +63,11 @@ class Noise(NamedTuple):
 
 
 @njit_internal
-def noise_of(seed, stored, sizes, n_steps, first_block):
+def noise_of(seed, stored, sizes, n_steps, first_block, first_purpose=0):
     """The source of normals for a record whose last observation is at step ``n_steps``."""
     rows = max(sizes.initial, sizes.process, sizes.observation)
     buffer = np.empty(0 if stored.size else max(rows * sizes.width, sizes.resampling))
-    return Noise(seed, stored, buffer, sizes, n_steps, first_block)
+    return Noise(seed, first_purpose, stored, buffer, sizes, n_steps, first_block)
 
 
 @inline_always
@@ -81,6 +83,7 @@ def _normals(noise, purpose, step, place, n_rows, width):
     if noise.stored.size > 0:
         return np.int64(noise.stored.ctypes.data) + _NUMBER_BYTES * place
     address = np.int64(noise.buffer.ctypes.data)
+    purpose += noise.first_purpose
     _fill(noise.seed, purpose, step, noise.first_block, address, n_rows, width)
     return address
 
@@ -134,7 +137,8 @@ def resampling_normals(noise, j, k):
         place = n_stored(sizes, noise.n_steps, j) + sizes.observation * sizes.width
         return noise.stored[place : place + sizes.resampling]
     one, first, address = np.int64(1), np.int64(0), noise.buffer.ctypes.data
-    _fill(noise.seed, np.int64(RESAMPLING), k, first, address, one, sizes.resampling)
+    purpose = np.int64(RESAMPLING) + noise.first_purpose
+    _fill(noise.seed, purpose, k, first, address, one, sizes.resampling)
     return noise.buffer[: sizes.resampling]
 
 
