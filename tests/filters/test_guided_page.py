@@ -99,7 +99,7 @@ def test_equations_that_explode_leave_the_particles_unguided():
     exact = log_likelihood(psf.BootstrapPF(200_000), record, wild).sum()
     assert np.log(np.exp(terms).mean()) == pytest.approx(exact, abs=1.0)
     lost = wild | {"initial_mean": 1e3, "initial_var": 0.5}
-    with pytest.warns(psf.FilterWarning, match="infinite or NaN"):
+    with pytest.warns(psf.FilterWarning, match="overflowed or became NaN"):
         assert log_likelihood(psf.GuidedPF(50), record, lost).tolist() == [-np.inf, -np.inf]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
-from pymc_statespace_filters.ops.noise import LogLikelihoodOfNoise, StoredNoise
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 from scipy.special import logsumexp
 from scipy.stats import norm
 
