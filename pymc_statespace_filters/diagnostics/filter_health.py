@@ -19,13 +19,15 @@ from ..states.record import Array, RecordAtDraws, States, TermHealthAtDraws, sim
 from ..states.variable import VariableAtDraws, select_variables
 from ..system.accumulators import inputs_of_user
 from ..system.checks import check_random_seed
-from .calibration import coverage_of, uniformity_of, whiteness_of
-from .innovations import (
+from .calibration import (
     autocorrelation_of,
+    coverage_of,
     input_correlation_of,
     inputs_before,
     lags_of,
     standardised,
+    uniformity_of,
+    whiteness_of,
 )
 from .predictions import Calibration, calibration_by_rank, calibration_of, laws_of
 

@@ -9,7 +9,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
 
-from ..diagnostics.innovations import standardised
+from ..diagnostics.calibration import standardised
 from ..errors import ModelError
 from .canvas import (
     add_legend,

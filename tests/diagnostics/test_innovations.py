@@ -8,7 +8,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.diagnostics.innovations import (
+from pymc_statespace_filters.diagnostics.calibration import (
     autocorrelation_of,
     input_correlation_of,
     inputs_before,

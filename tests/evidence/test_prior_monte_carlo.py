@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pymc as pm
 import pytest
-from pymc_statespace_filters.evidence.posterior.draws import build_posterior
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.estimators.smc_moves import sample_prior_particles
+from pymc_statespace_filters.evidence.posterior import build_posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.evidence.targets import Regression, TwoModes, bounded, half_normally_distributed
 
