@@ -7,13 +7,13 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
-from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 from scipy.special import logsumexp
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.philox import INITIAL, PILOT, STATES
 from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.ops.states import FilterRun
 from tests.systems import log_likelihoods
 
