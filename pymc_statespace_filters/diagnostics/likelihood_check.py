@@ -53,7 +53,8 @@ def check_filter(
     n_draws : int
         Number of points, at least 8.
     random_seed : None, int or numpy.random.Generator
-        Seed of the points and of the noise. The numbers follow from it unless time was up.
+        Seed of the points and of the noise. The numbers follow from it, unless time was up or an
+        exact filter takes so long that time decides about it.
 
     Returns
     -------

@@ -60,6 +60,9 @@ def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> li
     if reference is None:
         return [_without_reference(draws, name)]
     bias = _difference(draws.checked, reference)
+    if bias.n < 2:
+        verdict = f"undecided whether {name} is off: it failed, or its reference did, at the draws"
+        return [Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, verdict)]
     moved = _shifts(found, points, names, reference)
     visible = abs(bias.mean) + bias.margin
     what = (

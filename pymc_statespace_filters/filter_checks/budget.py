@@ -6,21 +6,29 @@ import time
 _PLAIN_NS, _GUIDED_NS = 5.0, 25.0
 # The number of particles of the plain filter, at least and at most.
 _LEAST, _MOST = 200, 20_000
-# Of the time, for the estimates of plain particles, and at most for those of guided ones; the rest
-# is for compilation and the filter that is checked.
-_SHARE, _GUIDED_SHARE = 0.3, 0.5
+# Of the time, for the estimates of plain particles, and at most for those of other witnesses; the
+# rest is for the filter that is checked.
+_SHARE, _SHARE_OF_OTHERS = 0.3, 0.5
 
 
 class Budget:
-    """CPU seconds of this process, counted from now on."""
+    """CPU seconds of this process, counted from `begin`: compilation comes before."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._began = seconds, time.process_time()
+
+    def begin(self) -> None:
+        """Count the time from now on."""
+        self._began = time.process_time()
 
     @property
     def is_spent(self) -> bool:
         """Whether the time is up."""
         return time.process_time() - self._began > self._seconds
+
+    def is_enough_for(self, seconds: float) -> bool:
+        """Whether a witness may take so many seconds in all."""
+        return seconds <= _SHARE_OF_OTHERS * self._seconds
 
     def n_particles(self, n_estimates: int, n_steps: int, n_states: int) -> int:
         """Particles with which so many estimates of a record fit the budget, of one digit."""
@@ -31,5 +39,5 @@ class Budget:
 
     def affords(self, n_particles: int, n_estimates: int, n_steps: int, n_states: int) -> bool:
         """Whether there is time for so many estimates with guided particles."""
-        work = n_particles * n_estimates * n_steps * (1 + n_states) * _GUIDED_NS * 1e-9
-        return work <= _GUIDED_SHARE * self._seconds
+        work = n_particles * n_estimates * n_steps * (1 + n_states) * _GUIDED_NS
+        return self.is_enough_for(work * 1e-9)

@@ -5,6 +5,7 @@ a guided filter assumes; both are unbiased, and only where both agree is a diffe
 trusted that does not follow from unbiasedness alone.
 """
 
+import time
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,8 +24,11 @@ from .budget import Budget
 
 Array = NDArray[np.float64]
 
+_ONE_SEED = np.zeros((1, 1), dtype=np.int64)
 N_SEEDS, N_GUIDED_SEEDS = 6, 8  # of noisy filters at each point; guided ones take less time
-_AT_ONCE = 2  # points, after which the time is looked at
+_AT_ONCE, _FEWEST = 2, 4  # points, after which the time is looked at, and at least
+# CPU seconds of an evaluation with which an exact filter suits a chain, and is the only witness.
+_QUICK = 0.01
 _MORE = 4  # times as many particles has the second guided witness
 # Standard deviation of the logs of estimates, in nats, above which their mean is not trusted.
 USABLE = 2.0
@@ -104,7 +108,10 @@ def compare(
     variable: VariableAtPoints, filter: Filter, budget: Budget, rng: np.random.Generator
 ) -> Comparison:
     """Evaluate the filter and its witnesses, point by point until the budget is spent."""
-    filters = [filter, *(_exact(variable, filter) or _unbiased(variable, filter, budget))]
+    filters = [filter, *_witnesses(variable, filter, budget)]
+    for one in filters:
+        _seconds(variable, one)  # compiled before the time counts
+    budget.begin()
     found: list[list[Array]] = [[] for _ in filters]
     scored = not is_unbiased(filter)
     for first in range(0, len(variable), _AT_ONCE):
@@ -112,7 +119,7 @@ def compare(
         for one, logs in zip(filters, found, strict=True):
             seeds = rng.integers(2**62, size=(len(points), _n_seeds(one)))
             logs.append(variable.at(points, one, seeds, scored=scored))
-        if budget.is_spent:
+        if budget.is_spent and points.stop >= _FEWEST:
             break
     estimates = [Estimates(f, np.concatenate(logs)) for f, logs in zip(filters, found, strict=True)]
     checked, *others = estimates
@@ -130,13 +137,23 @@ def _n_seeds(filter: Filter) -> int:
     return N_GUIDED_SEEDS if isinstance(filter, GuidedPF) else N_SEEDS
 
 
-def _exact(variable: VariableAtPoints, filter: Filter) -> list[Filter]:
-    """A filter without noise or bias, if there is one and it works at the first point."""
-    found = exact_filter(compile_system(variable.system), without=filter)
-    if found is None:
-        return []
-    works = np.isfinite(variable.at([0], found, np.zeros((1, 1), dtype=np.int64)))
-    return [found] if works.all() else []
+def _witnesses(variable: VariableAtPoints, filter: Filter, budget: Budget) -> list[Filter]:
+    """A filter without noise or bias that is quick; else unbiased ones, and it if there is time."""
+    exact = exact_filter(compile_system(variable.system), without=filter)
+    if exact is None or not np.isfinite(variable.at([0], exact, _ONE_SEED)).all():
+        return _unbiased(variable, filter, budget)
+    seconds = _seconds(variable, exact)
+    if seconds <= _QUICK:
+        return [exact]
+    found = _unbiased(variable, filter, budget)
+    return [exact, *found] if budget.is_enough_for(seconds * len(variable)) else found
+
+
+def _seconds(variable: VariableAtPoints, filter: Filter) -> float:
+    """CPU seconds of an evaluation at the first point."""
+    began = time.process_time()
+    variable.at([0], filter, _ONE_SEED)
+    return time.process_time() - began
 
 
 def is_unbiased(filter: Filter) -> bool:

@@ -42,9 +42,9 @@ def nats(value: float) -> str:
 
 def cure(found: Comparison) -> str:
     """Name a filter that works at these points; a sentence."""
-    if found.exact is not None:
-        return f"Use {short_form(found.exact.filter)}, which computes this likelihood."
     plain = found.plain if found.plain is not None and found.plain.is_usable else None
+    if found.exact is not None and plain is None:
+        return f"Use {short_form(found.exact.filter)}, which computes this likelihood."
     for one in found.guided:
         agrees = plain is None or abs(np.median(one.mean - plain.mean)) <= TOLERATED
         if not isinstance(found.checked.filter, GuidedPF) and one.is_usable and agrees:

@@ -42,10 +42,9 @@ def low_at(found: Comparison, where: str) -> Finding:
     visible = _visible(found)
     check = f"low {where}"
     if proved > TOLERATED:
-        verdict = (
-            f"{name} is too low {where}, by {nats(proved)} nats at least, although its estimates "
-            f"scatter by only {nats(checked.scatter)} nats over seeds. {cure(found)}"
-        )
+        scatter = f"its estimates scatter by {nats(checked.scatter)} nats over seeds"
+        but = f", although {scatter}" if checked.is_usable else f"; {scatter}"
+        verdict = f"{name} is too low {where}, by {nats(proved)} nats at least{but}. {cure(found)}"
         return Finding(check, statistic, se, ALPHA, visible, OFF, verdict)
     if visible <= VISIBLE:
         verdict = (

@@ -44,7 +44,7 @@ def draws_of(name="phi", seed=1):
 
 
 def exact_filters_left_out(monkeypatch):
-    monkeypatch.setattr(estimates, "_exact", lambda variable, filter: [])
+    monkeypatch.setattr(estimates, "exact_filter", lambda system, *, without: None)
 
 
 def test_exact_and_plain_filters_are_not_compared(monkeypatch):
@@ -140,6 +140,26 @@ def test_nothing_is_decided_where_plain_particles_collapse(monkeypatch):
         )
         assert table["outcome"][0] == "undecided"
         assert "BootstrapPF(1000)" in table["verdict"][0]
+
+
+def test_an_exact_filter_that_is_slow_is_neither_awaited_nor_recommended(monkeypatch):
+    """Nor does the time of compilation count: the first run decides as the second does."""
+    monkeypatch.setattr(estimates, "_seconds", lambda variable, filter: 1.0)
+    model = model_of(SQUARE, psf.EKF(), record_of(SQUARE, phi=0.8))
+    table = psf.check_filter(draws_of(), model, random_seed=1)
+    assert table["outcome"][0] == "off"
+    assert "GridFilter" not in table["verdict"][0]
+    monkeypatch.setattr(estimates, "_seconds", lambda variable, filter: 0.1)
+    table = psf.check_filter(draws_of(), model, random_seed=1)
+    assert "below GridFilter() at draws" in table["verdict"][0]
+    assert "Use GridFilter" not in table["verdict"][0]
+
+
+def test_some_points_are_evaluated_however_little_time_there_is(monkeypatch):
+    monkeypatch.setattr(estimates.Budget, "is_spent", True)
+    model = model_of(SQUARE, psf.EKF(), record_of(SQUARE, phi=0.8))
+    verdict = psf.check_filter(draws_of(), model, random_seed=1)["verdict"][0]
+    assert "nan" not in verdict
 
 
 @pytest.mark.parametrize(
