@@ -19,6 +19,8 @@ from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
 
 _SAMPLERS = ("pymc.step_methods.", "pymc.smc.")
+# Those with gradients, of which there are none: an error says so.
+_WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
 _GRAPHS = ("pymc.logprob.", "pymc.model.", "pytensor.", "functools", f"{__package__}.")
 _INSIDE = (
     str(Path(__file__).parents[1]),
@@ -29,7 +31,8 @@ _INSIDE = (
 
 def warn_of_held_seed(filter: Filter) -> None:
     """Warn if a sampler of PyMC asks for the log-density of a filter with noise."""
-    if filter.noisy and _asks_from().startswith(_SAMPLERS):
+    who = _asks_from() if filter.noisy else ""
+    if who.startswith(_SAMPLERS) and not who.startswith(_WITH_GRADIENT):
         warnings.warn(
             f"{short_form(filter)}: this sampler evaluates the estimated likelihood with one noise "
             "seed throughout. If it moves parameters of the likelihood, its draws are those of the "

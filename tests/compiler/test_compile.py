@@ -130,12 +130,12 @@ def test_an_exception_of_a_vector_function_is_nan(on_arrays):
     assert function(np.array([2.0]))[0][0] == 0.5
 
 
-def test_a_failing_parameter_check_is_minus_infinity(on_arrays):
+def test_a_failing_parameter_check_is_not_finite(on_arrays):
     theta = vector("theta", 1)
     graph = Graph({"theta": theta}, [pt.atleast_1d(pm.logp(pm.Poisson.dist(mu=theta[0]), 3))])
     for _ in range(2):
         logp = vector_function("f", "c", graph).function
-        assert logp(np.array([-1.0]))[0] == -np.inf
+        assert not np.isfinite(logp(np.array([-1.0]))[0])
         assert logp(np.array([2.0]))[0] == pytest.approx(stats.poisson(2.0).logpmf(3), rel=1e-12)
         on_arrays()
 

@@ -87,7 +87,7 @@ def test_machine_code_of_pytensor_has_them_too():
 
 def test_an_invalid_parameter_is_a_failure_that_is_counted():
     count = system(lambda x, q, b: [x[0], law.poisson_quantile(q[0], b), x[2]])
-    with pytest.warns(FilterWarning, match="infinite or NaN"):
+    with pytest.warns(FilterWarning, match="overflowed or became NaN"):
         found = psf.log_likelihood(
             count, psf.BootstrapPF(32), {"b": -1.0}, np.zeros((2, 1)), steps=[1, 2]
         )

@@ -187,7 +187,9 @@ def test_the_seed_is_noise_of_the_filter_alone():
 
 
 def test_one_warning_counts_what_failed_in_a_batch():
-    with pytest.warns(psf.FilterWarning, match="-inf in 2 of 3 evaluations: 2 times") as caught:
+    with pytest.warns(
+        psf.FilterWarning, match="-inf in 2 of 3 evaluations, first in row 2"
+    ) as caught:
         terms = psf.log_likelihood(
             walk(), psf.EKF(), {"a": [0.9, 1e200, 1e250], "s": 0.3}, RECORD, steps=STEPS
         )

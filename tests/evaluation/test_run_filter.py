@@ -142,7 +142,7 @@ def test_where_no_particle_is_finite_the_state_is_unknown():
     # Steps of a steep cubic drift explode, long before the observation that fails.
     steep = {"alpha": 0.0, "beta": -1000.0, "sigma": 10.0}
     steep |= {"noise_var": 0.1, "initial_mean": 1.0, "initial_var": 0.1}
-    with pytest.warns(psf.FilterWarning, match="infinite or NaN"):
+    with pytest.warns(psf.FilterWarning, match="overflowed or became NaN"):
         found = psf.run_filter(
             DOUBLE_WELL_SYSTEM, psf.BootstrapPF(50), steep, [1.0, 1.0], steps=[0, 30], at="steps"
         )

@@ -13,6 +13,7 @@ from scipy import stats
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.filters.outcomes import Failure
 from tests.references.linear_states import linear_states
 
 DT, T0 = 0.2, 1.5
@@ -247,14 +248,14 @@ def test_states_end_where_an_observation_fails(states, moment):
         assert np.isnan(values[lost]).all()
         if moment == "predicted" or moment == "filtered":
             np.testing.assert_array_equal(values[~lost], unbroken[~lost])
-    np.testing.assert_array_equal(found.health, [np.inf, 2.0, 4.0])
+    np.testing.assert_array_equal(found.health, [np.inf, Failure.ZERO_DENSITY, 4.0])
 
 
 @MOMENTS
 def test_impossible_parameters_have_no_states(states, moment):
     found = states(moment, REGULAR | {"spread": -0.1})
     assert all(np.isnan(values).all() for values in found[:4])
-    np.testing.assert_array_equal(found.health, [np.inf, 2.0, 0.0])
+    np.testing.assert_array_equal(found.health, [np.inf, Failure.INITIAL_COV, 0.0])
 
 
 @pytest.mark.slow

@@ -140,7 +140,7 @@ def test_a_record_is_sent_once():
         return led(ranks, evaluate)
 
     kinds, _ = on_ranks(2, call)
-    assert kinds == ["record", "evaluate"] * 2 + ["evaluate"] * 10 + ["end"]
+    assert kinds == ["record", "evaluate"] * 2 + ["evaluate"] * 8 + ["end"]
 
 
 def density_of(model, group=None):

@@ -139,7 +139,8 @@ def closing_warning(
     collapse. PyMC logs the warning in the main process, in whichever process the chain ran.
     """
     message = (
-        _collapse_problem(statistics, remedy)
+        _screen_problem(statistics)
+        or _collapse_problem(statistics, remedy)
         or _mobility_problem(statistics, is_noisy=bool(remedy))
         or _growth_problem(growth)
         or _failure_problem(statistics)
@@ -169,6 +170,17 @@ def sampler_warning(message: str) -> SamplerWarning:
     return SamplerWarning(WarningType.BAD_ACCEPTANCE, message, "warn")
 
 
+def _screen_problem(statistics: PhaseStatistics) -> str | None:
+    failed, screened = statistics.screen_failed, statistics.screened
+    if failed <= TOLERATED_FAILURES * screened:
+        return None
+    return (
+        f"The screen failed in {failed} of {screened} proposals after warm-up, which were rejected "
+        "without evaluating the target: if the posterior extends into that region it is truncated "
+        "there. Use another screen, or none; a lower screen_power does not help."
+    )
+
+
 def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | None:
     n, screened = statistics.iterations, statistics.screened
     if statistics.accept_rate < MIN_ACCEPT_RATE:
@@ -178,13 +190,6 @@ def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | N
         return (
             f"DRAM accepted {statistics.moved:.0f} of {n} proposals after warm-up: the chain "
             f"hardly moves. One of these may help: {', '.join(remedies)}."
-        )
-    if statistics.screen_failed > TOLERATED_FAILURES * screened:
-        return (
-            f"The screen failed in {statistics.screen_failed} of {screened} proposals after "
-            "warm-up, which were rejected without evaluating the target: if the posterior extends "
-            "into that region it is truncated there. Use another screen, or none; a lower "
-            "screen_power does not help."
         )
     if statistics.longest_dwell > max(LEAST_DWELL, LONG_DWELL * n):
         begin = "Its"
