@@ -27,6 +27,7 @@ from ..system.parameters import element_names
 type Arguments = tuple[Any, ...]
 
 _MOST_LISTED = 8  # observations, or records
+_NEGLIGIBLE = 0.01  # nats
 _N_SEEDS = 5  # at which a collapsed estimate is repeated, to say how noisy it is
 
 
@@ -51,24 +52,26 @@ def warn_about(
         failure, here = Failure.of(code), health[:, 1] == code
         first = int(np.argmax(here))
         share = f" in {here.sum()} of {len(health)} evaluations" if len(health) > 1 else ""
-        place = _place(system, failure, health[first, 2], arguments_of(first), bool(share))
+        arguments = arguments_of(first)
+        place = _place(system, failure, health[first, 2], arguments, bool(share))
         of_records = _named(labels, of_each, here)
         sentences = (
             f"{short_form(filter)} gave -inf{share}{of_records}{place}: {failure.message}",
-            *_cures(system, filter, failure),
+            *_cures(system, filter, failure, arguments),
         )
         warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, stacklevel=stacklevel)
     smallest = np.where(failed, np.inf, health[:, 0])
     collapsed = smallest < COLLAPSED
-    if collapsed.any():
-        worst = int(np.argmin(smallest))
+    worst = int(np.argmin(smallest))
+    extent = _extent(system, filter, arguments_of(worst)) if collapsed.any() else None
+    if extent is not None:
         sentences = (
             f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
             f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations"
             f"{_named(labels, of_each, collapsed)} (smallest effective number "
             f"{smallest[worst]:.3g})",
             *_about_copies(system, filter),
-            _extent(system, filter, arguments_of(worst)),
+            extent,
             collapse_remedy(compile_system(system), filter),
         )
         warnings.warn(". ".join(sentences), FilterWarning, stacklevel=stacklevel)
@@ -98,8 +101,13 @@ def _place(
     return first + ",".join(parts) if parts else ""
 
 
-def _cures(system: StateSpaceModel, filter: Any, failure: Failure) -> list[str]:
-    """What to do, for this system where that depends on it."""
+def _cures(
+    system: StateSpaceModel, filter: Any, failure: Failure, arguments: Arguments
+) -> list[str]:
+    """What to do, for this system where that depends on it.
+
+    Another filter is no cure of what lies in the equations or their parameters.
+    """
     compiled = compile_system(system)
     if failure == Failure.STATE_NOT_FINITE and not system.has_gaussian_steps:
         return [
@@ -107,10 +115,15 @@ def _cures(system: StateSpaceModel, filter: Any, failure: Failure) -> list[str]:
             "number is drawn as NaN"
         ]
     cures = [failure.cure] if failure.cure else []
-    at_particles = failure in (Failure.ZERO_DENSITY, Failure.OBSERVATION_UNDEFINED)
-    if at_particles and filter.noisy and not compiled.is_deterministic:
-        cures.append(elsewhere(compiled, filter).removesuffix("."))
+    if failure == Failure.ZERO_DENSITY and filter.noisy and not compiled.is_deterministic:
+        exact = exact_filter(compiled, without=filter)
+        if exact is None or np.isfinite(_terms(system, exact, arguments)).all():
+            cures.append(elsewhere(compiled, filter).removesuffix("."))
     return cures
+
+
+def _terms(system: StateSpaceModel, filter: Any, arguments: Arguments) -> np.ndarray:
+    return np.asarray(evaluator(LogLikelihood(system, filter))(*arguments)[0])
 
 
 def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> str:
@@ -130,27 +143,39 @@ def warn_of_choice(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3)
             warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
 
 
-def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str:
-    """Say which terms few particles decided, and how far off or how noisy their sum is."""
+def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str | None:
+    """Say which terms few particles decided, and how far off or how noisy their sum is.
+
+    None if they decided no term, or the sum is right for every seed, as that of a guided filter
+    of a linear system.
+    """
     if not isinstance(filter, HealthFilter):
         return "The log-likelihood may be far too low, by a different amount for every seed"
     terms, n_effective, _ = evaluator(TermHealth(system, filter))(*arguments)
     few = np.flatnonzero(n_effective < COLLAPSED)
+    if few.size == 0:
+        return None
     listed = ", ".join(map(str, few[:_MOST_LISTED])) + ", .." * (few.size > _MOST_LISTED)
     where = f"In the worst of them these are {few.size} of {terms.size} terms, j = {listed}"
     exact = exact_filter(compile_system(system), without=filter)
     if exact is not None:
-        missing = evaluator(LogLikelihood(system, exact))(*arguments)[0] - terms
+        missing = _terms(system, exact, arguments) - terms
+        if abs(missing.sum()) < _NEGLIGIBLE:
+            estimates = _at_other_seeds(system, filter, arguments, terms.sum())
+            if estimates.size == _N_SEEDS and np.ptp(estimates) < _NEGLIGIBLE:
+                return None
         if np.isfinite(missing).all():
             return (
                 f"{where}, together {_below(missing[few].sum())} those of {short_form(exact)}; the "
                 f"log-likelihood is {_below(missing.sum())}, by a different amount for every seed"
             )
     estimates = _at_other_seeds(system, filter, arguments, terms.sum())
-    n_failed = _N_SEEDS - estimates.size
+    n_failed, spread = _N_SEEDS - estimates.size, float(np.ptp(estimates))
+    if spread < _NEGLIGIBLE and not n_failed:
+        return where
     failed = f" and was -inf at {n_failed} of them" if n_failed else ""
     return (
-        f"{where}; at {_N_SEEDS} seeds the log-likelihood ranged over {np.ptp(estimates):.1f} nats"
+        f"{where}; at {_N_SEEDS} seeds the log-likelihood ranged over {_nats(spread)}"
         f"{failed}, and it is too low more often than not"
     )
 
@@ -160,10 +185,16 @@ def _at_other_seeds(
 ) -> np.ndarray:
     """The finite estimates of the log-likelihood at a seed, ``first``, and at some others."""
     *record, seed = arguments
-    evaluate = evaluator(LogLikelihood(system, filter))
-    others = [evaluate(*record, int(seed) ^ other)[0].sum() for other in range(1, _N_SEEDS)]
+    seeds = [int(seed) ^ other for other in range(1, _N_SEEDS)]
+    others = [_terms(system, filter, (*record, each)).sum() for each in seeds]
     return np.array([value for value in (first, *others) if np.isfinite(value)])
 
 
 def _below(missing: float) -> str:
-    return f"{abs(missing):.1f} nats {'below' if missing > 0 else 'above'}"
+    return f"{_nats(abs(missing))} {'below' if missing > 0 else 'above'}"
+
+
+def _nats(size: float) -> str:
+    if size < 0.1:
+        return "less than 0.1 nats"
+    return f"{size:.1f} nats" if size < 1000.0 else f"{size:.0f} nats"

@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
-from ..filters.outcomes import Failure
+from ..filters.outcomes import Failure, why_zero
 from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.filter_estimates import failures_at
@@ -95,12 +95,7 @@ class Posterior:
     def why_zero(self, x: Array) -> str:
         """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
         x = x[:N_EXPLAINED]
-        found = [] if self.failures is None else self.failures(x).most_common(1)
-        if not found:
-            return "narrow the priors to plausible values"
-        (failure, count), *_ = found
-        cure = f". {failure.cure}" if failure.cure else ""
-        return f"in {count} of {len(x)} evaluations {failure.message}{cure}"
+        return why_zero(Counter() if self.failures is None else self.failures(x), len(x))
 
     def halves(self) -> tuple["Posterior", "Posterior"]:
         """Split every chain into its first and second half."""

@@ -1,5 +1,7 @@
 """Outcomes of an evaluation: why a filter failed, too few particles, and rows that are missing."""
 
+from collections import Counter
+
 import numpy as np
 
 from ..compiler.native.jit import inline_always
@@ -51,7 +53,7 @@ class Failure(OutcomeCode):
         "beside the spread of the state",
         "A larger tolerance, such as GridFilter(tolerance=1e-3), needs fewer",
     )
-    OUT_OF_MEMORY = 6, "there was not enough memory for the members"
+    OUT_OF_MEMORY = 6, "there was not enough memory for the members", "Use fewer members"
     TOO_FAR = (
         7,
         "the observation lies where the density of the state is below 1e-265, which this filter "
@@ -75,6 +77,11 @@ class Failure(OutcomeCode):
         """Whether it belongs to a row of the record, not to parameters or the machine."""
         return self not in _WITHOUT_ROW
 
+    @property
+    def is_far(self) -> bool:
+        """Whether the data lie far from the states, not in the equations or their parameters."""
+        return self in (Failure.ZERO_DENSITY, Failure.TOO_FAR)
+
 
 _WITHOUT_ROW = (
     Failure.INITIAL_COV, Failure.PROCESS_NOISE, Failure.OBSERVATION_NOISE, Failure.OUT_OF_MEMORY
@@ -85,6 +92,19 @@ _WITHOUT_ROW = (
     NO_PROCESS_NOISE, GRID_TOO_LARGE, OUT_OF_MEMORY, TOO_FAR, INITIAL_COV, PROCESS_NOISE,
     OBSERVATION_NOISE, OBSERVATION_UNDEFINED,
 ) = map(int, Failure)  # fmt: skip
+
+
+def why_zero(failures: Counter[Failure], n_points: int) -> str:
+    """Why the likelihood is zero at points of the prior, counted by reason, and what to do."""
+    narrow = "narrow the priors to plausible values"
+    if not failures:
+        return narrow
+    (failure, count), *_ = failures.most_common(1)
+    cures = [failure.cure] if failure.cure else []
+    if failure.is_far or not cures:
+        cures.append(narrow.capitalize())
+    reason = f"in {count} of {n_points} evaluations {failure.message}"
+    return ". ".join([reason, *cures])
 
 
 @inline_always

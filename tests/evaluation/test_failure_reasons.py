@@ -148,7 +148,7 @@ def test_a_record_of_a_panel_is_named():
         )  # fmt: skip
 
 
-def test_particles_led_to_the_wrong_side_are_told_of_free_ones():
+def test_another_filter_is_no_cure_of_an_observation_that_is_not_defined():
     """x ~ N(-3, 1) gives a count only if it is positive: quadrature has -17.3."""
     counts = system(
         transition=lambda x: [x[0]], process_noise=None, initial_mean=[-3.0], initial_cov=[[1.0]],
@@ -156,10 +156,26 @@ def test_particles_led_to_the_wrong_side_are_told_of_free_ones():
         observation_dist=lambda x: [pm.Poisson.dist(x[0])],
     )  # fmt: skip
     (text,), _ = failures(counts, psf.GuidedPF(100), {})
-    assert "Use BootstrapPF(1000)" in text
+    assert text.endswith(
+        "Write the observation so that it is defined at every state, for example "
+        "with pt.softplus(x[0]), which is positive and does not overflow."
+    )
     texts, terms = failures(counts, psf.BootstrapPF(20_000), {})
     assert not texts
     assert np.isfinite(terms).all()
+
+
+def test_a_filter_is_recommended_where_it_has_a_likelihood():
+    """No particle is where a count is possible; and no filter has a density of one at 1e200."""
+    counts = system(
+        initial_mean=[-4.0], initial_cov=[[0.5]], observation=None, observation_noise=None,
+        observation_dist=lambda x: [pm.Poisson.dist(pt.maximum(x[0], 0.0))],
+    )  # fmt: skip
+    (text,), _ = failures(counts, psf.BootstrapPF(20), {"a": 0.9})
+    assert Failure.ZERO_DENSITY.message in text
+    assert text.endswith("Use GridFilter(), which computes this likelihood without particles.")
+    (text,), _ = failures(system(), psf.BootstrapPF(20), {"a": 0.9}, [1.0, 1e200, 1.0])
+    assert text.endswith(f"{Failure.ZERO_DENSITY.cure}.")
 
 
 def test_every_failure_of_a_filter_has_a_sentence():

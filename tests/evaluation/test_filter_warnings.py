@@ -76,8 +76,39 @@ def test_the_spread_over_seeds_is_that_of_the_system_at_hand():
     with pytest.warns(psf.FilterWarning):
         at_seeds = psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=seeds)
     spread = np.ptp(at_seeds.sum(axis=1))
-    assert f"at 5 seeds the log-likelihood ranged over {spread:.1f} nats" in str(caught[0].message)
+    assert f"at 5 seeds the log-likelihood ranged over {spread:.0f} nats" in str(caught[0].message)
     assert str(caught[0].message).startswith("BootstrapPF(64): fewer than 3")
+
+
+LINEAR = psf.StateSpaceModel(
+    transition=lambda x, q: [0.9 * x[0] + q[0]],
+    process_noise=[[0.3]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.1]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+
+
+@pytest.mark.parametrize("observed", [[0.2, 1.0, np.nan], [np.nan] * 3])
+def test_two_particles_that_are_right_are_not_warned_of(observed):
+    """The sum of guided ones is exact for a linear system, whatever their number."""
+    arguments = (LINEAR, psf.GuidedPF(2), {}, observed)
+    terms = psf.log_likelihood(*arguments, steps=[1, 2, 3], seed=[1, 2])
+    exact = psf.log_likelihood(LINEAR, psf.EKF(), {}, observed, steps=[1, 2, 3])
+    assert terms.sum(axis=1) == pytest.approx([exact.sum()] * 2, abs=1e-12)
+
+
+def test_two_particles_that_saw_no_data_are_not_warned_of():
+    psf.log_likelihood(BENT, psf.GuidedPF(2), {}, [np.nan] * 3, steps=[1, 2, 3], seed=1)
+
+
+@pytest.mark.parametrize(
+    ("observed", "nats"), [(2.0, r"\d+\.\d nats below"), (500.0, r"\d{4,} nats below")]
+)
+def test_large_differences_have_no_decimals(observed, nats):
+    with pytest.warns(psf.FilterWarning, match=f"the log-likelihood is {nats}, by a different"):
+        psf.log_likelihood(LINEAR, psf.BootstrapPF(2), {}, [observed], steps=[1], seed=1)
 
 
 @pytest.mark.parametrize("smallest", [COLLAPSED, np.inf])

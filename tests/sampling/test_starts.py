@@ -1,5 +1,7 @@
 """`find_starts`: points of the posterior, in all its modes, whatever the prior."""
 
+from collections import Counter
+
 import arviz as az
 import numpy as np
 import pymc as pm
@@ -10,6 +12,7 @@ from scipy.stats import kstest, norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.outcomes import Failure, why_zero
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.systems import autoregression, simulated
@@ -122,6 +125,62 @@ def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():
         pm.Poisson("n", 3)
     with pytest.raises(ModelError, match="discrete"):
         psf.find_starts(discrete)
+
+
+SYSTEM = {
+    "transition": lambda x, q: [0.9 * x[0] + q[0]], "process_noise": [[0.3]],
+    "observation": lambda x: [x[0]], "observation_noise": [[0.1]],
+    "initial_mean": [2.0], "initial_cov": [[1.0]],
+}  # fmt: skip
+COUNTS = SYSTEM | {
+    "observation": None, "observation_noise": None,
+    "observation_dist": lambda x, v: [pm.Poisson.dist(v + 0.0 * x[0])],
+}  # fmt: skip
+GROWING = {"transition": lambda x, q, v: [1e30 * v * x[0] ** 5 + q[0]]}
+
+
+@pytest.mark.parametrize(
+    ("settings", "filter", "failure"),
+    [
+        (SYSTEM | {"process_noise": lambda v: [[v]]}, psf.EKF(), Failure.PROCESS_NOISE),
+        (SYSTEM | {"initial_cov": lambda v: [[v]]}, psf.BootstrapPF(5), Failure.INITIAL_COV),
+        (SYSTEM | {"observation_noise": lambda v: [[v]]}, psf.UKF(), Failure.OBSERVATION_NOISE),
+        (COUNTS, psf.IPLF(), Failure.OBSERVATION_UNDEFINED),
+        (SYSTEM | GROWING, psf.EKF(), Failure.STATE_NOT_FINITE),
+    ],
+    ids=lambda one: one.name if isinstance(one, Failure) else None,
+)
+def test_the_reason_of_a_likelihood_that_is_zero_at_all_draws(settings, filter, failure):
+    with pm.Model() as model:
+        pm.Normal("v", -1.0, 0.1)
+        system = psf.StateSpaceModel(**settings)
+        psf.StateSpace("d", system, filter, steps=[4, 5, 6], observed=np.ones(3))
+    with pytest.raises(ModelError) as caught:
+        psf.find_starts(model, progressbar=False)
+    assert str(caught.value) == (
+        "the likelihood is zero at all of 2000 draws of the prior: in 200 of 200 evaluations "
+        f"{failure.message}. {failure.cure}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("failures", "text"),
+    [
+        ({}, "narrow the priors to plausible values"),
+        (
+            {Failure.ZERO_DENSITY: 3, Failure.TOO_FAR: 1},
+            f"in 3 of 9 evaluations {Failure.ZERO_DENSITY.message}. {Failure.ZERO_DENSITY.cure}. "
+            "Narrow the priors to plausible values",
+        ),
+        (
+            {Failure.NOT_A_NUMBER: 9},
+            "in 9 of 9 evaluations the log-density is NaN or plus infinity. Narrow the priors to "
+            "plausible values",
+        ),
+    ],
+)
+def test_data_far_from_the_states_may_be_due_to_the_priors(failures, text):
+    assert why_zero(Counter(failures), 9) == text
 
 
 @pytest.fixture(scope="module")

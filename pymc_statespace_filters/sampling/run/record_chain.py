@@ -149,11 +149,13 @@ class RecordChain(ChainArrays):
             return
         label = self._target.labels[int(np.argmin(is_found))]
         reasons = [code for code in failures if code]
-        because = f" ({Failure.of(reasons[-1]).message})" if reasons else ""
+        failure = Failure.of(reasons[-1]) if reasons else Failure.NONE
+        because = f" ({failure.message})" if reasons else ""
+        cure = f". {failure.cure}" if failure.cure else ""
         tried = f", nor at {n_tried - 1} draws from the prior" if n_tried > 1 else ""
         raise ModelError(
             f"the log-density of record {label!r} is not finite at the start{because}{tried}: give "
-            "a start of finite log-density by initvals"
+            f"a start of finite log-density by initvals{cure}"
         )
 
     def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:

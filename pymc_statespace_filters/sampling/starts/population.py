@@ -18,10 +18,12 @@ from pymc.model import Model
 
 from ...compiler.native.rows import Rows
 from ...errors import ModelError
+from ...filters.outcomes import why_zero
 from ...progress import row_progress
 from ...pymc_model.prior import can_sample
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ..kernel.state import draw_seeds
+from ..target.initial_points import N_DRAWS
 from ..target.settings import DRAMSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
@@ -102,10 +104,7 @@ def find_population(
             drawn = _prior_population(target, _from_prior(full), n_points)
             found = _annealed(drawn, n_points, rng, fewest=1)
         if found is None:
-            raise ModelError(
-                f"the likelihood is zero at all of {len(drawn[0].x)} draws of the prior: narrow "
-                "the priors to plausible values"
-            )
+            raise ModelError(_nowhere(target, rows, drawn[0].x, rng))
         log_density = found.log_first + found.log_ratio
         modes = find_modes(found.x, lambda x: full(x)[1], rng)
     return Points(found.x, log_density, modes)
@@ -128,6 +127,16 @@ def _led_by_ekf(
         drawn = _prior_population(target, _from_prior(cheap), N_POINTS)
         found = _annealed(drawn, N_POINTS, rng)
     return None if found is None else (found.x, cheap)
+
+
+def _nowhere(target: Target, rows: Rows, x: Array, rng: np.random.Generator) -> str:
+    """Say that no draw of the prior has a positive likelihood, why, and what to do."""
+    explained = x[:N_DRAWS]
+    failures = target.density.failures(rows(explained, *_seeds(target, len(explained), rng).T))
+    return (
+        f"the likelihood is zero at all of {len(x)} draws of the prior: "
+        f"{why_zero(failures, len(explained))}"
+    )
 
 
 def _population(x: Array, log_densities: Densities) -> tuple[Population, Densities]:
@@ -177,13 +186,18 @@ def _densities(rows: Rows, target: Target, rng: np.random.Generator) -> Densitie
     """Log-densities of prior and posterior; an estimate gets new noise, unless it is fixed."""
 
     def evaluate(x: Array) -> tuple[Array, Array]:
-        seeds = draw_seeds(rng, (len(x), len(target.seed_names)))
-        if not target.settings.refresh_noise:
-            seeds = np.broadcast_to(target.fixed_seeds, seeds.shape)
-        posterior, prior = rows(x, *seeds.T)[:2]
+        posterior, prior = rows(x, *_seeds(target, len(x), rng).T)[:2]
         return _number(prior), _number(posterior)
 
     return evaluate
+
+
+def _seeds(target: Target, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Seeds of the noise of n evaluations, (n, noisy)."""
+    seeds = draw_seeds(rng, (n, len(target.seed_names)))
+    if not target.settings.refresh_noise:
+        seeds = np.broadcast_to(target.fixed_seeds, seeds.shape)
+    return seeds
 
 
 def _from_prior(densities: Densities) -> Densities:

@@ -5,6 +5,7 @@ noise of estimated likelihoods are further arguments. The same call returns the 
 filters, so that the reason of a failure costs no second evaluation.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from pytensor.tensor.variable import TensorVariable
 from ...compiler.native.pytensor_function import NativeFunction
 from ...compiler.native.rows import Rows
 from ...errors import ModelError
-from ...filters.outcomes import RAISED
+from ...filters.outcomes import NOT_A_NUMBER, RAISED, Failure
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.density import compile_density, compile_raveled
@@ -141,6 +142,14 @@ class LogDensity:
         """
         native, n_varying = self._native or self.prepare(), 1 + self._n_seeds
         return Rows(native, n_varying, in_turn=self._leader is not None)
+
+    def failures(self, results: Sequence[np.ndarray]) -> Counter[Failure]:
+        """How many of the results of `at_rows` are of failed evaluations, for each reason."""
+        log_density, healths = results[0], results[2 : 2 + self._n_healths]
+        codes = np.where(log_density < np.inf, 0, NOT_A_NUMBER)
+        for health in healths[::-1]:  # the first filter that failed is the reason
+            codes = np.where(health[:, 1] != 0.0, health[:, 1], codes)
+        return Counter(Failure.of(code) for code in codes[codes != 0])
 
     def bind(self) -> "BoundLogDensity":
         """Make the log-density callable from one thread, with separate arrays."""
