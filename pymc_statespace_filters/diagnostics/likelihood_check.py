@@ -9,6 +9,7 @@ import xarray as xr
 
 from ..filter_checks.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
+from ..pymc_model.inspection import given_model
 from ..system.checks import check_count, check_random_seed
 
 _LEAST_POINTS = 8
@@ -140,7 +141,7 @@ def check_filter(
     >>> "GridFilter" in table["verdict"][0]
     True
     """
-    model = pm.modelcontext(model)
+    model = given_model(model)
     if filter is not None:
         check_is_filter(filter)
     table = check_model(

@@ -5,6 +5,7 @@ import pymc as pm
 import xarray as xr
 
 from ..errors import ModelError
+from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
 from ..states.groups import add_group, row_coords
@@ -94,7 +95,7 @@ def compute_log_likelihood(
     >>> dict(terms.sizes)
     {'chain': 2, 'draw': 100, 'd_time': 3}
     """
-    model = pm.modelcontext(model)
+    model = given_model(model)
     draws = select_draws(idata, None)
     found = xr.merge(
         [

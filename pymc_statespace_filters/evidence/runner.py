@@ -16,7 +16,7 @@ from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.inspection import exactness
+from ..pymc_model.inspection import exactness, given_model
 from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
 from .checks import check_convergence, check_discretisation
@@ -55,10 +55,8 @@ def run_estimators(
         chains that disagree, once for each unreliable estimate, and once for each estimator that
         cannot treat the model while another can.
     """
-    if not isinstance(model, pm.Model | None):
-        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
+    model = given_model(model)
     posterior_group(idata)  # fails early, before anything is compiled
-    model = pm.modelcontext(model)
     exact = None if filter is None else ExactDensity(model, filter)
     density = ModelDensity(model, moved=noise_was_moved(idata))
     posterior, noise = build_posterior(idata, density)

@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 from ..errors import EvidenceWarning
 from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse_of_chains, pareto_k
 from ..pymc_model.density import RowFunction, check_free_variables
+from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import MIN_DRAWS, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
 from ..system.checks import check_count, check_random_seed
@@ -118,7 +119,7 @@ def step_error(
     >>> bool(abs(table["log_evidence_change"].item()) < 0.05)
     True
     """
-    model = pm.modelcontext(model)
+    model = given_model(model)
     check_free_variables(model)
     check_count("halvings", halvings, 1)
     check_count("n_draws", n_draws, MIN_DRAWS)

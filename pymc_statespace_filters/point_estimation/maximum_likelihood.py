@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 import pymc as pm
 from numpy.typing import NDArray
-from pymc.model import Model, modelcontext
+from pymc.model import Model
 
 from ..errors import ModelError
 from ..pymc_model.density import ConstrainedValues
+from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors
 from ..sampling.starts.annealing import N_SWEEPS, Population
 from ..sampling.starts.population import population_of
@@ -122,9 +123,7 @@ def maximum_likelihood(
     parameter
     a          0.578093        0.108064
     """
-    if not isinstance(model, Model | None):
-        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
-    model = modelcontext(model)
+    model = given_model(model)
     if not (model.observed_RVs or model.potentials):
         raise ModelError("model must have an observed variable or a Potential, got neither")
     rng = check_random_seed(random_seed)

@@ -21,6 +21,13 @@ from ..system.panel_records import RECORD
 from .random_variable import PanelRV, StateSpaceRV
 
 
+def given_model(model: pm.Model | None) -> pm.Model:
+    """The model, or that of the ``with`` block; a `ModelError` if it is something else."""
+    if not isinstance(model, pm.Model | None):
+        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
+    return pm.modelcontext(model)
+
+
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:
     """The Apply node of every StateSpace variable, by name; its last five inputs are parameters."""
     return {

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-from pymc.model import Model, modelcontext
+from pymc.model import Model
 from xarray import DataTree
 
 from ..errors import ModelError
+from ..pymc_model.inspection import given_model
 from ..system.checks import check_flag
 from .checkpoint.checkpoint import folder_name
 from .run.driver import sample_models
@@ -189,9 +190,7 @@ def sample_dram(
     >>> idata["posterior"]["mu"].shape
     (2, 500)
     """
-    model = modelcontext(model)
-    if not isinstance(model, Model):
-        raise ModelError(f"model must be a pymc.Model, got {model!r}")
+    model = given_model(model)
     request = sampling_request(
         draws,
         tune,

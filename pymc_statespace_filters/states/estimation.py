@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
 from ..system.steps import check_at, rows_at
@@ -169,7 +170,7 @@ def _add_states(
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> xr.DataTree:
-    model = pm.modelcontext(model)
+    model = given_model(model)
     check_at(at)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import FilterWarning, ModelError
 from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
+from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_flag, check_random_seed
 from ..system.record import check_observed
@@ -123,7 +124,7 @@ def free_run(
     (Frozen({'chain': 2, 'draw': 200, 'd_time': 2, 'observable': 1}),
      Frozen({'interval': 2, 'observable': 1}))
     """
-    model = pm.modelcontext(model)
+    model = given_model(model)
     with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)

@@ -4,6 +4,7 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytest
+import xarray as xr
 from pytensor.graph.traversal import ancestors
 
 import pymc_statespace_filters as psf
@@ -132,3 +133,25 @@ def test_noisy_filters_and_their_sizes():
     assert resized(FEW, 99) == psf.BootstrapPF(99, resample_below=0.7)
     assert resized(psf.EnKF(5, likelihood="gaussian"), 99) == psf.EnKF(99, likelihood="gaussian")
     assert resized(psf.PFEnKF(5), 99) == psf.PFEnKF(99)
+
+
+@pytest.mark.parametrize(
+    ("function", "settings"),
+    [
+        (psf.check_filter, {}),
+        (psf.compute_log_likelihood, {}),
+        (psf.estimate_evidence, {}),
+        (psf.filter_diagnostics, {}),
+        (psf.filtered_states, {}),
+        (psf.forecast, {"steps": [9]}),
+        (psf.free_run, {}),
+        (psf.leave_future_out, {"min_observations": 2}),
+        (psf.reweight, {"filter": FEW}),
+        (psf.smoothed_states, {}),
+        (psf.step_error, {}),
+    ],
+    ids=lambda one: getattr(one, "__name__", None),
+)
+def test_draws_and_model_in_the_wrong_order(function, settings):
+    with pytest.raises(ModelError, match=r"model must be a pymc.Model, got DataTree"):
+        function(pm.Model(), xr.DataTree(), **settings)

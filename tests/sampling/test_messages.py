@@ -116,7 +116,7 @@ TABLE = [
     (run_chains, {"initvals": {"mu": "x"}}, r"'mu' must be numbers, .* got 'x'"),
     (run_chains, {"initvals": {"sigma": -1.0}}, r"not finite at the start, \[0\.0, nan\]"),
     (run_chains, {"stages": 0}, r"stages must be .* got 0"),
-    (run_chains, {"model": 3}, r"model must be a pymc.Model, got 3"),
+    (run_chains, {"model": 3}, r"model must be a pymc.Model, got int"),
     (run_chains, {"checkpoint": 3}, r"checkpoint must be the path of a folder, got 3"),
     (run_chains, {"checkpoint": ""}, r"checkpoint must be the path of a folder, got ''"),
     # chains that stop at an effective size

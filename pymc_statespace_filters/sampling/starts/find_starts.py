@@ -1,11 +1,12 @@
 """``find_starts``: initial values of chains that lie in the posterior."""
 
 import numpy as np
-from pymc.model import Model, modelcontext
+from pymc.model import Model
 from pymc.stats.convergence import log_warnings
 
 from ...errors import ModelError
 from ...pymc_model.density import ConstrainedValues
+from ...pymc_model.inspection import given_model
 from ...system.checks import check_count, check_flag, check_random_seed
 from .modes import modes_message, modes_warning
 from .population import N_POINTS, population_of
@@ -76,7 +77,7 @@ def find_starts(
     >>> [bool(1.0 < start["mu"] < 1.4) for start in starts]
     [True, True, True, True]
     """
-    model = modelcontext(model)
+    model = given_model(model)
     check_count("chains", chains, 1)
     check_flag("progressbar", progressbar)
     if chains > N_POINTS:
