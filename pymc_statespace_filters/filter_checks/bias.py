@@ -78,6 +78,9 @@ def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> li
             f"{what}, by which the log-evidence is off, and this varies by {nats(bias.spread)} "
             f"between draws{moves}. {cure(draws)}"
         )
+    elif any(one.outcome == UNDECIDED for one in moved):
+        outcome = UNDECIDED
+        verdict = f"undecided whether {name} is off: {what}{moves}, which is too uncertain to tell"
     elif visible <= VISIBLE:
         outcome, verdict = FINE, f"no sign that {name} is off: {what}{moves}"
     else:

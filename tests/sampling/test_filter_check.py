@@ -4,12 +4,10 @@ import json
 import logging
 
 import numpy as np
-import pandas as pd
 import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.output import filter_check
 from tests.systems import autoregression
 
 N = 30
@@ -55,22 +53,6 @@ def test_a_filter_that_is_right_has_a_sentence_in_the_report(caplog):
     assert outcome_of(idata) == "no sign"
     (said,) = [one for one in caplog.records if "no sign that EKF() is off" in one.message]
     assert said.levelno == logging.DEBUG
-
-
-def test_what_is_undecided_is_said_without_a_progress_bar(caplog, monkeypatch):
-    table = check_model_of_undecided()
-    monkeypatch.setattr(filter_check, "check_model", lambda *args, **settings: table)
-    with caplog.at_level(logging.INFO, "pymc.stats.convergence"):
-        idata = psf.sample_dram(model=model_of(0.02), progressbar=False, **SETTINGS)
-    assert outcome_of(idata) == "undecided"
-    (said,) = [one for one in caplog.records if "undecided whether" in one.message]
-    assert said.levelno == logging.INFO
-
-
-def check_model_of_undecided():
-    verdict = "undecided whether EKF() is off"
-    row = {"variable": "d", "filter": "EKF()", "outcome": "undecided", "verdict": verdict}
-    return pd.DataFrame([row])
 
 
 def test_several_models_are_named():

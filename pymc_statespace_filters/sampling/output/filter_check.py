@@ -12,7 +12,7 @@ from xarray import DataTree
 
 from ...errors import FilterWarning, StateSpaceFiltersError
 from ...filter_checks.checks import check_model, outcomes_of, store
-from ...filter_checks.finding import EXACT, FINE, OFF, UNDECIDED
+from ...filter_checks.finding import OFF
 from ...pymc_model.inspection import observes_state_space
 from ...pymc_model.posterior_draws import MIN_DRAWS
 
@@ -26,17 +26,14 @@ _PACKAGE = str(Path(__file__).parents[2])
 
 
 class FilterCheck(NamedTuple):
-    """Sentences about filters: for the report, about what is undecided, and about what is off."""
+    """Sentences about filters that are not off, for the report, and about those that are."""
 
     said: tuple[str, ...] = ()
-    undecided: tuple[str, ...] = ()
     warned: tuple[str, ...] = ()
 
     def messages(self, level: str) -> list[SamplerWarning]:
-        """The sentences of the report, of this level; what is undecided is always said."""
-        of_levels = [(text, level) for text in self.said]
-        of_levels += [(text, "info") for text in self.undecided]
-        return [SamplerWarning(WarningType.CONVERGENCE, *one) for one in of_levels]
+        """The sentences of the report."""
+        return [SamplerWarning(WarningType.CONVERGENCE, text, level) for text in self.said]
 
 
 def warn_of_filters(texts: Sequence[str]) -> None:
@@ -65,10 +62,11 @@ def check_filters(
             rng=rng,
         )
     except StateSpaceFiltersError as error:
-        return FilterCheck(undecided=(f"The filter was not checked: {error}",))
+        return FilterCheck((f"The filter was not checked: {error}",))
     outcomes = outcomes_of(table)
     store(tree, outcomes)
-    texts: dict[str, list[str]] = {EXACT: [], FINE: [], UNDECIDED: [], OFF: []}
-    for name, one in outcomes.items():
-        texts[one["outcome"]].append(f"{name}: {one['verdict']}")
-    return FilterCheck((*texts[EXACT], *texts[FINE]), tuple(texts[UNDECIDED]), tuple(texts[OFF]))
+    said = [(one["outcome"] == OFF, f"{name}: {one['verdict']}") for name, one in outcomes.items()]
+    return FilterCheck(
+        tuple(text for is_off, text in said if not is_off),
+        tuple(text for is_off, text in said if is_off),
+    )
