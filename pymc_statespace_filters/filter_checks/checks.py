@@ -95,10 +95,7 @@ def check_model(
 def _plain_row(filter: Filter) -> Finding:
     name = short_form(filter)
     if isinstance(filter, BootstrapPF):
-        verdict = (
-            f"{name} is unbiased and has no guide; how much its estimates scatter, "
-            "suggest_particles measures"
-        )
+        verdict = f"{name} is unbiased; suggest_particles measures how much its estimates scatter"
     else:
         verdict = f"{name} is exact for this system"
     return Finding("exact", 0.0, 0.0, np.nan, 0.0, EXACT, verdict)

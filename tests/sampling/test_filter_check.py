@@ -55,6 +55,15 @@ def test_a_filter_that_is_right_has_a_sentence_in_the_report(caplog):
     assert said.levelno == logging.DEBUG
 
 
+def test_nothing_is_said_where_nothing_was_compared(caplog):
+    with caplog.at_level(logging.DEBUG, "pymc.stats.convergence"):
+        idata = psf.sample_dram(
+            model=model_of(1.0, psf.BootstrapPF(50)), progressbar=False, **SETTINGS
+        )
+    assert outcome_of(idata) == "exact"
+    assert not [one for one in caplog.records if one.message.startswith("d: ")]
+
+
 def test_several_models_are_named():
     models = {"bent": model_of(1.0), "exact": model_of(1.0, psf.GridFilter())}
     with pytest.warns(psf.FilterWarning, match=r"^Model 'bent': d: EKF") as caught:

@@ -12,7 +12,7 @@ from xarray import DataTree
 
 from ...errors import FilterWarning, StateSpaceFiltersError
 from ...filter_checks.checks import check_model, outcomes_of, store
-from ...filter_checks.finding import OFF
+from ...filter_checks.finding import EXACT, OFF
 from ...pymc_model.inspection import observes_state_space
 from ...pymc_model.posterior_draws import MIN_DRAWS
 
@@ -65,8 +65,12 @@ def check_filters(
         return FilterCheck((f"The filter was not checked: {error}",))
     outcomes = outcomes_of(table)
     store(tree, outcomes)
-    said = [(one["outcome"] == OFF, f"{name}: {one['verdict']}") for name, one in outcomes.items()]
+    compared = [
+        (one["outcome"] == OFF, f"{name}: {one['verdict']}")
+        for name, one in outcomes.items()
+        if one["outcome"] != EXACT  # nothing was compared
+    ]
     return FilterCheck(
-        tuple(text for is_off, text in said if not is_off),
-        tuple(text for is_off, text in said if is_off),
+        tuple(text for is_off, text in compared if not is_off),
+        tuple(text for is_off, text in compared if is_off),
     )
