@@ -159,6 +159,7 @@ def test_some_points_are_evaluated_however_little_time_there_is(monkeypatch):
     monkeypatch.setattr(estimates.Budget, "is_spent", True)
     model = model_of(SQUARE, psf.EKF(), record_of(SQUARE, phi=0.8))
     verdict = psf.check_filter(draws_of(), model, random_seed=1)["verdict"][0]
+    assert "at draws" in verdict
     assert "nan" not in verdict
 
 
