@@ -143,7 +143,7 @@ def main(selected: list[str]) -> None:
         for name, filter in FILTERS.items():
             try:
                 cell = measure(case, filter, exact)
-            except psf.ModelError as refusal:
+            except psf.errors.ModelError as refusal:
                 reasons[name] = str(refusal)
             else:
                 cells[name] = cell
@@ -157,5 +157,5 @@ def main(selected: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("ignore", psf.FilterWarning)
+    warnings.simplefilter("ignore", psf.errors.FilterWarning)
     main(sys.argv[1:])

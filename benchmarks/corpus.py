@@ -120,7 +120,7 @@ def _double_well() -> Case:
 
 def _oscillator() -> Case:
     def drift(x, u, c, k, c3, k_f):
-        force = psf.cubic(x[0], k, c3) + psf.freeplay(x[0], k_f, 0.2)
+        force = psf.mechanics.cubic(x[0], k, c3) + psf.mechanics.freeplay(x[0], k_f, 0.2)
         return [x[1], u[0] - c * x[1] - force]
 
     system = psf.StateSpaceModel(
@@ -159,10 +159,16 @@ def _epidemic() -> Case:
     """Counts of a map, with a total since the last report."""
 
     def events(x, t, rate, sigma):
-        noise = psf.gamma_white_noise(sigma, 1.0)
+        noise = psf.compartments.gamma_white_noise(sigma, 1.0)
         season = 1.0 + 0.2 * pt.cos(t)
-        infected = psf.euler_multinomial(x[0], [rate * season * noise * x[1] / 1000.0, 0.01], 1.0)
-        return [pm.Poisson.dist(5.0), *infected, *psf.euler_multinomial(x[1], [0.3], 1.0)]
+        infected = psf.compartments.euler_multinomial(
+            x[0], [rate * season * noise * x[1] / 1000.0, 0.01], 1.0
+        )
+        return [
+            pm.Poisson.dist(5.0),
+            *infected,
+            *psf.compartments.euler_multinomial(x[1], [0.3], 1.0),
+        ]
 
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] + q[0] - q[1] - q[2], x[1] + q[1] - q[3], x[2] + q[1]],

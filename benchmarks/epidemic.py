@@ -17,13 +17,13 @@ TRUTH = {"R0": 17.0, "amplitude": 0.2, "sigma_se": 0.3, "rho": 0.5, "k": 10.0}
 
 def events(x, t, R0, amplitude, sigma_se):
     S, E, I, _ = x  # noqa: E741
-    noise = psf.gamma_white_noise(sigma_se, 1.0)
+    noise = psf.compartments.gamma_white_noise(sigma_se, 1.0)
     season = 1.0 + amplitude * pt.cos(2.0 * np.pi * t / 365.0)
     rate = R0 / INFECTIOUS * season * (I + IMPORTED) / POPULATION * noise
     births = pm.Poisson.dist(TURNOVER * POPULATION)
-    infected = psf.euler_multinomial(S, [rate, TURNOVER], 1.0)
-    emerged = psf.euler_multinomial(E, [1.0 / LATENCY, TURNOVER], 1.0)
-    recovered = psf.euler_multinomial(I, [1.0 / INFECTIOUS, TURNOVER], 1.0)
+    infected = psf.compartments.euler_multinomial(S, [rate, TURNOVER], 1.0)
+    emerged = psf.compartments.euler_multinomial(E, [1.0 / LATENCY, TURNOVER], 1.0)
+    recovered = psf.compartments.euler_multinomial(I, [1.0 / INFECTIOUS, TURNOVER], 1.0)
     return [births, *infected, *emerged, *recovered]
 
 

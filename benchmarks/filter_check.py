@@ -190,5 +190,5 @@ def main(n_records: int) -> None:
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("ignore", psf.FilterWarning)
+    warnings.simplefilter("ignore", psf.errors.FilterWarning)
     main(int(sys.argv[1]) if len(sys.argv) > 1 else 300)

@@ -46,7 +46,7 @@ class Case(NamedTuple):
         """Return the log-likelihood for every seed."""
         record = {"observed": self.observed, "steps": self.steps}
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", psf.FilterWarning)
+            warnings.simplefilter("ignore", psf.errors.FilterWarning)
             terms = psf.log_likelihood(self.system, filter, self.given, **record, seed=seeds)
         return terms.sum(axis=-1)
 

@@ -63,7 +63,7 @@ def main() -> None:
     print("| --- " * (3 + len(CORRELATIONS)) + "|")
     for family, length, size in product(FAMILIES, RECORD_LENGTHS, SIZES):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", psf.FilterWarning)
+            warnings.simplefilter("ignore", psf.errors.FilterWarning)
             rows = variances([make(size) for make in family.values()], length)
         for name, row in zip(family, rows, strict=True):
             numbers = " | ".join(f"{value:.2g}" for value in row)

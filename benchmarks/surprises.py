@@ -42,7 +42,7 @@ def errors(filter, n_seeds, truth) -> tuple[np.ndarray, bool]:
             steps=record.steps,
             seed=np.arange(n_seeds),
         )
-    return terms - truth, any(w.category is psf.FilterWarning for w in caught)
+    return terms - truth, any(w.category is psf.errors.FilterWarning for w in caught)
 
 
 def main() -> None:

@@ -108,7 +108,7 @@ SYSTEMS = [
 def log_likelihoods(filter, system, record, seeds) -> np.ndarray:
     """Return the log-likelihood for every seed."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", psf.FilterWarning)
+        warnings.simplefilter("ignore", psf.errors.FilterWarning)
         return psf.log_likelihood(system, filter, {}, **record, seed=seeds).sum(axis=-1)
 
 

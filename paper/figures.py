@@ -41,7 +41,7 @@ def log_likelihoods(case, filter, alphas: np.ndarray, n_seeds: int) -> np.ndarra
     seeds = np.arange(n_seeds) if filter.noisy else np.zeros(1, int)
     with warnings.catch_warnings():
         # Filters that collapse are what the figure shows.
-        warnings.simplefilter("ignore", psf.FilterWarning)
+        warnings.simplefilter("ignore", psf.errors.FilterWarning)
         terms = psf.log_likelihood(
             case.system, filter, given, case.observed, steps=case.steps, seed=seeds
         )

@@ -1,8 +1,52 @@
 """Likelihoods, sampling and model choice for nonlinear state-space models in PyMC."""
 
+import sys
+from typing import Any
+
 import lazy_loader
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used; `__init__.pyi` lists them.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# Names that were once here, and the modules that have them now.
+_MOVED = {
+    "compartments": ("euler_multinomial", "gamma_white_noise"),
+    "errors": (
+        "CheckpointError",
+        "CheckpointWarning",
+        "DataMismatchError",
+        "EvidenceWarning",
+        "FilterWarning",
+        "GradientUnavailableError",
+        "LoweringError",
+        "ModelError",
+        "ParallelError",
+        "ParallelWarning",
+        "StateSpaceFiltersError",
+    ),
+    "evidence": ("Evidence",),
+    "mechanics": (
+        "cubic",
+        "freeplay",
+        "hysteresis",
+        "hysteresis_branch",
+        "linear_modes",
+        "second_order",
+    ),
+    "point_estimation": ("MaximumLikelihoodEstimate",),
+}
+_NEW_PLACES = {
+    name: f"{__name__}.{module}.{name}" for module, names in _MOVED.items() for name in names
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _NEW_PLACES:
+        return _import_name(name)
+    text = f"{__name__}.{name} has moved to {_NEW_PLACES[name]}."
+    # `from ... import` replaces an AttributeError by a text of its own.
+    if sys._getframe(1).f_globals.get("__name__") == "importlib._bootstrap":
+        raise ImportError(text, name=__name__)
+    raise AttributeError(text, name=name)

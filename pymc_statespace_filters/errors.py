@@ -4,6 +4,20 @@ A wrong argument raises an exception before anything is computed. A failure insi
 value (minus infinity and a counted reason), reported by a warning afterwards.
 """
 
+__all__ = [
+    "CheckpointError",
+    "CheckpointWarning",
+    "DataMismatchError",
+    "EvidenceWarning",
+    "FilterWarning",
+    "GradientUnavailableError",
+    "LoweringError",
+    "ModelError",
+    "ParallelError",
+    "ParallelWarning",
+    "StateSpaceFiltersError",
+]
+
 
 class StateSpaceFiltersError(Exception):
     """Base class of all errors that the package raises deliberately.
@@ -13,7 +27,7 @@ class StateSpaceFiltersError(Exception):
     >>> import pymc_statespace_filters as psf
     >>> try:
     ...     psf.EnKF(1)
-    ... except psf.StateSpaceFiltersError as error:
+    ... except psf.errors.StateSpaceFiltersError as error:
     ...     print(type(error).__name__)
     ModelError
     """
@@ -37,10 +51,11 @@ class DataMismatchError(StateSpaceFiltersError, ValueError):
     Examples
     --------
     >>> import pymc_statespace_filters as psf
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> facts = {"se": 0.1, "estimator": "bridge", "n_parameters": 1, "n_observations": 20}
     >>> facts |= {"max_log_likelihood": -28.0}
     >>> rivals = {
-    ...     name: psf.Evidence(log_evidence=-30.0, data_fingerprint=name, **facts)
+    ...     name: Evidence(log_evidence=-30.0, data_fingerprint=name, **facts)
     ...     for name in ("this record", "another record")
     ... }
     >>> psf.compare_evidence(rivals)
@@ -96,7 +111,7 @@ class GradientUnavailableError(StateSpaceFiltersError):
     ...     d = psf.StateSpace("d", walk, psf.BootstrapPF(10), steps=[1, 2], observed=[0.3, 1.2])
     ...     try:
     ...         pm.sample(progressbar=False)
-    ...     except psf.GradientUnavailableError as error:
+    ...     except psf.errors.GradientUnavailableError as error:
     ...         print("DRAM" in str(error))
     True
     """
@@ -108,7 +123,7 @@ class ParallelError(StateSpaceFiltersError, RuntimeError):
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> issubclass(psf.ParallelError, RuntimeError)
+    >>> issubclass(psf.errors.ParallelError, RuntimeError)
     True
     """
 
@@ -121,7 +136,7 @@ class ParallelWarning(UserWarning):
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("error", psf.ParallelWarning)
+    ...     warnings.simplefilter("error", psf.errors.ParallelWarning)
     """
 
 
@@ -133,7 +148,7 @@ class FilterWarning(UserWarning):
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("error", psf.FilterWarning)
+    ...     warnings.simplefilter("error", psf.errors.FilterWarning)
     """
 
 
@@ -145,7 +160,7 @@ class EvidenceWarning(UserWarning):
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("ignore", psf.EvidenceWarning)
+    ...     warnings.simplefilter("ignore", psf.errors.EvidenceWarning)
     """
 
 
@@ -157,7 +172,7 @@ class CheckpointError(StateSpaceFiltersError, OSError):
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> issubclass(psf.CheckpointError, OSError)
+    >>> issubclass(psf.errors.CheckpointError, OSError)
     True
     """
 
@@ -170,5 +185,5 @@ class CheckpointWarning(UserWarning):
     >>> import warnings
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("error", psf.CheckpointWarning)
+    ...     warnings.simplefilter("error", psf.errors.CheckpointWarning)
     """

@@ -141,6 +141,6 @@ def test_a_senseless_argument_is_refused_by_name(
 ):
     monkeypatch.chdir(tmp_path)  # a call that takes a path for good must not write elsewhere
     names = f"{argument}|{ALSO_NAMED.get(argument, argument)}"
-    with pytest.raises((psf.StateSpaceFiltersError, TypeError, ValueError)) as caught:
+    with pytest.raises((psf.errors.StateSpaceFiltersError, TypeError, ValueError)) as caught:
         call(**arguments | {argument: value})
     assert re.search(rf"\b({names})\b", str(caught.value)), caught.value

@@ -166,7 +166,7 @@ def _third(x):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_wrong_system_is_refused_when_it_is_made(name):
     changes, words = SYSTEMS[name]
-    with pytest.raises(psf.ModelError, match=words) as caught:
+    with pytest.raises(psf.errors.ModelError, match=words) as caught:
         make(**changes)
     assert isinstance(caught.value, ValueError)
 
@@ -202,23 +202,23 @@ GENERATOR = pytensor.shared(np.random.default_rng(1), name="generator")
 @pytest.mark.parametrize("name", DRAWS_INSIDE)
 def test_a_function_that_draws_is_told_where_noise_belongs(name):
     changes, words = DRAWS_INSIDE[name]
-    with pytest.raises(psf.ModelError, match=words) as caught:
+    with pytest.raises(psf.errors.ModelError, match=words) as caught:
         make(**changes)
     assert "as a parameter" not in str(caught.value)
 
 
 def test_a_drift_that_draws_is_told_of_the_diffusion():
-    with pytest.raises(psf.ModelError, match=r"normal.* made inside it: .*diffusion"):
+    with pytest.raises(psf.errors.ModelError, match=r"normal.* made inside it: .*diffusion"):
         euler(drift=lambda x: [pm.Normal.dist(x[0], 1.0), x[1]])
 
 
 def test_pymc_variables_are_not_constants():
     unnamed = pm.Normal.dist()
-    with pytest.raises(psf.ModelError, match=r"random variable .*as a parameter"):
+    with pytest.raises(psf.errors.ModelError, match=r"random variable .*as a parameter"):
         make(transition=lambda x, q: [unnamed + q[0], x[1]])
     with pm.Model():
         gain = pm.Normal("gain")
-        with pytest.raises(psf.ModelError, match=r"random variable gain.*as a parameter"):
+        with pytest.raises(psf.errors.ModelError, match=r"random variable gain.*as a parameter"):
             make(observation=lambda x: [gain * x[0]])
 
 
@@ -253,7 +253,7 @@ INTEGRATORS = {
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_a_wrong_integrator_is_refused(name):
     construct, words = INTEGRATORS[name]
-    with pytest.raises(psf.ModelError, match=words):
+    with pytest.raises(psf.errors.ModelError, match=words):
         construct()
 
 
@@ -348,7 +348,7 @@ def test_a_wrong_record_is_refused(name):
     )
     given |= changes
     positional = [given.pop(k) for k in ("system", "filter", "params", "observed")]
-    with pytest.raises(psf.ModelError, match=words):
+    with pytest.raises(psf.errors.ModelError, match=words):
         psf.log_likelihood(*positional, **given)
 
 
@@ -364,13 +364,13 @@ def test_a_wrong_record_is_refused(name):
 )
 def test_a_wrong_simulation_is_refused(changes, words):
     given = dict(system=SYSTEM, params={"a": 0.5}, steps=[0, 3]) | changes
-    with pytest.raises(psf.ModelError, match=words):
+    with pytest.raises(psf.errors.ModelError, match=words):
         psf.simulate(given.pop("system"), given.pop("params"), **given)
 
 
 @pytest.mark.parametrize("name", [3, ""])
 def test_a_variable_has_a_name(name):
-    with pm.Model(), pytest.raises(psf.ModelError, match="name must be a text"):
+    with pm.Model(), pytest.raises(psf.errors.ModelError, match="name must be a text"):
         psf.StateSpace(name, SYSTEM, psf.EKF(), params={"a": 0.5}, steps=[0], observed=[0.0])
 
 
@@ -392,7 +392,7 @@ def test_functions_give_symmetric_covariances(role):
         observation_noise=np.eye(2),
     )
     make(**both | {role: _correlated})
-    with pytest.raises(psf.ModelError, match=f"{role} must be symmetric, got .* parameters"):
+    with pytest.raises(psf.errors.ModelError, match=f"{role} must be symmetric, got .* parameters"):
         make(**both | {role: _skewed})
 
 
@@ -400,7 +400,7 @@ def test_a_density_alone_cannot_be_simulated():
     system = make(
         observation=..., observation_noise=..., observation_logp=lambda d, x: -(d[0] ** 2)
     )
-    with pytest.raises(psf.ModelError, match="simulating needs observation"):
+    with pytest.raises(psf.errors.ModelError, match="simulating needs observation"):
         psf.simulate(system, {"a": 1.0}, steps=[1])
 
 
@@ -414,9 +414,9 @@ def test_filters_refuse_systems_that_they_cannot_treat():
         [1.0],
     )
     for filter in (psf.EKF(), psf.EnKF(10)):
-        with pytest.raises(psf.ModelError, match=r"GuidedPF.* BootstrapPF"):
+        with pytest.raises(psf.errors.ModelError, match=r"GuidedPF.* BootstrapPF"):
             psf.log_likelihood(counts, filter, *arguments, steps=[0])
-    with pytest.raises(psf.ModelError, match=r"EKF .*\['branch'\]"):
+    with pytest.raises(psf.errors.ModelError, match=r"EKF .*\['branch'\]"):
         psf.log_likelihood(memory, psf.EKF(), *arguments, steps=[0])
 
 
@@ -436,7 +436,7 @@ def test_filters_refuse_systems_that_they_cannot_treat():
     ],
 )
 def test_wrong_timestamps_are_refused(arguments, words):
-    with pytest.raises(psf.ModelError, match=words):
+    with pytest.raises(psf.errors.ModelError, match=words):
         psf.nearest_steps(*arguments)
 
 

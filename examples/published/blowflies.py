@@ -41,8 +41,8 @@ def blowflies(dt: int) -> psf.StateSpaceModel:
 
     def noise(x, P, delta, N0, sigma_P, sigma_d):
         parents = x[-1]
-        recruitment = psf.gamma_white_noise(sigma_P, dt)
-        mortality = psf.gamma_white_noise(sigma_d, dt)
+        recruitment = psf.compartments.gamma_white_noise(sigma_P, dt)
+        mortality = psf.compartments.gamma_white_noise(sigma_d, dt)
         recruits = pm.Poisson.dist(P * parents * pt.exp(-parents / N0) * dt * recruitment)
         survivors = pm.Binomial.dist(x[0], pt.exp(-delta * dt * mortality))
         return [recruits, survivors]

@@ -39,9 +39,11 @@ def noise(x, u, R0, sigma, gamma, mu, alpha, iota, sigmaSE, cohort, amplitude):
     force = transmission * (infectious + iota) ** alpha / people
     return [
         pm.Poisson.dist(entering),
-        *psf.euler_multinomial(susceptible, [force * psf.gamma_white_noise(sigmaSE, DT), mu], DT),
-        *psf.euler_multinomial(exposed, [sigma, mu], DT),
-        *psf.euler_multinomial(infectious, [gamma, mu], DT),
+        *psf.compartments.euler_multinomial(
+            susceptible, [force * psf.compartments.gamma_white_noise(sigmaSE, DT), mu], DT
+        ),
+        *psf.compartments.euler_multinomial(exposed, [sigma, mu], DT),
+        *psf.compartments.euler_multinomial(infectious, [gamma, mu], DT),
     ]
 
 

@@ -62,7 +62,7 @@ def accelerations(x: Any, speed: Any, moment: Any, c_alpha: Any, gust: Any = 0.0
 def step(x, q, u, k_alpha, c_alpha, gust, k_3=0.0, k_f=0.0, delta=0.0):
     """Return the state one step later: first the rates, then the positions from the new rates."""
     h, alpha, h_rate, alpha_rate = x
-    moment = psf.cubic(alpha, k_alpha, k_3) + psf.freeplay(alpha, k_f, delta)
+    moment = psf.mechanics.cubic(alpha, k_alpha, k_3) + psf.mechanics.freeplay(alpha, k_f, delta)
     a_h, a_alpha = accelerations(x, u[0], moment, c_alpha, gust * q[0] / np.sqrt(DT))
     h_rate, alpha_rate = h_rate + DT * a_h, alpha_rate + DT * a_alpha
     return [h + DT * h_rate, alpha + DT * alpha_rate, h_rate, alpha_rate]

@@ -34,6 +34,7 @@ from double_well_tables import (
 from study import Study, check, study
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.evidence import Evidence
 
 DT = 0.01
 N_STEPS = 2000
@@ -136,7 +137,7 @@ class Posterior(NamedTuple):
     """Results of one filter for one equation in one case."""
 
     draws: xr.DataTree
-    evidence: psf.Evidence
+    evidence: Evidence
 
 
 def sample(

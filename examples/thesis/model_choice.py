@@ -29,6 +29,7 @@ from scipy.special import softmax
 from study import Study, check, mixing, study
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.evidence import Evidence
 
 # The first case as printed does not move enough to show anything (see `oscillator.py`), and takes
 # the three stiffnesses as equal. Here no record does: all have the same eight rivals.
@@ -47,7 +48,7 @@ PF_ENKF_SHARE = 5  # of the draws: PF-EnKF takes three to eight times as long as
 BRIDGED = ("case 3", "cubic + hysteresis")  # also by bridge sampling with the ensemble
 
 # The tables show the warnings of an evidence: few effective draws, large R-hat.
-warnings.filterwarnings("ignore", category=psf.EvidenceWarning)
+warnings.filterwarnings("ignore", category=psf.errors.EvidenceWarning)
 
 # Chains from the prior need this long to find and learn a ridge; with the EKF it takes seconds.
 PILOT = {"draws": 12_500, "tune": 7500}
@@ -61,7 +62,7 @@ class Sampled:
     """Draws of one variant, its evidence by each estimator, and the CPU seconds they took."""
 
     idata: xr.DataTree
-    evidence: dict[str, psf.Evidence]
+    evidence: dict[str, Evidence]
     seconds: float
 
     @property
@@ -100,7 +101,7 @@ def sample(
         return {"seconds": time.process_time() - started, "evidence": evidence}
 
     left = settings.kept(place, idata, find)
-    evidence = {name: psf.Evidence(**values) for name, values in left["evidence"].items()}
+    evidence = {name: Evidence(**values) for name, values in left["evidence"].items()}
     return Sampled(idata, evidence, left["seconds"])
 
 
@@ -146,7 +147,7 @@ def refined(
     return found
 
 
-def chib_jeliazkov(found: Mapping[str, Sampled]) -> dict[str, psf.Evidence]:
+def chib_jeliazkov(found: Mapping[str, Sampled]) -> dict[str, Evidence]:
     return {variant: sampled.evidence["chib_jeliazkov"] for variant, sampled in found.items()}
 
 

@@ -48,7 +48,7 @@ def oscillator(*, memory: bool = False, width: float | None = None) -> psf.State
 
     The force T cos(omega t) is an input, and the variance Gamma of the measurements a parameter, so
     that all cases are one system. Without `memory` the sign of the velocity selects the branch.
-    `width` rounds the kinks (`psf.freeplay`).
+    `width` rounds the kinks (`psf.mechanics.freeplay`).
     """
 
     def transition(x, q, u, k_l, c, sigma, k_nl=0, k_f=0, delta_f=0, k_h=0, a_h=0, delta_h=0):
@@ -56,16 +56,16 @@ def oscillator(*, memory: bool = False, width: float | None = None) -> psf.State
         z, velocity = x[0], x[1]
         branch = x[2] if memory else velocity
         force = (
-            psf.cubic(z, k_l, k_nl)
-            + psf.freeplay(z, k_f, delta_f, width=width)
-            + psf.hysteresis(z, branch, k_h, a_h, delta_h, width=width)
+            psf.mechanics.cubic(z, k_l, k_nl)
+            + psf.mechanics.freeplay(z, k_f, delta_f, width=width)
+            + psf.mechanics.hysteresis(z, branch, k_h, a_h, delta_h, width=width)
             + c * velocity
         )
         moved = z + DT * velocity
         kicked = velocity + (DT * (u[0] - force) + np.sqrt(DT) * sigma * q[0]) / MASS
         if not memory:
             return [moved, kicked]
-        return [moved, kicked, psf.hysteresis_branch(moved, branch, a_h, delta_h)]
+        return [moved, kicked, psf.mechanics.hysteresis_branch(moved, branch, a_h, delta_h)]
 
     n_branches = int(memory)
     return psf.StateSpaceModel(
@@ -191,8 +191,8 @@ def restoring_force(
     """
     p = {name: np.asarray(parameters.get(name, 0.0))[..., None] for name in TRUTH}
     force = (
-        psf.cubic(u, p["k_l"], p["k_nl"])
-        + psf.freeplay(u, p["k_f"], p["delta_f"], width=width)
-        + psf.hysteresis(u, direction, p["k_h"], p["a_h"], p["delta_h"], width=width)
+        psf.mechanics.cubic(u, p["k_l"], p["k_nl"])
+        + psf.mechanics.freeplay(u, p["k_f"], p["delta_f"], width=width)
+        + psf.mechanics.hysteresis(u, direction, p["k_h"], p["a_h"], p["delta_h"], width=width)
     )
     return force.eval(mode="FAST_COMPILE")

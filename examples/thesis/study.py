@@ -21,6 +21,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.evidence import Evidence
 
 matplotlib.use("Agg")
 # A study reports in tables; PyMC would announce every chain.
@@ -76,16 +77,16 @@ class Study:
         found = psf.run_models(models, **settings)
         return {of: _whole(draws, settings) for of, draws in found.items()}
 
-    def evidence(self, name: str, draws: xr.DataTree, model: pm.Model) -> psf.Evidence:
+    def evidence(self, name: str, draws: xr.DataTree, model: pm.Model) -> Evidence:
         """Estimate an evidence, or read what an earlier run computed for the same draws."""
 
         def find() -> dict[str, Any]:
             with warnings.catch_warnings():
                 # The result itself reports its doubts, in a table.
-                warnings.simplefilter("ignore", psf.EvidenceWarning)
+                warnings.simplefilter("ignore", psf.errors.EvidenceWarning)
                 return asdict(psf.chib_jeliazkov(draws, model, random_seed=self.seed))
 
-        return psf.Evidence(**self.kept(name, draws, find))
+        return Evidence(**self.kept(name, draws, find))
 
     def kept(self, name: str, draws: xr.DataTree, find: Callable[[], Any]) -> Any:
         """Return what `find` returns, or its result for the same draws from an earlier run."""

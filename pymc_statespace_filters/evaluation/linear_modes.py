@@ -214,7 +214,7 @@ def linear_modes(system: StateSpaceModel, params: Any, *, at: Any = None) -> pd.
     ...     initial_mean=[1.0, 0.0],
     ...     initial_cov=[[0.1, 0.0], [0.0, 0.1]],
     ... )
-    >>> psf.linear_modes(system, {"k": 4.0, "c": 0.2}).round(3)
+    >>> psf.mechanics.linear_modes(system, {"k": 4.0, "c": 0.2}).round(3)
           frequency  damping_ratio  growth_rate  time_constant
     mode
     0         0.318           0.05         -0.1           10.0

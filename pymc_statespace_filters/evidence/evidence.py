@@ -67,7 +67,7 @@ class Evidence:
 
     Examples
     --------
-    >>> from pymc_statespace_filters import Evidence
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> Evidence(-31.24, 0.02, "chib_jeliazkov", 3, 100, -24.1, "0c5f")
     Evidence(log_evidence=-31.240 ± 0.020, estimator='chib_jeliazkov', k=3, J=100)
     """

@@ -61,7 +61,8 @@ def plot_evidence(
 
     Examples
     --------
-    >>> from pymc_statespace_filters import Evidence, compare_evidence, plot_evidence
+    >>> from pymc_statespace_filters import compare_evidence, plot_evidence
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
     >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
     >>> table = compare_evidence({"linear": linear, "cubic": cubic})
@@ -145,7 +146,8 @@ def plot_model_probabilities(
 
     Examples
     --------
-    >>> from pymc_statespace_filters import Evidence, compare_evidence, plot_model_probabilities
+    >>> from pymc_statespace_filters import compare_evidence, plot_model_probabilities
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
     >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
     >>> collection = plot_model_probabilities(

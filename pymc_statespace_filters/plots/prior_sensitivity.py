@@ -52,7 +52,8 @@ def plot_prior_sensitivity(
 
     Examples
     --------
-    >>> from pymc_statespace_filters import Evidence, compare_evidence, plot_prior_sensitivity
+    >>> from pymc_statespace_filters import compare_evidence, plot_prior_sensitivity
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
     >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
     >>> collection = plot_prior_sensitivity(compare_evidence({"linear": linear, "cubic": cubic}))

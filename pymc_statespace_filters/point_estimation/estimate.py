@@ -94,11 +94,12 @@ class MaximumLikelihoodEstimate:
     --------
     >>> import pymc as pm
     >>> import pymc_statespace_filters as psf
+    >>> from pymc_statespace_filters.point_estimation import MaximumLikelihoodEstimate
     >>> with pm.Model():
     ...     mu = pm.Normal("mu", 0, 100)
     ...     y = pm.Normal("y", mu, 0.2, observed=[1.2, 1.1, 1.3, 1.2])
     ...     found = psf.maximum_likelihood(random_seed=1)
-    >>> isinstance(found, psf.MaximumLikelihoodEstimate)
+    >>> isinstance(found, MaximumLikelihoodEstimate)
     True
     >>> found.covariance.round(6)
             mu

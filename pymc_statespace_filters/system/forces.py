@@ -46,7 +46,7 @@ def cubic(z: Tensorlike, k_l: Coefficient, k_nl: Coefficient) -> TensorVariable:
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> psf.cubic(2.0, k_l=1.0, k_nl=0.5).eval()
+    >>> psf.mechanics.cubic(2.0, k_l=1.0, k_nl=0.5).eval()
     array(6.)
     """
     z = _real(z)
@@ -95,7 +95,7 @@ def freeplay(
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> psf.freeplay([-0.5, 0.1, 0.5], k_f=2.0, delta_f=0.2).eval()
+    >>> psf.mechanics.freeplay([-0.5, 0.1, 0.5], k_f=2.0, delta_f=0.2).eval()
     array([-0.6, 0. , 0.6])
     """
     z, width = _real(z), _check_width(width)
@@ -168,7 +168,7 @@ def hysteresis(
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> psf.hysteresis(0.0, [1.0, -1.0], k_h=1.0, a_h=0.5, delta_h=1.5).eval()
+    >>> psf.mechanics.hysteresis(0.0, [1.0, -1.0], k_h=1.0, a_h=0.5, delta_h=1.5).eval()
     array([ 0.75, -0.75])
     """
     z, v, width = _real(z), _real(v), _check_width(width)
@@ -218,7 +218,7 @@ def hysteresis_branch(
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> psf.hysteresis_branch([-2.5, 0.0, 2.5], 1.0, a_h=0.5, delta_h=1.5).eval()
+    >>> psf.mechanics.hysteresis_branch([-2.5, 0.0, 2.5], 1.0, a_h=0.5, delta_h=1.5).eval()
     array([ 1.,  1., -1.])
     """
     z, end = _real(z), a_h + delta_h

@@ -49,8 +49,8 @@ def euler_multinomial(size: Any, rates: Sequence[Any], dt: Any) -> list[TensorVa
     >>> system = psf.StateSpaceModel(
     ...     transition=lambda x, q: [x[0] - q[0] - q[1], x[1] + q[0] - q[2]],
     ...     process_dist=lambda x, infect, die, recover: [
-    ...         *psf.euler_multinomial(x[0], [infect * x[1], die], 0.1),
-    ...         *psf.euler_multinomial(x[1], [recover], 0.1),
+    ...         *psf.compartments.euler_multinomial(x[0], [infect * x[1], die], 0.1),
+    ...         *psf.compartments.euler_multinomial(x[1], [recover], 0.1),
     ...     ],
     ...     observation_dist=lambda x: [pm.Poisson.dist(0.3 * x[1] + 0.1)],
     ...     initial_dist=lambda: [990, 10],
@@ -110,7 +110,7 @@ def gamma_white_noise(sigma: Any, dt: Any) -> TensorVariable:
     >>> import pymc_statespace_filters as psf
     >>> import pymc as pm
     >>> def process_dist(x, rate, sigma):
-    ...     factor = psf.gamma_white_noise(sigma, dt=0.1)
+    ...     factor = psf.compartments.gamma_white_noise(sigma, dt=0.1)
     ...     return [pm.Poisson.dist(rate * x[0] * factor * 0.1)]
     """
     for name, value in (("sigma", sigma), ("dt", dt)):

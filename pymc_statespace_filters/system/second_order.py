@@ -57,7 +57,7 @@ def second_order(
     Two masses in a row, the first on a hardening spring, the second pushed:
 
     >>> import pymc_statespace_filters as psf
-    >>> drift = psf.second_order(
+    >>> drift = psf.mechanics.second_order(
     ...     mass=[[1.0, 0.0], [0.0, 2.0]],
     ...     damping=lambda c: [[2 * c, -c], [-c, c]],
     ...     stiffness=lambda k: [[2 * k, -k], [-k, k]],

@@ -153,9 +153,9 @@ def test_what_has_no_machine_code_is_named():
         initial_mean=[0.0, 1.0],
         initial_cov=np.eye(2),
     )
-    with pytest.raises(psf.LoweringError, match=r"pytensor.tensor operations.*_black_box"):
+    with pytest.raises(psf.errors.LoweringError, match=r"pytensor.tensor operations.*_black_box"):
         compile_system(system).propagate  # noqa: B018
-    with pytest.raises(psf.LoweringError, match=r"_black_box|[Nn]o|gradient"):
+    with pytest.raises(psf.errors.LoweringError, match=r"_black_box|[Nn]o|gradient"):
         psf.log_likelihood(system, psf.EnKF(10), {}, [0.0], steps=[1])
 
 

@@ -43,8 +43,8 @@ CONTINUOUS = {
     "smooth": lambda x, a: pt.tanh(a * x),
     "kink": lambda x, a: pt.switch(x > a, a + 2 * (x - a), x),
     "ramp": lambda x, a: pt.switch(x > 0, x, 0.0),
-    "freeplay": lambda x, a: x - 0.1 * psf.freeplay(x, 2.0, a),
-    "rounded freeplay": lambda x, a: x - 0.1 * psf.freeplay(x, 2.0, a, width=0.1),
+    "freeplay": lambda x, a: x - 0.1 * psf.mechanics.freeplay(x, 2.0, a),
+    "rounded freeplay": lambda x, a: x - 0.1 * psf.mechanics.freeplay(x, 2.0, a, width=0.1),
     "absolute value": lambda x, a: a * abs(x),
     "maximum": lambda x, a: pt.maximum(x, a),
     "clip": lambda x, a: pt.clip(x, -a, a),
@@ -79,7 +79,7 @@ def test_observations_and_drifts():
     assert jumping_equations(drift(lambda x: -pt.sign(x))) == ("transition",)
     assert jumping_equations(drift(lambda x: -pt.sign(x), dt=0.01)) == ("transition",)
     assert jumping_equations(drift(lambda x: -pt.sign(x), dt=0.0002)) == ()
-    assert jumping_equations(drift(lambda x: -psf.freeplay(x, 2.0, 0.5))) == ()
+    assert jumping_equations(drift(lambda x: -psf.mechanics.freeplay(x, 2.0, 0.5))) == ()
 
 
 def test_a_carried_memory_is_no_jump():
@@ -96,7 +96,7 @@ RECORD = dict(observed=[0.1, 0.2], steps=[1, 2])
 
 def test_a_filter_that_linearises_a_jump_is_warned_of_once():
     switched = system(JUMPS["switch"])
-    with pytest.warns(psf.FilterWarning) as caught:
+    with pytest.warns(psf.errors.FilterWarning) as caught:
         psf.log_likelihood(switched, psf.EKF(), {"a": [0.1, 0.2, 0.3]}, **RECORD)
     assert [str(w.message) for w in caught] == [
         "EKF(): the transition of this system jumps where the state crosses a threshold, which no "
@@ -104,7 +104,7 @@ def test_a_filter_that_linearises_a_jump_is_warned_of_once():
         "linearise."
     ]
     assert caught[0].filename == __file__
-    with pytest.warns(psf.FilterWarning, match="jumps") as caught:
+    with pytest.warns(psf.errors.FilterWarning, match="jumps") as caught:
         psf.run_filter(switched, psf.EKF(), {"a": 0.1}, **RECORD)
     assert caught[0].filename == __file__
 
@@ -113,7 +113,7 @@ def test_a_model_with_such_a_filter_is_warned_of_where_it_is_built():
     switched = system(JUMPS["switch"])
     with pm.Model():
         pm.Normal("a")
-        with pytest.warns(psf.FilterWarning, match="EKF.*jumps") as caught:
+        with pytest.warns(psf.errors.FilterWarning, match="EKF.*jumps") as caught:
             psf.StateSpace("d", switched, psf.EKF(), **RECORD)
         assert caught[0].filename == __file__
     # None of a filter that does not linearise, nor where the package itself takes an EKF.

@@ -129,6 +129,6 @@ def test_lorenz_96_runs_and_particle_filters_warn_of_collapse(lorenz):
         gaussian = psf.EnKF(100, likelihood="gaussian")
         assert np.isfinite(psf.log_likelihood(lorenz, gaussian, {}, record, steps=steps)).all()
     for filter in (psf.BootstrapPF(100), psf.PFEnKF(100)):
-        with pytest.warns(psf.FilterWarning, match="fewer than 3 particles"):
+        with pytest.warns(psf.errors.FilterWarning, match="fewer than 3 particles"):
             terms = psf.log_likelihood(lorenz, filter, {}, record, steps=steps)
         assert not np.isnan(terms).any()

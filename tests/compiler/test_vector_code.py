@@ -43,11 +43,11 @@ FUNCTIONS = {
     "truth values": lambda x, a: (x > a) * x + 1.0 * (x < 0),
     "rounding": lambda x, a: pt.floor(x) + pt.ceil(x / a) + pt.round(x) * pt.trunc(3 * x),
     "remainder": lambda x, a: x % a + x // a,
-    "cubic": lambda x, a: psf.cubic(x, a, 0.3),
-    "freeplay": lambda x, a: psf.freeplay(x, 2.0, a),
-    "smooth freeplay": lambda x, a: psf.freeplay(x, 2.0, a, width=0.2),
-    "hysteresis": lambda x, a: psf.hysteresis(x, x - a, 2.0, a, 0.4),
-    "smooth hysteresis": lambda x, a: psf.hysteresis(x, x - a, 2.0, a, 0.4, width=0.2),
+    "cubic": lambda x, a: psf.mechanics.cubic(x, a, 0.3),
+    "freeplay": lambda x, a: psf.mechanics.freeplay(x, 2.0, a),
+    "smooth freeplay": lambda x, a: psf.mechanics.freeplay(x, 2.0, a, width=0.2),
+    "hysteresis": lambda x, a: psf.mechanics.hysteresis(x, x - a, 2.0, a, 0.4),
+    "smooth hysteresis": lambda x, a: psf.mechanics.hysteresis(x, x - a, 2.0, a, 0.4, width=0.2),
 }
 
 

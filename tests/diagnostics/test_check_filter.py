@@ -110,9 +110,11 @@ def test_a_doubt_goes_with_the_draws():
     observed = record_of(SQUARE, phi=0.8)
     model, idata = model_of(SQUARE, psf.EKF(), observed), draws_of()
     psf.check_filter(idata, model, random_seed=1)
-    with pytest.warns(psf.FilterWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"):
+    with pytest.warns(psf.errors.FilterWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"):
         psf.filter_diagnostics(idata, model, n_draws=4, random_seed=1, progressbar=False)
-    with pytest.warns(psf.EvidenceWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"):
+    with pytest.warns(
+        psf.errors.EvidenceWarning, match=r"EKF\(\) is \d+ ± .* nats below GridFilter"
+    ):
         found = psf.estimate_evidence(idata, model, estimators="bridge", progressbar=False)
     assert "nats below GridFilter()" in found["bridge"].doubts
     with_another_filter = model_of(SQUARE, psf.GridFilter(), observed)

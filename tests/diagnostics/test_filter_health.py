@@ -136,7 +136,7 @@ def noisy():
 
 def test_the_effective_number_is_that_of_each_draws_own_estimate(noisy):
     model, idata = noisy
-    with pytest.warns(psf.FilterWarning, match="fewer than 3 particles"):
+    with pytest.warns(psf.errors.FilterWarning, match="fewer than 3 particles"):
         found = psf.filter_diagnostics(idata, model, random_seed=1, extend_inferencedata=False)
     assert "filter_diagnostics" not in idata.children
     found = found["filter_diagnostics"]
@@ -162,7 +162,7 @@ def test_failures_are_counted():
     """In machine code, with particles."""
     with (
         pytensor.config.change_flags(mode="NUMBA"),
-        pytest.warns(psf.FilterWarning, match="in 10 of 10 evaluations"),
+        pytest.warns(psf.errors.FilterWarning, match="in 10 of 10 evaluations"),
     ):
         found = diagnosed(
             SYSTEM, psf.BootstrapPF(20), [0.1, 0.2, 1e200, 0.3], np.arange(4), (1, 10), **TRUTH

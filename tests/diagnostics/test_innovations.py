@@ -97,7 +97,7 @@ def test_a_surprise_of_six_deviations_shows_as_six(filter, tolerance, forced_rec
 def test_with_particles_it_is_cut_off_and_said_to_be(forced_record):
     """Predicted moments of 400 draws: within five standard errors."""
     force, observed, _, _ = forced_record
-    with pytest.warns(psf.FilterWarning, match="fewer than 3 particles") as caught:
+    with pytest.warns(psf.errors.FilterWarning, match="fewer than 3 particles") as caught:
         found = diagnosed(
             FORCED, psf.BootstrapPF(100), observed, LONG, 400, inputs=force, a=A, b=1.0
         )

@@ -29,7 +29,7 @@ def evaluate(filter, points):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         terms = psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, points | KNOWN, RECORD, steps=STEPS)
-    assert all(issubclass(w.category, psf.FilterWarning) for w in caught)
+    assert all(issubclass(w.category, psf.errors.FilterWarning) for w in caught)
     counted = sum(
         int(count)
         for w in caught
@@ -90,11 +90,11 @@ def test_a_covariance_that_no_observation_depends_on_must_exist(filter):
         initial_cov=np.eye(2),
     )
     record = {"observed": [0.5, np.nan, -0.3], "steps": [0, 1, 2]}
-    with pytest.warns(psf.FilterWarning, match="-inf in 1 of 2"):
+    with pytest.warns(psf.errors.FilterWarning, match="-inf in 1 of 2"):
         terms = psf.log_likelihood(system, filter, {"r": [0.5, 2.0]}, **record)
-    with pytest.warns(psf.FilterWarning, match="gave -inf in row 2"):
+    with pytest.warns(psf.errors.FilterWarning, match="gave -inf in row 2"):
         alone = psf.log_likelihood(system, filter, {"r": 2.0}, **record)
-    with pytest.warns(psf.FilterWarning, match="gave -inf in row 2"):
+    with pytest.warns(psf.errors.FilterWarning, match="gave -inf in row 2"):
         run = psf.run_filter(system, filter, {"r": 2.0}, **record)
     panel = {
         "panel": [0, 0, 0, 1, 1, 1],
@@ -122,7 +122,7 @@ def test_a_singular_matrix_in_a_users_function_is_minus_infinity(filter):
         initial_mean=[1.0],
         initial_cov=[[0.1]],
     )
-    with pytest.warns(psf.FilterWarning, match="-inf in 2 of 3"):
+    with pytest.warns(psf.errors.FilterWarning, match="-inf in 2 of 3"):
         terms = psf.log_likelihood(
             system, filter, {"k": [1.0, 0.0, -0.0]}, [1.0, 1.0], steps=[0, 2]
         )

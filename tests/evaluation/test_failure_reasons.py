@@ -51,7 +51,7 @@ def failures(system, filter, params, observed=DATA, **data):
 def takes(system, filter):
     try:
         filter.check(compile_system(system))
-    except psf.ModelError:
+    except psf.errors.ModelError:
         return False
     return True
 
@@ -141,7 +141,9 @@ def test_of_many_evaluations_the_first_of_each_reason_is_shown(filter):
 
 def test_a_record_of_a_panel_is_named():
     panel = ["one"] * 3 + ["two"] * 3
-    with pytest.warns(psf.FilterWarning, match="of record 'two', first in row 1, at time 1.5"):
+    with pytest.warns(
+        psf.errors.FilterWarning, match="of record 'two', first in row 1, at time 1.5"
+    ):
         psf.log_likelihood(
             system(), psf.EKF(), {"a": 0.9}, [*DATA, 1.0, 1e200, 1.0],
             steps=[*STEPS, *STEPS], panel=panel,

@@ -70,10 +70,10 @@ def test_a_filter_is_not_its_own_remedy(monkeypatch):
 def test_the_spread_over_seeds_is_that_of_the_system_at_hand():
     record = np.array([0.1, 0.3, -0.5, 2.0])
     arguments = (BENT, psf.BootstrapPF(64), {}, record)
-    with pytest.warns(psf.FilterWarning) as caught:
+    with pytest.warns(psf.errors.FilterWarning) as caught:
         psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=8)
     seeds = [8 ^ i for i in range(5)]
-    with pytest.warns(psf.FilterWarning):
+    with pytest.warns(psf.errors.FilterWarning):
         at_seeds = psf.log_likelihood(*arguments, steps=[1, 2, 3, 4], seed=seeds)
     spread = np.ptp(at_seeds.sum(axis=1))
     assert f"at 5 seeds the log-likelihood ranged over {spread:.0f} nats" in str(caught[0].message)
@@ -107,7 +107,9 @@ def test_two_particles_that_saw_no_data_are_not_warned_of():
     ("observed", "nats"), [(2.0, r"\d+\.\d nats below"), (500.0, r"\d{4,} nats below")]
 )
 def test_large_differences_have_no_decimals(observed, nats):
-    with pytest.warns(psf.FilterWarning, match=f"the log-likelihood is {nats}, by a different"):
+    with pytest.warns(
+        psf.errors.FilterWarning, match=f"the log-likelihood is {nats}, by a different"
+    ):
         psf.log_likelihood(LINEAR, psf.BootstrapPF(2), {}, [observed], steps=[1], seed=1)
 
 

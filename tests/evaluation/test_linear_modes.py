@@ -47,8 +47,8 @@ def two_masses():
 
 
 def test_a_system_of_two_masses():
-    drift = psf.second_order(MASSES, DAMPING, SPRINGS)
-    modes = psf.linear_modes(system_of(drift, [0.5, 0.0, 0.0, 1.0]), {})
+    drift = psf.mechanics.second_order(MASSES, DAMPING, SPRINGS)
+    modes = psf.mechanics.linear_modes(system_of(drift, [0.5, 0.0, 0.0, 1.0]), {})
     assert list(modes.columns) == COLUMNS
     assert modes.index.tolist() == [0, 1]
     s = np.array(two_masses())
@@ -66,14 +66,14 @@ def test_a_system_of_two_masses():
 def test_real_and_growing_modes():
     """Overdamped: two real modes; a growing oscillation; and a double well at its top."""
     system = system_of(oscillator, [1.0, 0.0])
-    modes = psf.linear_modes(system, {"k": 2.0, "c": 3.0})
+    modes = psf.mechanics.linear_modes(system, {"k": 2.0, "c": 3.0})
     np.testing.assert_allclose(modes["growth_rate"], [-1.0, -2.0])
     np.testing.assert_allclose(modes["time_constant"], [1.0, 0.5])
     np.testing.assert_array_equal(modes[["frequency", "damping_ratio"]], [[0, 1], [0, 1]])
-    (growing,) = psf.linear_modes(system, {"k": 1.0, "c": -0.2}).values
+    (growing,) = psf.mechanics.linear_modes(system, {"k": 1.0, "c": -0.2}).values
     omega = np.sqrt(1 - 0.01)
     np.testing.assert_allclose(growing, [omega / (2 * np.pi), -0.1, 0.1, 10.0])
-    top = psf.linear_modes(system_of(well, [0.0]), {"a": 3.0, "b": 3.0})
+    top = psf.mechanics.linear_modes(system_of(well, [0.0]), {"a": 3.0, "b": 3.0})
     np.testing.assert_allclose(top.values, [[0.0, -1.0, 3.0, 1 / 3]])
 
 
@@ -81,10 +81,10 @@ def test_a_rest_point_off_zero():
     """The nearest well, from a start that Newton's full step would leave for the other one."""
     params = {"a": 3.0, "b": 3.0}
     for start in (0.6, 0.9, 40.0):
-        modes = psf.linear_modes(system_of(well, [start]), params)
+        modes = psf.mechanics.linear_modes(system_of(well, [start]), params)
         np.testing.assert_allclose(modes.attrs["at"]["x0"], 1.0, rtol=1e-10)
         np.testing.assert_allclose(modes["growth_rate"], [-6.0])
-    given = psf.linear_modes(system_of(well, [5.0]), params, at=[0.5])
+    given = psf.mechanics.linear_modes(system_of(well, [5.0]), params, at=[0.5])
     np.testing.assert_allclose(given["growth_rate"], [3.0 - 9.0 * 0.25])
     assert given.attrs["at"] == {"x0": 0.5}
 
@@ -93,7 +93,7 @@ def test_inputs_and_time_are_zero():
     system = system_of(
         lambda x, u, t, k: [1.0 - k * x[0] + u[0] + t], [0.0], inputs=["force"]
     )  # fmt: skip
-    modes = psf.linear_modes(system, {"k": 2.0})
+    modes = psf.mechanics.linear_modes(system, {"k": 2.0})
     np.testing.assert_allclose(modes.attrs["at"]["x0"], 0.5)
 
 
@@ -105,21 +105,23 @@ def test_steps_have_the_logarithms_of_their_eigenvalues():
         None, [1.0, 0.0], transition=lambda x, q: [*(pt.as_tensor(F) @ x + [q[0], 0.0])], **settings
     )
     s = np.log(next(v for v in np.linalg.eigvals(F) if v.imag > 0)) / 0.5
-    modes = psf.linear_modes(turning, {})
+    modes = psf.mechanics.linear_modes(turning, {})
     np.testing.assert_allclose(modes["frequency"], [s.imag / (2 * np.pi)])
     np.testing.assert_allclose(modes["growth_rate"], [s.real])
     assert modes.attrs["eigenvalues_of"] == "step"
     flipping = system_of(
         None, [1.0, 1.0], transition=lambda x, q: [-0.5 * x[0] + q[0], 0.0 * x[1]], **settings
     )
-    ended, flipped = psf.linear_modes(flipping, {}).values
+    ended, flipped = psf.mechanics.linear_modes(flipping, {}).values
     np.testing.assert_allclose(flipped[[0, 2]], [1.0, np.log(0.5) / 0.5])
     np.testing.assert_array_equal(ended, [0.0, 1.0, -np.inf, 0.0])
 
 
 def test_a_line_of_rest_points():
     """Nothing holds the position: a mode that neither grows nor decays."""
-    modes = psf.linear_modes(system_of(lambda x, c: [x[1], -c * x[1]], [3.0, 1.0]), {"c": 2.0})
+    modes = psf.mechanics.linear_modes(
+        system_of(lambda x, c: [x[1], -c * x[1]], [3.0, 1.0]), {"c": 2.0}
+    )
     np.testing.assert_allclose(modes["growth_rate"], [0.0, -2.0], atol=1e-12)
     assert modes.attrs["at"]["x1"] == pytest.approx(0.0, abs=1e-12)
 
@@ -128,8 +130,8 @@ def test_the_steps_of_an_unpickled_system():
     """They know the drift no more; their eigenvalues differ by about the step's length."""
     system = system_of(oscillator, [1.0, 0.0], length=1e-3)
     params = {"k": 4.0, "c": 0.2}
-    exact = psf.linear_modes(system, params)
-    copied = psf.linear_modes(pickle.loads(pickle.dumps(system)), params)
+    exact = psf.mechanics.linear_modes(system, params)
+    copied = psf.mechanics.linear_modes(pickle.loads(pickle.dumps(system)), params)
     assert copied.attrs["eigenvalues_of"] == "step"
     np.testing.assert_allclose(copied["frequency"], exact["frequency"], rtol=1e-3)
     # A substep of length h turns s into log(1 + h s) / h = s - h s^2 / 2.
@@ -144,7 +146,7 @@ def draws_of(n=400):
 
 def test_draws_have_medians_and_intervals():
     system, draws = system_of(oscillator, [1.0, 0.0]), draws_of()
-    modes = psf.linear_modes(system, draws)
+    modes = psf.mechanics.linear_modes(system, draws)
     assert list(modes.columns) == [
         f"{name}{end}" for name in COLUMNS for end in ("", "_low", "_high")
     ]
@@ -157,9 +159,9 @@ def test_draws_have_medians_and_intervals():
     idata = az.from_dict({"posterior": draws | {"unused": np.zeros((2, 400, 3))}})
     named = {name: idata["posterior"][name] for name in draws}
     for posterior in (idata, idata["posterior"].to_dataset(), named):
-        assert psf.linear_modes(system, posterior).equals(modes)
+        assert psf.mechanics.linear_modes(system, posterior).equals(modes)
         turned = idata["posterior"].to_dataset().transpose("draw", "chain", ...)
-        np.testing.assert_allclose(psf.linear_modes(system, turned), modes, rtol=1e-12)
+        np.testing.assert_allclose(psf.mechanics.linear_modes(system, turned), modes, rtol=1e-12)
 
 
 def test_arrays_of_parameters():
@@ -169,8 +171,8 @@ def test_arrays_of_parameters():
     draws = draws_of()
     together = np.stack([draws["k"], draws["c"]], axis=-1)
     idata = az.from_dict({"posterior": {"k": together}})
-    expected = psf.linear_modes(system_of(oscillator, [1.0, 0.0]), draws)
-    np.testing.assert_allclose(psf.linear_modes(system, idata), expected, rtol=1e-12)
+    expected = psf.mechanics.linear_modes(system_of(oscillator, [1.0, 0.0]), draws)
+    np.testing.assert_allclose(psf.mechanics.linear_modes(system, idata), expected, rtol=1e-12)
 
 
 def test_modes_are_matched_over_draws():
@@ -188,7 +190,7 @@ def test_modes_are_matched_over_draws():
                 x[3], -k[1 - first] * x[2] - c[1 - first] * x[3]]  # fmt: skip
 
     system = system_of(drift, [0.0] * 4, shapes={"k": (2,), "c": (2,)})
-    modes = psf.linear_modes(system, {"k": k, "c": c, "order": rng.normal(size=500)})
+    modes = psf.mechanics.linear_modes(system, {"k": k, "c": c, "order": rng.normal(size=500)})
     np.testing.assert_allclose(modes["growth_rate"], -np.median(c, axis=0) / 2, rtol=1e-9)
     frequencies = np.sqrt(k - c**2 / 4) / (2 * np.pi)
     for end, prob in (("_low", 0.05), ("", 0.5), ("_high", 0.95)):
@@ -200,7 +202,7 @@ def test_rest_points_of_draws():
     """At each draw its own: the slope is -2 a there, whatever b."""
     rng = np.random.default_rng(3)
     a, b = rng.uniform(1.0, 3.0, (2, 200))
-    modes = psf.linear_modes(system_of(well, [0.9]), {"a": a, "b": b})
+    modes = psf.mechanics.linear_modes(system_of(well, [0.9]), {"a": a, "b": b})
     np.testing.assert_allclose(modes["growth_rate_low"], np.quantile(-2 * a, [0.05]), rtol=1e-9)
     assert modes.attrs["at"]["x0"] == pytest.approx(np.sqrt(np.median(a) / np.median(b)))
 
@@ -221,18 +223,20 @@ WRONG = [
 
 @pytest.mark.parametrize(("system", "params", "settings", "message"), WRONG)
 def test_what_has_no_modes(system, params, settings, message):
-    with pytest.raises(psf.ModelError, match=message):
-        psf.linear_modes(system, params, **settings)
+    with pytest.raises(psf.errors.ModelError, match=message):
+        psf.mechanics.linear_modes(system, params, **settings)
 
 
 def test_a_table_is_narrow_enough_for_a_terminal():
-    text = psf.linear_modes(PAIR, {"a": 0.5}).to_string()
+    text = psf.mechanics.linear_modes(PAIR, {"a": 0.5}).to_string()
     assert max(map(len, text.splitlines())) <= 80
-    assert len(psf.linear_modes(FORCED, {"a": 0.5})) == 1
+    assert len(psf.mechanics.linear_modes(FORCED, {"a": 0.5})) == 1
 
 
 def test_parameters_of_each_record_are_no_draws():
     draws = xr.Dataset({"a": (("chain", "draw", "patient"), np.full((2, 5, 3), 0.5))})
-    with pytest.raises(psf.ModelError, match=r"got the dimension 'patient' too: .*isel\(patient=0"):
-        psf.linear_modes(FORCED, draws)
-    assert len(psf.linear_modes(FORCED, draws.isel(patient=0))) == 1
+    with pytest.raises(
+        psf.errors.ModelError, match=r"got the dimension 'patient' too: .*isel\(patient=0"
+    ):
+        psf.mechanics.linear_modes(FORCED, draws)
+    assert len(psf.mechanics.linear_modes(FORCED, draws.isel(patient=0))) == 1

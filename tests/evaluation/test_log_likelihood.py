@@ -111,7 +111,7 @@ def test_counts_have_the_density_of_scipy():
     for filter in (psf.BootstrapPF(10), psf.PFEnKF(10)):
         (term,) = psf.log_likelihood(system, filter, point, [[4.0, 0.1]], steps=[0])
         assert term == pytest.approx(true, rel=1e-12)
-    with pytest.warns(psf.FilterWarning, match="-inf"):  # not a whole number
+    with pytest.warns(psf.errors.FilterWarning, match="-inf"):  # not a whole number
         (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), point, [[4.5, 0.1]], steps=[0])
     assert term == -np.inf
     (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), point, [[np.nan, 0.1]], steps=[0])
@@ -145,7 +145,7 @@ def test_carried_states_are_not_nudged():
     assert compile_system(system([])).free.tolist() == [0, 1]
     terms = psf.log_likelihood(system(["branch"]), psf.EnKF(50), {}, [0.3, 0.3], steps=[0, 1])
     assert np.isfinite(terms).all()
-    with pytest.raises(psf.ModelError, match="branch"):
+    with pytest.raises(psf.errors.ModelError, match="branch"):
         psf.log_likelihood(system(["branch"]), psf.EKF(), {}, [0.3], steps=[0])
 
 
@@ -188,7 +188,7 @@ def test_the_seed_is_noise_of_the_filter_alone():
 
 def test_one_warning_counts_what_failed_in_a_batch():
     with pytest.warns(
-        psf.FilterWarning, match="-inf in 2 of 3 evaluations, first in row 2"
+        psf.errors.FilterWarning, match="-inf in 2 of 3 evaluations, first in row 2"
     ) as caught:
         terms = psf.log_likelihood(
             walk(), psf.EKF(), {"a": [0.9, 1e200, 1e250], "s": 0.3}, RECORD, steps=STEPS
@@ -200,7 +200,9 @@ def test_one_warning_counts_what_failed_in_a_batch():
 
 def test_one_warning_for_collapsed_particles():
     record = np.full(4, 20.0)
-    with pytest.warns(psf.FilterWarning, match="fewer than 3 particles .* in 2 of 2") as caught:
+    with pytest.warns(
+        psf.errors.FilterWarning, match="fewer than 3 particles .* in 2 of 2"
+    ) as caught:
         psf.log_likelihood(walk(), psf.BootstrapPF(50), POINT, record, steps=STEPS, seed=[1, 2])
     assert len(caught) == 1
 

@@ -72,9 +72,11 @@ def test_threads_divide_records_and_change_nothing(filter):
         np.testing.assert_array_equal(
             psf.log_likelihood(PAIR, filter, POINT, DATA, cores=cores, **given), one
         )
-    with pytest.raises(psf.ModelError, match="cores must be an integer of at least 1, got 0"):
+    with pytest.raises(
+        psf.errors.ModelError, match="cores must be an integer of at least 1, got 0"
+    ):
         psf.log_likelihood(PAIR, filter, POINT, DATA, cores=0, **given)
-    with pytest.raises(psf.ModelError, match="cores must be 1 without a panel"):
+    with pytest.raises(psf.errors.ModelError, match="cores must be 1 without a panel"):
         psf.log_likelihood(PAIR, filter, {"a": 0.5, "b": 0.3}, DATA[:1], steps=[0], cores=2)
 
 
@@ -102,9 +104,9 @@ def test_records_have_inputs_of_their_own():
 
 
 def test_wrong_numbers_of_records_are_named():
-    with pytest.raises(psf.ModelError, match=r"parameter 'a' .* for each of the 3 records"):
+    with pytest.raises(psf.errors.ModelError, match=r"parameter 'a' .* for each of the 3 records"):
         psf.simulate(PAIR, {"a": [0.1, 0.2]}, panel=LABELS, steps=STEPS)
-    with pytest.raises(psf.ModelError, match="sort the rows by record"):
+    with pytest.raises(psf.errors.ModelError, match="sort the rows by record"):
         psf.simulate(PAIR, {"a": 0.1}, panel=[1, 2, 1], steps=[0, 0, 1])
 
 
@@ -173,14 +175,16 @@ def test_categories_texts_and_nullable_columns_are_labels_and_values():
     ],
 )
 def test_errors_of_a_table_name_record_and_row(change, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.panel_from(FRAME.assign(**change), **COLUMNS)
 
 
 def test_unknown_columns_and_empty_tables_are_refused():
-    with pytest.raises(psf.ModelError, match=r"time must name columns of frame, .* \['hour'\]"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"time must name columns of frame, .* \['hour'\]"
+    ):
         psf.panel_from(FRAME, **COLUMNS | {"time": "hour"})
-    with pytest.raises(psf.ModelError, match="at least one row"):
+    with pytest.raises(psf.errors.ModelError, match="at least one row"):
         psf.panel_from(FRAME.iloc[:0], **COLUMNS)
-    with pytest.raises(psf.ModelError, match=r"pandas.DataFrame, got dict"):
+    with pytest.raises(psf.errors.ModelError, match=r"pandas.DataFrame, got dict"):
         psf.panel_from({"site": [1]}, **COLUMNS)

@@ -117,22 +117,22 @@ REFUSED = [
 @pytest.mark.parametrize(("filter", "changes", "message"), REFUSED)
 def test_what_is_not_the_same_run_is_refused_by_name(filter, changes, message):
     first = run(PF, slice(3))
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         run(filter, slice(3, None), **{"state": first} | changes)
 
 
 def test_other_parameters_systems_and_failed_runs_are_refused():
     first = run(PF, slice(3))
     rows = {"steps": STEPS[3:], "seed": 3, "state": first}
-    with pytest.raises(psf.ModelError, match=r"parameters \[0.5\] instead of \[0.6\]$"):
+    with pytest.raises(psf.errors.ModelError, match=r"parameters \[0.5\] instead of \[0.6\]$"):
         psf.run_filter(SYSTEM, PF, {"a": 0.6}, DATA[3:], inputs=FORCE, **rows)
-    with pytest.raises(psf.ModelError, match=r"got one with another system$"):
+    with pytest.raises(psf.errors.ModelError, match=r"got one with another system$"):
         psf.run_filter(other_system(), PF, {"a": 0.5}, DATA[3:], **rows)
-    with pytest.warns(psf.FilterWarning, match="gave -inf"):
+    with pytest.warns(psf.errors.FilterWarning, match="gave -inf"):
         failed = psf.run_filter(
             SYSTEM, PF, {"a": 1e300}, DATA[:4], inputs=FORCE, seed=3, steps=STEPS[:4]
         )
-    with pytest.raises(psf.ModelError, match=r"^state must be of a run that did not fail"):
+    with pytest.raises(psf.errors.ModelError, match=r"^state must be of a run that did not fail"):
         psf.run_filter(
             SYSTEM, PF, {"a": 1e300}, DATA[4:], inputs=FORCE, seed=3, steps=STEPS[4:],
             state=failed,

@@ -125,7 +125,7 @@ PAIR_START = multivariate_normal([0.0, 0.3], [[1.5, 0.1], [0.1, 2.4]])
 def test_a_failure_leaves_what_was_known_before_it(filter, system, observed, inputs, first):
     impossible = observed.copy()
     impossible[1] *= 1e200  # its square is infinite
-    with pytest.warns(psf.FilterWarning, match="-inf"):
+    with pytest.warns(psf.errors.FilterWarning, match="-inf"):
         found = psf.run_filter(
             system, filter, POINT, impossible, steps=STEPS, inputs=inputs, at="steps"
         )
@@ -142,7 +142,7 @@ def test_where_no_particle_is_finite_the_state_is_unknown():
     # Steps of a steep cubic drift explode, long before the observation that fails.
     steep = {"alpha": 0.0, "beta": -1000.0, "sigma": 10.0}
     steep |= {"noise_var": 0.1, "initial_mean": 1.0, "initial_var": 0.1}
-    with pytest.warns(psf.FilterWarning, match="overflowed or became NaN"):
+    with pytest.warns(psf.errors.FilterWarning, match="overflowed or became NaN"):
         found = psf.run_filter(
             DOUBLE_WELL_SYSTEM, psf.BootstrapPF(50), steep, [1.0, 1.0], steps=[0, 30], at="steps"
         )
@@ -168,5 +168,5 @@ def test_where_no_particle_is_finite_the_state_is_unknown():
 def test_refusals(changes, message):
     arguments = {"filter": psf.EKF(), "params": POINT, "steps": STEPS} | changes
     filter, params = arguments.pop("filter"), arguments.pop("params")
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.run_filter(PAIR, filter, params, PAIR_DATA, **arguments)

@@ -182,7 +182,7 @@ def test_times_lie_on_the_grid_to_a_millionth_of_a_step():
     system = deterministic()
     arguments = dict(params={"a": 0.5}, inputs=np.zeros(9))
     psf.simulate(system, times=[0.5 * (4 + 9e-7)], **arguments)
-    with pytest.raises(psf.ModelError, match=r"off the grid.*nearest_steps"):
+    with pytest.raises(psf.errors.ModelError, match=r"off the grid.*nearest_steps"):
         psf.simulate(system, times=[0.5 * (4 + 2e-6)], **arguments)
 
 
@@ -240,7 +240,9 @@ def test_a_distribution_without_a_mean_has_no_simulation_without_noise():
     )  # fmt: skip
     arguments = dict(steps=[0], inputs=[0.0])
     assert psf.simulate(system, {"a": 0.5}, **arguments).observations.notnull().all()
-    with pytest.raises(psf.ModelError, match=r"the mean of every .*got cauchy_rv.*use noise=True"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"the mean of every .*got cauchy_rv.*use noise=True"
+    ):
         psf.simulate(system, {"a": 0.5}, noise=False, **arguments)
-    with pytest.raises(psf.ModelError, match="noise must be True or False, got 0"):
+    with pytest.raises(psf.errors.ModelError, match="noise must be True or False, got 0"):
         psf.simulate(system, {"a": 0.5}, noise=0, **arguments)

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence import Evidence
 from pymc_statespace_filters.evidence.agreement import assess_agreement
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS, EvidenceEstimates
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
@@ -130,7 +131,7 @@ def test_a_missing_mode_is_found_by_whoever_needs_no_draws():
 
 
 def evidence(name, log_evidence, se):
-    return psf.Evidence(log_evidence, se, name, 2, 10, -3.0, "0c5f")
+    return Evidence(log_evidence, se, name, 2, 10, -3.0, "0c5f")
 
 
 def estimates(**values):
@@ -179,9 +180,7 @@ class TestAgreement:
 
 
 def test_a_long_doubt_does_not_hide_the_errors():
-    doubtful = psf.Evidence(
-        -4.0, 0.125, "b", 2, 10, -3.0, "0c5f", doubts="the chains disagree " * 9
-    )
+    doubtful = Evidence(-4.0, 0.125, "b", 2, 10, -3.0, "0c5f", doubts="the chains disagree " * 9)
     shown = repr(EvidenceEstimates({"a": evidence("a", -4.1, 0.25), "b": doubtful}))
     for error in ("0.125", "0.250"):
         assert error in shown

@@ -260,7 +260,7 @@ def test_evidence_with_another_filter(approximate, truth):
 
 
 def test_estimators_that_need_exact_draws_are_refused(approximate):
-    with pytest.raises(psf.ModelError, match=r"importance.*got \['bridge'\]"):
+    with pytest.raises(psf.errors.ModelError, match=r"importance.*got \['bridge'\]"):
         estimate_evidence(
             approximate, model_of(psf.IPLF()), filter=psf.GridFilter(), estimators="bridge"
         )
@@ -297,7 +297,7 @@ def test_draws_that_lack_a_mode_are_said_to():
         pm.Normal("a", 0, 2)
         psf.StateSpace("d", system, psf.EKF(), steps=steps, observed=data)
     idata = az.from_dict({"posterior": {"a": a}})
-    with pytest.warns(psf.EvidenceWarning, match="lies where there are no draws"):
+    with pytest.warns(psf.errors.EvidenceWarning, match="lies where there are no draws"):
         found = reweight(idata, model, filter=psf.BootstrapPF(100), random_seed=8)
     assert found.attrs["beyond_draws"] > 0.3
     assert (found["posterior"]["a"] < 0).any()
@@ -316,30 +316,32 @@ def test_draws_that_lack_a_mode_are_said_to():
     ],
 )
 def test_a_biased_filter_is_refused(approximate, filter, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         reweight(approximate, model_of(psf.IPLF()), filter=filter)
 
 
 def test_the_filter_of_the_model_is_refused(approximate):
-    with pytest.raises(psf.ModelError, match=r"another one.*got GridFilter\(\)"):
+    with pytest.raises(psf.errors.ModelError, match=r"another one.*got GridFilter\(\)"):
         reweight(approximate, model_of(psf.GridFilter()), filter=psf.GridFilter())
 
 
 def test_a_model_without_such_a_variable_is_refused(approximate):
     with pm.Model() as model:
         pm.Normal("a", 0, 1)
-    with pytest.raises(psf.ModelError, match="observed StateSpace variable"):
+    with pytest.raises(psf.errors.ModelError, match="observed StateSpace variable"):
         reweight(approximate, model, filter=psf.GridFilter())
 
 
 def test_numbers_of_draws_that_cannot_be(approximate):
     for n_draws in (10, 10_000, 100.0):
-        with pytest.raises(psf.ModelError, match="n_draws must be an integer from 80 to 1000"):
+        with pytest.raises(
+            psf.errors.ModelError, match="n_draws must be an integer from 80 to 1000"
+        ):
             reweight(approximate, model_of(psf.IPLF()), filter=psf.GridFilter(), n_draws=n_draws)
 
 
 def test_rows_that_are_not_scored_need_a_filter_without_noise(approximate):
-    with pytest.raises(psf.ModelError, match="first 2 rows are not scored"):
+    with pytest.raises(psf.errors.ModelError, match="first 2 rows are not scored"):
         reweight(approximate, model_of(psf.IPLF(), score_from=2), filter=psf.BootstrapPF(10))
 
 
@@ -347,7 +349,7 @@ def test_draws_of_other_data_are_refused(approximate):
     stored = np.full((4, 250), -20.0) + np.arange(250)
     idata = approximate.copy()
     idata["sample_stats"] = az.from_dict({"sample_stats": {"lp": stored}})["sample_stats"]
-    with pytest.raises(psf.DataMismatchError, match="the draws belong to another model"):
+    with pytest.raises(psf.errors.DataMismatchError, match="the draws belong to another model"):
         reweight(idata, model_of(psf.IPLF()), filter=psf.GridFilter())
 
 

@@ -11,13 +11,9 @@ import xarray as xr
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters import (
-    DimensionCorrection,
-    Evidence,
-    compare_evidence,
-    prior_sensitivity,
-)
+from pymc_statespace_filters import DimensionCorrection, compare_evidence, prior_sensitivity
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence import Evidence
 from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.evidence import store_evidence
 from tests.evidence.analytic import Regression

@@ -279,11 +279,17 @@ def test_what_it_cannot_treat_is_refused():
         lambda x, q, a: [a * x[0] + q[0]], process_noise=[[1.0]], observation=lambda x: [x[0]],
         observation_noise=[[1.0]], initial_mean=[0.0], initial_cov=[[1.0]],
     )  # fmt: skip
-    with pytest.raises(psf.ModelError, match=r"must have .* an integrator, .*got \[StateSpaceMo"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"must have .* an integrator, .*got \[StateSpaceMo"
+    ):
         psf.step_error(IDATA, model_of(system=system))
-    with pytest.raises(psf.ModelError, match="halvings must be an integer of at least 1, got 0"):
+    with pytest.raises(
+        psf.errors.ModelError, match="halvings must be an integer of at least 1, got 0"
+    ):
         psf.step_error(IDATA, model_of(), halvings=0)
-    with pytest.raises(psf.ModelError, match="n_draws must be an integer of at least 20, got 5"):
+    with pytest.raises(
+        psf.errors.ModelError, match="n_draws must be an integer of at least 20, got 5"
+    ):
         psf.step_error(IDATA, model_of(), n_draws=5)
 
 
@@ -316,9 +322,11 @@ def test_a_comparison_shows_it_as_a_column(table):
 
 def test_a_comparison_refuses_what_is_no_table(table):
     message = r"evidences hold neither draws nor equations; got True for the models \['a', 'b'\]"
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.compare_evidence(EVIDENCES, step_errors=True)
-    with pytest.raises(psf.ModelError, match=r"step_errors\['a'\] must be a table of psf.step"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"step_errors\['a'\] must be a table of psf.step"
+    ):
         psf.compare_evidence(EVIDENCES, step_errors={"a": 0.1})
-    with pytest.raises(psf.ModelError, match=r"got \['c'\] for the models"):
+    with pytest.raises(psf.errors.ModelError, match=r"got \['c'\] for the models"):
         psf.compare_evidence(EVIDENCES, step_errors={"c": table})

@@ -94,7 +94,9 @@ def test_few_different_particles_are_warned_of_although_all_weights_are_equal():
     system = line()
     data = psf.simulate(system, {}, steps=STEPS, random_seed=3)["observations"].values
     exact = psf.log_likelihood(system, psf.EKF(), {}, data, steps=STEPS).sum()
-    with pytest.warns(psf.FilterWarning, match="no noise reaches the states x0, x1") as caught:
+    with pytest.warns(
+        psf.errors.FilterWarning, match="no noise reaches the states x0, x1"
+    ) as caught:
         found = psf.log_likelihood(system, psf.BootstrapPF(1000), {}, data, steps=STEPS).sum()
     assert exact - found > 100
     assert "Use EKF()" in str(caught[0].message)
@@ -104,7 +106,9 @@ def test_few_different_particles_are_warned_of_although_all_weights_are_equal():
 def test_the_remedy_for_curved_equations_works():
     system = growth()
     data = psf.simulate(system, {}, steps=STEPS, random_seed=3)["observations"].values
-    with pytest.warns(psf.FilterWarning, match=r"Use GuidedPF\(100\), which draws the start"):
+    with pytest.warns(
+        psf.errors.FilterWarning, match=r"Use GuidedPF\(100\), which draws the start"
+    ):
         psf.log_likelihood(system, psf.BootstrapPF(1000), {}, data, steps=STEPS)
     found = psf.log_likelihood(
         system, psf.GuidedPF(100), {}, data, steps=STEPS, seed=np.arange(5)

@@ -229,7 +229,7 @@ def test_observations_beyond_the_rounding_of_the_density(deviations, spread):
 def reason(observed=(1.0, 0.8), steps=(5, 10), **changes):
     """Terms of a double well and the code of the failure that the warning names."""
     parameters = double_well_parameters(DOUBLE_WELL) | changes
-    with pytest.warns(psf.FilterWarning, match="-inf") as caught:
+    with pytest.warns(psf.errors.FilterWarning, match="-inf") as caught:
         terms = psf.log_likelihood(
             DOUBLE_WELL_SYSTEM, psf.GridFilter(), parameters, observed, steps=steps
         )
@@ -274,7 +274,7 @@ def test_no_point_gives_nan():
     sizes[:, :2] *= rng.choice([-1, 1], (n, 2))
     parameters = double_well_parameters(DOUBLE_WELL) | dict(zip(names, sizes.T, strict=True))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", psf.FilterWarning)
+        warnings.simplefilter("ignore", psf.errors.FilterWarning)
         terms = psf.log_likelihood(
             DOUBLE_WELL_SYSTEM,
             psf.GridFilter(),
@@ -299,7 +299,7 @@ def refused(**changes):
         "initial_cov": [[1.0]],
     }
     system = psf.StateSpaceModel(**settings | changes)
-    with pytest.raises(psf.ModelError) as error:
+    with pytest.raises(psf.errors.ModelError) as error:
         psf.log_likelihood(system, psf.GridFilter(), {}, [0.0], steps=[1])
     return str(error.value)
 
@@ -337,7 +337,7 @@ def test_in_a_model_it_is_a_deterministic_likelihood_for_dram():
     assert model.compile_logp()({"sigma": 0.6}) == pytest.approx(expected, rel=1e-12)
     assert exactness(model)
     assert not noise_seeds(model)
-    with pytest.raises(psf.GradientUnavailableError, match="does not come with a gradient"):
+    with pytest.raises(psf.errors.GradientUnavailableError, match="does not come with a gradient"):
         model.compile_dlogp()
 
 

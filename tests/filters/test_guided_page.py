@@ -99,7 +99,7 @@ def test_equations_that_explode_leave_the_particles_unguided():
     exact = log_likelihood(psf.BootstrapPF(200_000), record, wild).sum()
     assert np.log(np.exp(terms).mean()) == pytest.approx(exact, abs=1.0)
     lost = wild | {"initial_mean": 1e3, "initial_var": 0.5}
-    with pytest.warns(psf.FilterWarning, match="overflowed or became NaN"):
+    with pytest.warns(psf.errors.FilterWarning, match="overflowed or became NaN"):
         assert log_likelihood(psf.GuidedPF(50), record, lost).tolist() == [-np.inf, -np.inf]
 
 
@@ -126,6 +126,6 @@ def test_does_not_warn_where_it_is_right():
     """The weights are uneven by design; those given the whole record count."""
     record = double_well_with_surprises()
     given = double_well_parameters(PRECISE_DOUBLE_WELL)
-    with pytest.warns(psf.FilterWarning):
+    with pytest.warns(psf.errors.FilterWarning):
         log_likelihood(psf.BootstrapPF(500), record._asdict(), given)
     log_likelihood(psf.GuidedPF(500), record._asdict(), given)

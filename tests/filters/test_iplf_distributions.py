@@ -151,7 +151,7 @@ def test_nuts_samples_the_posterior_of_counts(sixty_counts):
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()])
 def test_filters_of_gaussian_noise_name_the_one_for_distributions(filter):
-    with pytest.raises(psf.ModelError, match=r"GuidedPF\(100\).*\(exact\) and by IPLF\(\)"):
+    with pytest.raises(psf.errors.ModelError, match=r"GuidedPF\(100\).*\(exact\) and by IPLF\(\)"):
         psf.log_likelihood(counts(), filter, {}, [3], steps=[0])
 
 
@@ -162,11 +162,13 @@ def test_a_density_without_moments_is_refused():
         initial_mean=[0.0],
         initial_cov=[[1.0]],
     )
-    with pytest.raises(psf.ModelError, match="which observation_logp does not give"):
+    with pytest.raises(psf.errors.ModelError, match="which observation_logp does not give"):
         psf.log_likelihood(system, psf.IPLF(), {}, [3.0], steps=[0])
 
 
 def test_distributions_outside_the_table_are_named():
     system = observed_by(lambda x: pm.Cauchy.dist(alpha=x, beta=1.0))
-    with pytest.raises(psf.ModelError, match=r"which it knows for Bernoulli, .*; got cauchy"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"which it knows for Bernoulli, .*; got cauchy"
+    ):
         psf.log_likelihood(system, psf.IPLF(), {}, [3.0], steps=[0])

@@ -302,8 +302,11 @@ def test_counts_are_the_same_on_one_and_several_ranks():
     """Poisson, binomial and gamma noise, a start of their kind, and weekly totals."""
 
     def events(x, rate):
-        noise = psf.gamma_white_noise(0.5, 1.0)
-        return [pm.Poisson.dist(30.0 * noise), *psf.euler_multinomial(x[0], [rate], 1.0)]
+        noise = psf.compartments.gamma_white_noise(0.5, 1.0)
+        return [
+            pm.Poisson.dist(30.0 * noise),
+            *psf.compartments.euler_multinomial(x[0], [rate], 1.0),
+        ]
 
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] + q[0] - q[1], x[1] + q[1]],
@@ -343,12 +346,14 @@ def test_a_likelihood_has_few_exchanges():
 def test_a_filter_without_members_has_nothing_to_spread():
     for filter_ in (psf.EKF(), psf.GridFilter()):
         check_ranks(filter_, 1)
-        with pytest.raises(psf.ModelError, match=r"has no members to distribute over 2 ranks"):
+        with pytest.raises(
+            psf.errors.ModelError, match=r"has no members to distribute over 2 ranks"
+        ):
             check_ranks(filter_, 2)
 
 
 def test_more_ranks_than_blocks_of_members():
     check_ranks(EnKF(192), 3)
     for n_members in (192, 255):  # a part of a block is no block
-        with pytest.raises(psf.ModelError, match=r"has members for 3 of 4 ranks only"):
+        with pytest.raises(psf.errors.ModelError, match=r"has members for 3 of 4 ranks only"):
             check_ranks(EnKF(n_members), 4)

@@ -86,7 +86,7 @@ class PlainParticles:
 
     def check(self, system):
         if system.carried:
-            raise psf.ModelError("no carried states")
+            raise psf.errors.ModelError("no carried states")
 
     def is_exact_for(self, system):
         return True
@@ -142,7 +142,7 @@ def test_it_is_sampled_and_gives_evidence_and_states(cubature):
         )
         evidence = psf.chib_jeliazkov(idata, random_seed=1)
         states = psf.filtered_states(idata, n_draws=4, random_seed=2)["filtered_states"]
-        with pytest.raises(psf.ModelError, match="does not smooth; take filter="):
+        with pytest.raises(psf.errors.ModelError, match="does not smooth; take filter="):
             psf.smoothed_states(idata)
     assert idata.attrs["exact"]
     grid = np.linspace(-1.0, 1.0, 401)
@@ -163,13 +163,15 @@ def test_a_noisy_one_without_anything_else_is_sampled_with_fresh_noise():
         )
         seeds = idata.sample_stats["d_seed"].values
         assert np.unique(seeds).size > 2
-        with pytest.raises(psf.ModelError, match=r"gives no states: it has no compile_states"):
+        with pytest.raises(
+            psf.errors.ModelError, match=r"gives no states: it has no compile_states"
+        ):
             psf.filtered_states(idata)
-        with pytest.raises(psf.ModelError, match="correlation needs a filter whose normals"):
+        with pytest.raises(psf.errors.ModelError, match="correlation needs a filter whose normals"):
             psf.sample_dram(5, tune=5, chains=1, stages=1, correlation=0.9)
 
 
 @pytest.mark.parametrize("filter", [psf.EKF, PlainParticles, "EKF", None])
 def test_what_is_no_filter_is_refused(filter):
-    with pytest.raises(psf.ModelError, match=r"filter must be a filter such as psf.EKF\(\)"):
+    with pytest.raises(psf.errors.ModelError, match=r"filter must be a filter such as psf.EKF\(\)"):
         psf.log_likelihood(SYSTEM, filter, {"a": 0.5}, **RUN)

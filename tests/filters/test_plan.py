@@ -165,7 +165,7 @@ def test_a_record_that_does_not_fit_is_refused_from_python_and_from_compiled_cod
     likelihood = psf.BootstrapPF(20).compile(compile_system(PAIR))
     arguments = (RECORD_OF_PAIR | change).values()
     for function in (likelihood, likelihood.function):
-        with pytest.raises(psf.ModelError) as error:
+        with pytest.raises(psf.errors.ModelError) as error:
             function(*arguments)
         assert str(error.value) == Refusal(status).message
 

@@ -56,7 +56,7 @@ def evaluate(filter, points):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         terms = psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, points, **RECORD, seed=np.arange(n))
-    assert {one.category for one in caught} == {psf.FilterWarning}
+    assert {one.category for one in caught} == {psf.errors.FilterWarning}
     reasons = {
         failure.message: int(count)
         for failure in Failure

@@ -79,7 +79,7 @@ def test_a_refusal_names_the_filters_that_take_the_system(name):
     for filter in (psf.EKF(), psf.EnKF(10), psf.IPLF(), psf.GridFilter()):
         if type(filter).__name__ in expected:
             continue
-        with pytest.raises(psf.ModelError) as caught:
+        with pytest.raises(psf.errors.ModelError) as caught:
             psf.log_likelihood(model, filter, {}, [1.0], steps=[1])
         for known in kinds(filters_for(compile_system(SYSTEMS["one state"][0]))):
             recommended = re.search(rf"\b{known}\(", str(caught.value)) is not None
@@ -149,7 +149,9 @@ def test_a_gradient_is_offered_by_filters_that_take_the_system():
         pm.Normal("free")
         counts = system(**COUNTS, transition=lambda x, q, free: free * x[0] + q[0])
         psf.StateSpace("d", counts, psf.BootstrapPF(9), steps=[1], observed=[1])
-        with pytest.raises(psf.GradientUnavailableError, match=r"BootstrapPF\(9\)") as caught:
+        with pytest.raises(
+            psf.errors.GradientUnavailableError, match=r"BootstrapPF\(9\)"
+        ) as caught:
             model.dlogp()
     assert "gradient: IPLF()." in str(caught.value)
     assert "EKF" not in str(caught.value)

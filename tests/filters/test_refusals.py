@@ -23,7 +23,7 @@ def system(initial_cov=lambda p: [[p]]):
 @pytest.mark.parametrize("negative", ["p", "s", "r"])
 def test_a_negative_variance_is_impossible(filter, negative):
     params = {"p": 1.0, "s": 0.3, "r": 0.5} | {negative: -0.2}
-    with pytest.warns(psf.FilterWarning, match="gave -inf: .* not positive semidefinite"):
+    with pytest.warns(psf.errors.FilterWarning, match="gave -inf: .* not positive semidefinite"):
         terms = psf.log_likelihood(system(), filter, params, [0.3, 0.1], steps=[1, 2])
     assert (terms == -np.inf).all()
 

@@ -279,7 +279,7 @@ def test_a_fine_sensor_that_loses_the_sign_reads_both_densities(sd):
 
 @pytest.mark.parametrize("far", [30.0, 1e6])
 def test_an_observation_beyond_what_doubles_hold_is_named(far):
-    with pytest.warns(psf.FilterWarning, match=Failure(TOO_FAR).message):
+    with pytest.warns(psf.errors.FilterWarning, match=Failure(TOO_FAR).message):
         terms = psf.log_likelihood(LOG, psf.GridFilter(), {}, [0.4, far, 0.3], steps=np.arange(3))
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()

@@ -79,11 +79,11 @@ TABLE += [
 
 @pytest.mark.parametrize(("make", "argument", "value", "message"), TABLE)
 def test_wrong_settings_are_named_with_their_values(make, argument, value, message):
-    with pytest.raises(psf.ModelError, match=f"{message}, got ") as caught:
+    with pytest.raises(psf.errors.ModelError, match=f"{message}, got ") as caught:
         make(**{argument: value})
     assert str(caught.value).removesuffix(".").endswith(f"got {value!r}")
 
 
 def test_a_number_beyond_memory_is_refused():
-    with pytest.raises(psf.ModelError, match=r"n_particles .*to 1e.08"):
+    with pytest.raises(psf.errors.ModelError, match=r"n_particles .*to 1e.08"):
         psf.BootstrapPF(10**30)

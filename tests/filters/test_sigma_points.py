@@ -410,7 +410,7 @@ def test_impossible_settings_and_systems_are_refused(filter):
         lambda x: [x[0]], lambda x: [x[0]], observation_noise=[[1.0]], initial_mean=[0.0],
         initial_cov=[[1.0]], states=["branch"], carried=["branch"],
     )  # fmt: skip
-    with pytest.raises(psf.ModelError, match=rf"{name} cannot treat the carried states"):
+    with pytest.raises(psf.errors.ModelError, match=rf"{name} cannot treat the carried states"):
         psf.log_likelihood(memory, filter, {}, [0.3], steps=[0])
 
 

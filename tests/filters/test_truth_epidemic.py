@@ -20,9 +20,9 @@ def epidemic_system(epidemic, dt):
         rate = infection * (I + imported) / population
         return [
             births,
-            *psf.euler_multinomial(S, [rate, turnover], dt),
-            *psf.euler_multinomial(E, [latency, turnover], dt),
-            *psf.euler_multinomial(I, [recovery, turnover], dt),
+            *psf.compartments.euler_multinomial(S, [rate, turnover], dt),
+            *psf.compartments.euler_multinomial(E, [latency, turnover], dt),
+            *psf.compartments.euler_multinomial(I, [recovery, turnover], dt),
         ]
 
     def step(x, q):

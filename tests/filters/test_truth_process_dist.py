@@ -23,7 +23,7 @@ RECORD = {"observed": np.array([3.0, 1.0, 2.0, 4.0]), "steps": np.array([0, 1, 3
 def check_mean_likelihood(system, params, record, exact, n_particles=20):
     """Compare the mean likelihood with the exact one."""
     with warnings.catch_warnings():  # of few particles, which leave the mean as it is
-        warnings.simplefilter("ignore", psf.FilterWarning)
+        warnings.simplefilter("ignore", psf.errors.FilterWarning)
         terms = psf.log_likelihood(
             system, psf.BootstrapPF(n_particles), params, **record, seed=np.arange(N_SEEDS)
         )
@@ -184,7 +184,7 @@ def test_no_normal_variable_has_an_infinite_variance(law, mean):
     )
     record = {"observed": [0.5, 1.0], "steps": [1, 2]}
     for filter in (psf.EKF(), psf.UKF(), psf.IPLF(), psf.EnKF(20)):
-        with pytest.warns(psf.FilterWarning, match="-inf in 2 of 3"):
+        with pytest.warns(psf.errors.FilterWarning, match="-inf in 2 of 3"):
             terms = psf.log_likelihood(system, filter, {"nu": [2.1, 2.0, 1.5]}, **record)
         assert np.isfinite(terms[0]).all()
         assert (terms[1:] == -np.inf).all()
@@ -248,7 +248,7 @@ def test_members_below_zero_stay_in_the_ensemble():
 def test_other_filters_refuse_and_name_those_that_do_not(filter, message):
     named = r"BootstrapPF\(1000\) \(exact\) and by EKF\(\), IPLF\(\), UKF\(\), EnKF\(1000\) \(appr"
     params = {"lam": 3.0, "mu": 0.3, "start": 8.0}
-    with pytest.raises(psf.ModelError, match=message + named):
+    with pytest.raises(psf.errors.ModelError, match=message + named):
         psf.log_likelihood(immigration(), filter, params, [1.0], steps=[1])
 
 
@@ -261,5 +261,7 @@ def test_a_regime_is_no_member_of_an_ensemble():
         initial_dist=lambda: [1.0, 0.0],
         carried=["x1"],
     )
-    with pytest.raises(psf.ModelError, match=r"carried states \['x1'\], such as the number of"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"carried states \['x1'\], such as the number of"
+    ):
         psf.log_likelihood(system, psf.EnKF(10), {}, [1.0], steps=[1])

@@ -26,7 +26,7 @@ def test_bootstrap_filter_falls_far_below_the_truth_and_warns_once():
             steps=record.steps,
             seed=np.arange(6),
         )
-    assert [w.category for w in caught] == [psf.FilterWarning]
+    assert [w.category for w in caught] == [psf.errors.FilterWarning]
     message = str(caught[0].message)
     assert np.isfinite(terms).all()
 
@@ -61,7 +61,7 @@ def test_the_remedy_where_no_exact_filter_is():
         initial_cov=[[0.1, 0.0], [0.0, 0.1]],
     )
     with pytest.warns(
-        psf.FilterWarning, match="these are 1 of 2 terms, j = 1; at 5 seeds"
+        psf.errors.FilterWarning, match="these are 1 of 2 terms, j = 1; at 5 seeds"
     ) as caught:
         psf.log_likelihood(system, psf.BootstrapPF(30), {}, [1.0, 60.0], steps=[0, 1])
     (message,) = (str(w.message) for w in caught)

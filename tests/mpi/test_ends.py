@@ -23,14 +23,14 @@ def ends(comm):
     quick = call | {"draws": 20, "tune": 10}
     heard = []
 
-    with pytest.raises((ValueError, psf.ParallelError)) as caught:
+    with pytest.raises((ValueError, psf.errors.ParallelError)) as caught:
         psf.sample_dram(**quick, progressbar="sideways")
     heard.append(str(caught.value))
 
     with pytest.MonkeyPatch.context() as patch:
         if comm.rank == 0:
             patch.setattr(ChainTask, "run", _fails_when_others_are_done)
-        with pytest.raises((ArithmeticError, psf.ParallelError)) as caught:
+        with pytest.raises((ArithmeticError, psf.errors.ParallelError)) as caught:
             psf.sample_dram(**quick, progressbar=False, gather="all")
     heard.append(str(caught.value))
 

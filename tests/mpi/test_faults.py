@@ -69,7 +69,7 @@ def disagreements(comm):
     ]
     heard = []
     for changes in variants:
-        with pytest.raises(psf.DataMismatchError) as caught:
+        with pytest.raises(psf.errors.DataMismatchError) as caught:
             psf.run_models(**{"models": {"M": model}} | call | (changes if comm.rank == 1 else {}))
         heard.append(str(caught.value))
     return heard

@@ -26,12 +26,12 @@ def likelihoods(comm):
 def refusals(comm):
     refused = []
     for filter_ in (psf.EnKF(64), psf.EKF()):
-        with pytest.raises(psf.ModelError) as raised:
+        with pytest.raises(psf.errors.ModelError) as raised:
             psf.log_likelihood(PAIR, filter_, POINTS, PAIR_DATA, steps=STEPS, comm=comm)
         refused.append(str(raised.value))
     for other in ({"seed": comm.rank}, {"params": {"a": 0.9 + comm.rank, "b": 0.1}}):
         call = {"params": {"a": 0.9, "b": 0.1}, "seed": 1} | other
-        with pytest.raises(psf.DataMismatchError, match="on rank 1 of 2 than"):
+        with pytest.raises(psf.errors.DataMismatchError, match="on rank 1 of 2 than"):
             psf.log_likelihood(
                 PAIR, psf.EnKF(130), observed=PAIR_DATA, steps=STEPS, comm=comm, **call
             )

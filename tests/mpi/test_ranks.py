@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from pymc_statespace_filters import ParallelError
+from pymc_statespace_filters.errors import ParallelError
 from pymc_statespace_filters.parallel import communicator
 from pymc_statespace_filters.parallel.communicator import communicator_of
 from tests.mpi.launch import on_ranks

@@ -52,7 +52,7 @@ def refusals(comm):
     ]
     said = []
     for filter, changes in asked:
-        with pytest.raises((psf.ModelError, psf.ParallelError)) as caught:
+        with pytest.raises((psf.errors.ModelError, psf.errors.ParallelError)) as caught:
             psf.sample_dram(model=state_space_model(filter), **settings | changes)
         said.append(str(caught.value))
     return said

@@ -54,7 +54,7 @@ def test_a_launcher_of_another_mpi():
 def refusals(comm):
     from mpi4py import MPI
 
-    from pymc_statespace_filters import ModelError, ParallelError
+    from pymc_statespace_filters.errors import ModelError, ParallelError
     from pymc_statespace_filters.parallel.communicator import communicator_of
 
     freed = comm.Dup()
@@ -84,7 +84,7 @@ def test_communicators_that_cannot_be_used():
 def different(comm):
     if comm.rank == 1:
         os.environ |= {"NUMBA_CPU_NAME": "nocona", "NUMBA_CPU_FEATURES": ""}
-    from pymc_statespace_filters import ParallelError, ParallelWarning
+    from pymc_statespace_filters.errors import ParallelError, ParallelWarning
     from pymc_statespace_filters.parallel.communicator import communicator_of
 
     with pytest.raises(ParallelError, match=r"nocona .* on rank 1.* NUMBA_CPU_NAME=x86-64-v3"):

@@ -98,16 +98,18 @@ def test_a_step_of_one_task_is_no_launch(monkeypatch):
 
 @pytest.mark.parametrize("comm", ["wrold", 91, b"world", Intracomm(2)])
 def test_another_type_is_refused_without_mpi(comm):
-    with pytest.raises(psf.ModelError, match=r"comm must be None, 'world' or an intracomm.*, got "):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"comm must be None, 'world' or an intracomm.*, got "
+    ):
         mpi_communicator(comm)
     assert "mpi4py" not in sys.modules
 
 
 def test_other_objects_of_mpi_are_refused(loaded):
     loaded()
-    with pytest.raises(psf.ModelError, match="intracommunicator"):
+    with pytest.raises(psf.errors.ModelError, match="intracommunicator"):
         mpi_communicator(Comm(2))
-    with pytest.raises(psf.ModelError, match=r"got MPI.COMM_NULL: it was freed, or"):
+    with pytest.raises(psf.errors.ModelError, match=r"got MPI.COMM_NULL: it was freed, or"):
         mpi_communicator(Comm(0))
 
 
@@ -120,14 +122,14 @@ def test_other_objects_of_mpi_are_refused(loaded):
 )
 def test_mpi_must_be_running(loaded, state, words):
     mpi = loaded(**state)
-    with pytest.raises(psf.ParallelError, match=words):
+    with pytest.raises(psf.errors.ParallelError, match=words):
         mpi_communicator(mpi.COMM_WORLD)
 
 
 def test_mpi4py_is_missing(monkeypatch):
     monkeypatch.setenv("PMI_SIZE", "2")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
-    with pytest.raises(psf.ParallelError, match="pip install mpi4py"):
+    with pytest.raises(psf.errors.ParallelError, match="pip install mpi4py"):
         mpi_communicator("world")
 
 
@@ -142,7 +144,7 @@ def test_the_library_is_missing(monkeypatch, error):
     monkeypatch.setenv("PMI_SIZE", "2")
     monkeypatch.setitem(sys.modules, "mpi4py", Package("mpi4py"))
     cures = r"\(cannot load MPI library\).*filters\[mpi\]'.*apt install.*module load"
-    with pytest.raises(psf.ParallelError, match=cures):
+    with pytest.raises(psf.errors.ParallelError, match=cures):
         mpi_communicator("world")
 
 
@@ -152,7 +154,7 @@ def test_a_launcher_of_another_mpi(variable, comm, loaded, monkeypatch):
     loaded(world=1)
     monkeypatch.setenv(variable, "4")
     words = rf"4 ranks were started together \({variable}=4\), but none sees .*Open MPI"
-    with pytest.raises(psf.ParallelError, match=words):
+    with pytest.raises(psf.errors.ParallelError, match=words):
         mpi_communicator(comm)
 
 
@@ -167,7 +169,7 @@ def test_threads_that_may_not_call_mpi(loaded):
     loaded(threads=3)
     mpi_module.check_threads()
     loaded(threads=1)
-    with pytest.raises(psf.ParallelError, match=r"MPI_THREAD_MULTIPLE.*ranks_per_chain=1"):
+    with pytest.raises(psf.errors.ParallelError, match=r"MPI_THREAD_MULTIPLE.*ranks_per_chain=1"):
         mpi_module.check_threads()
 
 
@@ -183,7 +185,7 @@ def test_ranks_that_are_alike():
 def test_ranks_that_differ_may_run_chains():
     reports = [HERE, HERE | {"numba": "0.61.2"}, HERE]
     words = "The ranks differ: numba 0.68.0 on ranks 0, 2, 0.61.2 on rank 1. The draws"
-    with pytest.warns(psf.ParallelWarning, match=words):
+    with pytest.warns(psf.errors.ParallelWarning, match=words):
         environment.check_environments(reports, 0, in_lockstep=False)
     with warnings.catch_warnings(action="error"):
         environment.check_environments(reports, 1, in_lockstep=False)
@@ -193,5 +195,5 @@ def test_ranks_that_differ_may_not_share_a_likelihood():
     reports = [HERE, HERE | {"processor": "skylake"}]
     words = "same environment, got processor znver3 on rank 0, skylake on rank 1. .*NUMBA_CPU_NAME="
     for rank in range(2):
-        with pytest.raises(psf.ParallelError, match=words):
+        with pytest.raises(psf.errors.ParallelError, match=words):
             environment.check_environments(reports, rank, in_lockstep=True)

@@ -7,7 +7,8 @@ import pytest
 import xarray as xr
 from scipy.stats import norm
 
-from pymc_statespace_filters import Evidence, average_models, compare_evidence
+from pymc_statespace_filters import average_models, compare_evidence
+from pymc_statespace_filters.evidence import Evidence
 
 X = xr.DataArray(np.linspace(-2, 2, 9), coords=[("displacement", np.linspace(-2, 2, 9))])
 

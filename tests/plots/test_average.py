@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 from scipy.integrate import trapezoid
 
-from pymc_statespace_filters import ModelError, average_models, plot_average
+from pymc_statespace_filters import average_models, plot_average
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.drawn import drawn
 
 

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import ModelError, plot_evidence
+from pymc_statespace_filters import plot_evidence
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.evidence import store_evidence
 from pymc_statespace_filters.plots.canvas import linear_ticks
 from tests.plots.conftest import an_evidence

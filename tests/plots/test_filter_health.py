@@ -8,7 +8,8 @@ import pytest
 import xarray as xr
 from scipy.stats import kstest, norm
 
-from pymc_statespace_filters import ModelError, plot_filter_health
+from pymc_statespace_filters import plot_filter_health
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.conftest import TIMES
 from tests.plots.drawn import drawn
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import ModelError, plot_forecast
+from pymc_statespace_filters import plot_forecast
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.conftest import TIMES
 from tests.plots.drawn import drawn
 

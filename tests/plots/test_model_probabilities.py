@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pymc_statespace_filters import ModelError, compare_evidence, plot_model_probabilities
+from pymc_statespace_filters import compare_evidence, plot_model_probabilities
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.drawn import drawn
 
 

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import (
-    DimensionCorrection,
-    ModelError,
-    compare_evidence,
-    plot_prior_sensitivity,
-)
+from pymc_statespace_filters import DimensionCorrection, compare_evidence, plot_prior_sensitivity
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.drawn import drawn
 
 PRIOR = {"linear": 3, "cubic": 1, "quintic": 2}

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import ModelError, plot_states
+from pymc_statespace_filters import plot_states
+from pymc_statespace_filters.errors import ModelError
 from tests.plots.conftest import TIMES, states_group
 from tests.plots.drawn import drawn
 

@@ -128,9 +128,9 @@ def test_too_many_states_for_an_order_are_refused():
     wide = system(9)
     model = one_variable(psf.BootstrapPF(20), wide)
     message = "resampling='sorted' orders particles of at most 8 states, this system has 9"
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         autoregressive_noise([model.logp()], noise_seeds(model))
     for filter in (psf.BootstrapPF, psf.PFEnKF):
-        with pytest.raises(psf.ModelError, match=message):
+        with pytest.raises(psf.errors.ModelError, match=message):
             one_variable(filter(20, resampling="sorted"), wide)
     autoregressive_noise([one_variable(psf.EnKF(20), wide).logp()], noise_seeds(model))

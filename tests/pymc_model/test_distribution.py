@@ -304,5 +304,5 @@ def test_a_misspelt_parameter_is_shown_among_the_models_variables():
             r"no value for the parameters \['phi'\]; the model's variables are \['fi', 'spread'\]: "
             "name one so, or give the value in params"
         )
-        with pytest.raises(psf.ModelError, match=words):
+        with pytest.raises(psf.errors.ModelError, match=words):
             psf.StateSpace("d", autoregression(), psf.EKF(), steps=[1], observed=[0.3])

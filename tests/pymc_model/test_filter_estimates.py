@@ -101,7 +101,7 @@ def test_a_filter_that_cannot_treat_the_system_is_refused():
             steps=[1],
             observed=[0.3],
         )
-    with pytest.raises(psf.ModelError, match="GridFilter"):
+    with pytest.raises(psf.errors.ModelError, match="GridFilter"):
         VariableAtPoints(model, "d", np.zeros((1, 1))).log_likelihood(
             psf.GridFilter(), NO_SEEDS[:1]
         )

@@ -303,13 +303,13 @@ def test_other_samplers_run_on_estimates_and_leave_the_seed_alone():
         assert len(np.unique(idata["posterior"]["a"])) > 5
         assert model["d_seed"].get_value() == 3
         assert idata["constant_data"]["d_seed"] == 3
-        with pytest.warns(psf.FilterWarning, match="one noise seed throughout") as caught:
+        with pytest.warns(psf.errors.FilterWarning, match="one noise seed throughout") as caught:
             idata = pm.sample(step=pm.DEMetropolisZ(), **SHORT)
         assert caught[0].filename == __file__
         assert len(np.unique(idata["posterior"]["a"])) > 5
         assert model["d_seed"].get_value() == 3
         settings = {k: SHORT[k] for k in ("draws", "chains", "random_seed", "progressbar")}
-        with pytest.warns(psf.FilterWarning, match="one noise seed throughout"):
+        with pytest.warns(psf.errors.FilterWarning, match="one noise seed throughout"):
             idata = pm.sample_smc(**settings, cores=1, compute_convergence_checks=False)
         assert len(np.unique(idata["posterior"]["a"])) > 5
         assert model["d_seed"].get_value() == 3

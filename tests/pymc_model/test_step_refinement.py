@@ -134,7 +134,9 @@ def test_an_incomplete_integrator_is_refused():
         def step(self, values):
             return values["x"]
 
-    with pytest.raises(psf.ModelError, match="without noise_size, substep, refined, is_stable_at"):
+    with pytest.raises(
+        psf.errors.ModelError, match="without noise_size, substep, refined, is_stable_at"
+    ):
         linear_by(Step())
 
 

@@ -97,7 +97,7 @@ def test_errors_are_those_of_the_graph():
         observed = pm.Data("observed", np.ones((8, 1)), dims=("row", "column"))
         psf.StateSpace("d", SYSTEM, psf.EKF(), steps=np.arange(1, 9), observed=observed)
     model["observed"].set_value(np.ones((5, 1)))
-    with pytest.raises(psf.ModelError, match="observed must have a row for each step"):
+    with pytest.raises(psf.errors.ModelError, match="observed must have a row for each step"):
         ModelDensity(model).evaluate(np.zeros((1, 1)))
 
 

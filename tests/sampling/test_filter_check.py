@@ -41,7 +41,7 @@ def outcome_of(idata):
 
 
 def test_a_filter_that_is_off_is_warned_of_at_the_call():
-    with pytest.warns(psf.FilterWarning, match=r"d: EKF\(\) is .* Use G") as caught:
+    with pytest.warns(psf.errors.FilterWarning, match=r"d: EKF\(\) is .* Use G") as caught:
         idata = psf.sample_dram(model=model_of(1.0), progressbar=False, **SETTINGS)
     assert [one.filename for one in caught] == [__file__]
     assert outcome_of(idata) == "off"
@@ -66,7 +66,7 @@ def test_nothing_is_said_where_nothing_was_compared(caplog):
 
 def test_several_models_are_named():
     models = {"bent": model_of(1.0), "exact": model_of(1.0, psf.GridFilter())}
-    with pytest.warns(psf.FilterWarning, match=r"^Model 'bent': d: EKF") as caught:
+    with pytest.warns(psf.errors.FilterWarning, match=r"^Model 'bent': d: EKF") as caught:
         trees = psf.run_models(models, progressbar=False, **SETTINGS)
     assert len(caught) == 1
     assert {name: outcome_of(tree) for name, tree in trees.items()} == {

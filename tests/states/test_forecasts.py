@@ -113,7 +113,9 @@ def test_inputs_of_the_model_reach_beyond_its_record():
     for i in (0, 1):
         part = group.to_dataset().isel(draw=slice(i, None, 2))
         assert_drawn_from(joined(part), *pushed_joint_law(gains[i] * LONG_FORCE), RATE)
-    with pytest.raises(psf.ModelError, match=r"end after 12 rows, and step 12 needs 13: give inp"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"end after 12 rows, and step 12 needs 13: give inp"
+    ):
         predictions(posterior(gain=A), model, n_steps=6)
 
 
@@ -143,7 +145,7 @@ def test_parameters_that_no_draw_changes():
 def test_a_draw_at_which_the_filter_fails_has_no_forecast():
     values = A.copy()
     values[1, 0] = 1e300
-    with pytest.warns(psf.FilterWarning, match=r"in 1 of 6 evaluations") as warned:
+    with pytest.warns(psf.errors.FilterWarning, match=r"in 1 of 6 evaluations") as warned:
         group = psf.forecast(posterior(a=values), pair_model(), n_steps=2)["predictions"]
     assert [w.filename for w in warned] == [__file__]
     failed = np.zeros(SHAPE, dtype=bool)
@@ -158,7 +160,7 @@ def test_counts_are_forecast_as_counts():
     model = counted_model(initial_mean=0.0)
     values = np.tile([0.3, 1.3], (2, 1500))
     values[1, 0] = 1e300  # the filter fails, and no count is that of an unknown rate
-    with pytest.warns(psf.FilterWarning, match="in 1 of 6000 evaluations"):
+    with pytest.warns(psf.errors.FilterWarning, match="in 1 of 6000 evaluations"):
         group = predictions(posterior(level=values), model, n_steps=30).to_dataset().isel(d_time=-1)
     assert group["d"].isnull().sum() == group["d"][1, 0].isnull().sum() == 1
     for i, c in enumerate((0.3, 1.3)):
@@ -219,7 +221,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG)
 def test_what_cannot_be_forecast(arguments, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.forecast(posterior(a=A), pushed_model(), **arguments)
 
 

@@ -223,7 +223,9 @@ def test_counts():
 def test_a_run_that_diverges():
     values = np.full(SHAPE, 0.5)
     values[1, 2] = 1e200
-    with pytest.warns(psf.FilterWarning, match="leaves the finite numbers at 1 of 6 draws") as w:
+    with pytest.warns(
+        psf.errors.FilterWarning, match="leaves the finite numbers at 1 of 6 draws"
+    ) as w:
         group = psf.free_run(posterior(a=values), pair_model(), observed=PAIR_DATA)["free_run"]
     assert [one.filename for one in w] == [__file__]
     failed = np.zeros(SHAPE, dtype=bool)
@@ -234,7 +236,7 @@ def test_a_run_that_diverges():
     clean = runs(posterior(a=values[:1]), pair_model(), observed=PAIR_DATA)
     np.testing.assert_allclose(group["d_rmse"], clean["d_rmse"], rtol=1e-12)
     np.testing.assert_array_equal(group["d_rmse_of_draws"].isnull()[..., 0], failed)
-    with pytest.warns(psf.FilterWarning, match="at 6 of 6 draws"):
+    with pytest.warns(psf.errors.FilterWarning, match="at 6 of 6 draws"):
         group = runs(posterior(a=np.full(SHAPE, 1e200)), pair_model(), observed=PAIR_DATA)
     assert group["d_coverage"].isnull().all()
 
@@ -264,7 +266,7 @@ def test_several_variables():
     one = runs(posterior(a=A), model, var_name="push", observed=FORCED_DATA)
     np.testing.assert_array_equal(one["push"], group["push"])
     assert "d" not in one
-    with pytest.raises(psf.ModelError, match=r"give var_name, one of \['d', 'push'\]"):
+    with pytest.raises(psf.errors.ModelError, match=r"give var_name, one of \['d', 'push'\]"):
         psf.free_run(posterior(a=A), model, observed=FORCED_DATA)
 
 
@@ -281,5 +283,5 @@ WRONG = [
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG)
 def test_what_cannot_be_run(arguments, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.free_run(posterior(a=A), pushed_model(), **arguments)

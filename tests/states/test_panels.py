@@ -238,7 +238,8 @@ def test_inputs_that_depend_on_free_variables():
 def test_one_warning_for_failures_of_all_records():
     idata = posterior(a=np.where(A > 0.5, 1e200, A))
     with pytest.warns(
-        psf.FilterWarning, match=r"gave -inf in \d+ of 30 evaluations, of records 'b', 'a', 'c'"
+        psf.errors.FilterWarning,
+        match=r"gave -inf in \d+ of 30 evaluations, of records 'b', 'a', 'c'",
     ):
         psf.filtered_states(idata, panel_model())
 
@@ -253,5 +254,5 @@ def test_a_collapse_is_repeated_in_the_record_where_it_was():
             "d", FORCED, PARTICLES, panel=LABELS, steps=STEPS, observed=surprising, inputs=FORCES
         )
     told = r"of record 'c' \(.* these are 1 of 2 terms, j = 1"
-    with pytest.warns(psf.FilterWarning, match=told):
+    with pytest.warns(psf.errors.FilterWarning, match=told):
         psf.filtered_states(posterior(a=A), model, random_seed=1)

@@ -156,7 +156,9 @@ def test_evenly_spread_draws_of_every_chain():
 def test_one_warning_where_the_user_called(name):
     values = A.copy()
     values[0, 1] = values[1, 2] = 1e300
-    with pytest.warns(psf.FilterWarning, match=r"^EKF\(\) gave -inf in 2 of 6 eval") as warned:
+    with pytest.warns(
+        psf.errors.FilterWarning, match=r"^EKF\(\) gave -inf in 2 of 6 eval"
+    ) as warned:
         CALLS[name](posterior(a=values), pair_model())
     assert [w.filename for w in warned] == [__file__]
 
@@ -165,7 +167,7 @@ def test_one_warning_where_the_user_called(name):
 def test_failing_draws_are_unknown_from_the_failure_on(moment):
     values = A.copy()
     values[0, 1] = 1e300
-    with pytest.warns(psf.FilterWarning):
+    with pytest.warns(psf.errors.FilterWarning):
         idata = CALLS[f"{moment}_states"](posterior(a=values), pair_model())
     group = idata[f"{moment}_states"]
     n_known = 1 if moment == "filtered" else 0
@@ -241,12 +243,14 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_does_not_fit_is_refused(case, name):
     idata, model, settings, message = REFUSED[case]
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         CALLS[name](idata, model(), **settings)
 
 
 @pytest.mark.parametrize("at", ["observation", 3, ["steps"]])
 def test_rows_are_at_observations_or_steps(at):
     for call in (psf.filtered_states, psf.smoothed_states):
-        with pytest.raises(psf.ModelError, match=r"at must be one of \['observations', 'steps'\]"):
+        with pytest.raises(
+            psf.errors.ModelError, match=r"at must be one of \['observations', 'steps'\]"
+        ):
             call(GOOD, pair_model(), at=at)

@@ -74,7 +74,7 @@ def test_seeds_of_another_run_are_refused(model, seeds, function):
         r"d_seed in sample_stats of idata is of another run or another model: with it "
         r"BootstrapPF\(.*\) fails at 3 of 6 draws, at which their chain had a finite likelihood"
     )
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         function(idata_of(mixed, filter=json.dumps({"d": repr(FILTER)})), model)
 
 
@@ -91,7 +91,7 @@ def test_numbers_that_are_no_seeds_are_refused(model, seeds, value):
     numbers = seeds[0].astype(float)
     numbers[0, 1] = value
     with pytest.raises(
-        psf.ModelError, match=r"^d_seed .* must be noise seeds, .* in 1 of 6 places"
+        psf.errors.ModelError, match=r"^d_seed .* must be noise seeds, .* in 1 of 6 places"
     ):
         psf.filtered_states(idata_of(numbers), model)
 
@@ -99,5 +99,7 @@ def test_numbers_that_are_no_seeds_are_refused(model, seeds, value):
 def test_seeds_without_draws_are_refused(model, seeds):
     idata = idata_of(seeds[0])
     idata["sample_stats"]["d_seed"] = idata["sample_stats"]["d_seed"].isel(draw=0, drop=True)
-    with pytest.raises(psf.ModelError, match=r"^d_seed .* must have the dimensions chain and draw"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"^d_seed .* must have the dimensions chain and draw"
+    ):
         psf.filtered_states(idata, model)

@@ -171,7 +171,7 @@ def test_a_record_that_machine_code_refuses():
     observed = pytensor.shared(PAIR_DATA)
     model = pair_model(observed=observed)
     observed.set_value(PAIR_DATA[:2])
-    with pytest.raises(psf.ModelError, match="a row for each step"):
+    with pytest.raises(psf.errors.ModelError, match="a row for each step"):
         psf.filtered_states(posterior(a=MANY), model)
 
 

@@ -139,7 +139,7 @@ def test_draws_in_another_order_of_dimensions():
 
 def test_draws_must_be_finite():
     idata = posterior(a=np.where(A == A.flat[0], np.nan, A))
-    with pytest.raises(psf.ModelError, match="'a' in idata must be finite, got 1 of"):
+    with pytest.raises(psf.errors.ModelError, match="'a' in idata must be finite, got 1 of"):
         psf.filtered_states(idata, pair_model())
 
 
@@ -283,5 +283,5 @@ def test_seeds_belong_to_the_draws_of_their_labels():
     np.testing.assert_array_equal(found, means.isel(kept))
     others = thinned["posterior"].to_dataset().assign_coords(draw=[7, 8])
     thinned["posterior"] = xr.DataTree(others)
-    with pytest.raises(psf.ModelError, match="not among those of sample_stats"):
+    with pytest.raises(psf.errors.ModelError, match="not among those of sample_stats"):
         psf.filtered_states(thinned, model)

@@ -233,10 +233,10 @@ def test_the_inputs_remain_the_users():
     assert copy.fingerprint == SYSTEM.fingerprint
     assert rate_and_total(accumulators=[]).fingerprint != SYSTEM.fingerprint
     with pytest.raises(
-        psf.ModelError, match=r"shape \(steps, 1\), a column for each of \['push'\]"
+        psf.errors.ModelError, match=r"shape \(steps, 1\), a column for each of \['push'\]"
     ):
         psf.simulate(SYSTEM, {"a": A}, steps=STEPS, inputs=np.zeros((14, 2)))
-    with pytest.raises(psf.ModelError, match=r"inputs must have at least 8 rows"):
+    with pytest.raises(psf.errors.ModelError, match=r"inputs must have at least 8 rows"):
         model_of(inputs=PUSH[:6])
     found = psf.filter_diagnostics(
         posterior(a=np.full((1, 3), A)), model_of(), random_seed=1, progressbar=False
@@ -246,11 +246,13 @@ def test_the_inputs_remain_the_users():
 
 def test_names_that_are_no_states_are_refused():
     message = r"accumulators must name states, \['rate', 'total'\], got \['cases'\]"
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         rate_and_total(accumulators=["cases"])
-    with pytest.raises(psf.ModelError, match="accumulators must be a list of names, got 'total'"):
+    with pytest.raises(
+        psf.errors.ModelError, match="accumulators must be a list of names, got 'total'"
+    ):
         rate_and_total(accumulators="total")
-    with pytest.raises(psf.ModelError, match="accumulators must be distinct names"):
+    with pytest.raises(psf.errors.ModelError, match="accumulators must be distinct names"):
         rate_and_total(accumulators=["total", "total"])
 
 
@@ -261,14 +263,14 @@ def test_modes_and_rest_points_leave_accumulators_out():
         observation=lambda x: [x[1]], observation_noise=[[1.0]], initial_mean=[0.0, 0.0],
         initial_cov=np.eye(2), accumulators=["x1"],
     )  # fmt: skip
-    modes = psf.linear_modes(psf.StateSpaceModel(integrator, **settings), {"k": 2.0})
+    modes = psf.mechanics.linear_modes(psf.StateSpaceModel(integrator, **settings), {"k": 2.0})
     np.testing.assert_allclose(modes["growth_rate"], [-2.0])
     assert modes.attrs["at"]["x0"] == pytest.approx(0.5)
     in_steps = psf.StateSpaceModel(
         lambda x, q, k: [x[0] + 0.1 * (1.0 - k * x[0]) + q[0], x[1] + k * x[0]],
         process_noise=[[0.1]], dt=0.1, **settings,
     )  # fmt: skip
-    modes = psf.linear_modes(in_steps, {"k": 2.0})
+    modes = psf.mechanics.linear_modes(in_steps, {"k": 2.0})
     np.testing.assert_allclose(modes["growth_rate"], [np.log(0.8) / 0.1])
 
 

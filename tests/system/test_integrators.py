@@ -586,5 +586,5 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case):
     make, message = BAD[case]
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         make()

@@ -17,8 +17,8 @@ def exits():
     return psf.StateSpaceModel(
         transition=lambda x, q: q,
         process_dist=lambda x, a, b, c, sigma: [
-            *psf.euler_multinomial(x[0], [a, b, c], DT),
-            psf.gamma_white_noise(sigma, DT),
+            *psf.compartments.euler_multinomial(x[0], [a, b, c], DT),
+            psf.compartments.gamma_white_noise(sigma, DT),
         ],
         observation=lambda x: x[0],
         observation_noise=1.0,
@@ -95,16 +95,28 @@ def test_the_surrogate_has_the_same_moments():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: psf.euler_multinomial(5, [], 0.1), "rates must be a list with the rate of each"),
-        (lambda: psf.euler_multinomial(5, 2.0, 0.1), "rates must be a list .* got 2.0"),
-        (lambda: psf.euler_multinomial(-5, [1.0], 0.1), "size of euler_multinomial must be at le"),
-        (lambda: psf.euler_multinomial(5, [-1.0], 0.1), "rates of euler_multinomial must be at"),
-        (lambda: psf.gamma_white_noise(0.0, 0.1), "sigma must be"),
-        (lambda: psf.gamma_white_noise(1.0, -0.1), "dt must be"),
+        (
+            lambda: psf.compartments.euler_multinomial(5, [], 0.1),
+            "rates must be a list with the rate of each",
+        ),
+        (
+            lambda: psf.compartments.euler_multinomial(5, 2.0, 0.1),
+            "rates must be a list .* got 2.0",
+        ),
+        (
+            lambda: psf.compartments.euler_multinomial(-5, [1.0], 0.1),
+            "size of euler_multinomial must be at le",
+        ),
+        (
+            lambda: psf.compartments.euler_multinomial(5, [-1.0], 0.1),
+            "rates of euler_multinomial must be at",
+        ),
+        (lambda: psf.compartments.gamma_white_noise(0.0, 0.1), "sigma must be"),
+        (lambda: psf.compartments.gamma_white_noise(1.0, -0.1), "dt must be"),
     ],
 )
 def test_numbers_that_cannot_be_are_refused(call, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         call()
 
 
@@ -113,7 +125,7 @@ def test_exits_may_be_parameters_of_others():
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] - q[0], q[1]],
         process_dist=lambda x: [
-            (left := psf.euler_multinomial(x[0], [1.0], 0.5)[0]),
+            (left := psf.compartments.euler_multinomial(x[0], [1.0], 0.5)[0]),
             pm.Binomial.dist(left, 0.5),
         ],
         observation_dist=lambda x: [pm.Poisson.dist(x[1] + 1.0)],

@@ -167,8 +167,8 @@ def test_a_bad_parameter_on_the_way_is_a_failure():
         lambda x: pm.Categorical.dist(pt.stack([x, 1.0 - x])),
         lambda x: pm.Multinomial.dist(3, pt.stack([x, 1.0 - x]))[0],
         lambda x: pm.StudentT.dist(nu=3.0, mu=0.0, sigma=x),
-        lambda x: psf.euler_multinomial(5, [x], 0.1)[0],
-        lambda x: psf.euler_multinomial(5, [x, 2.0], 0.1)[1] + x,
+        lambda x: psf.compartments.euler_multinomial(5, [x], 0.1)[0],
+        lambda x: psf.compartments.euler_multinomial(5, [x, 2.0], 0.1)[1] + x,
     ]
     compiled = compile_system(system_of(*distributions))
     X = np.full((30, 1), -1.0)
@@ -218,7 +218,7 @@ def test_a_bad_parameter_fails_in_a_counted_way():
         initial_dist=lambda: [2],
     )
     with pytest.warns(
-        psf.FilterWarning, match="in 1 of 2 evaluations.* overflowed .* In process_dist"
+        psf.errors.FilterWarning, match="in 1 of 2 evaluations.* overflowed .* In process_dist"
     ):
         terms = psf.log_likelihood(
             system, psf.BootstrapPF(20), {"rate": [1.0, -1.0]}, [2.0, 4.0], steps=[1, 2]
@@ -257,13 +257,15 @@ def test_a_bad_parameter_fails_in_a_counted_way():
     ],
 )
 def test_what_cannot_be_drawn_is_refused(distribution, message):
-    with pytest.raises(psf.ModelError, match=f"process_dist.*{message}"):
+    with pytest.raises(psf.errors.ModelError, match=f"process_dist.*{message}"):
         system_of(distribution)
 
 
 def test_random_variables_from_outside_are_refused():
     outside = pm.Gamma.dist(2.0, 1.0, name="outside")
-    with pytest.raises(psf.ModelError, match=r"process_dist must use its arguments .* outside"):
+    with pytest.raises(
+        psf.errors.ModelError, match=r"process_dist must use its arguments .* outside"
+    ):
         system_of(lambda x: pm.Poisson.dist(outside))
 
 
@@ -301,7 +303,7 @@ SYSTEM = {
     ],
 )
 def test_a_wrong_combination_is_refused(changes, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         psf.StateSpaceModel(**SYSTEM | changes)
 
 

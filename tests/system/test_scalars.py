@@ -60,5 +60,5 @@ def test_scalars_of_an_integrator(diffusion):
 )
 def test_a_scalar_is_not_repeated_for_several(changes, words):
     scalars = dict(transition=lambda x, q, a: a * x[0] + q[0], observation=lambda x: x[0])
-    with pytest.raises(psf.ModelError, match=words):
+    with pytest.raises(psf.errors.ModelError, match=words):
         psf.StateSpaceModel(**LISTS | scalars | changes)

@@ -48,16 +48,16 @@ def assert_drift(found, force, mass=MASS, v=V):
 def test_matrices_of_numbers():
     """In lists too, and without symmetry; a diagonal mass matrix is divided by."""
     mass = np.array([[2.0, 0.8], [0.5, 1.0]])
-    drift = psf.second_order(mass, DAMPING.tolist(), STIFFNESS.tolist())
+    drift = psf.mechanics.second_order(mass, DAMPING.tolist(), STIFFNESS.tolist())
     assert_drift(drift_at(drift, X), LINEAR, mass)
     diagonal = np.diag([2.0, 0.5])
-    drift = psf.second_order(diagonal, DAMPING, STIFFNESS)
+    drift = psf.mechanics.second_order(diagonal, DAMPING, STIFFNESS)
     assert_drift(drift_at(drift, X), LINEAR, diagonal)
 
 
 def test_matrices_of_parameters():
     """In order of appearance, with defaults and shapes; a mass matrix that is not symmetric."""
-    drift = psf.second_order(
+    drift = psf.mechanics.second_order(
         mass=lambda m, off=0.5: [[m[0], off], [-off, m[1]]],
         damping=lambda c: pt.stack([[c, -c / 2], [-c / 2, c]]),
         stiffness=lambda k, m, k2=2.0: [[k + k2, -k], [-k, k * m[1]]],
@@ -76,7 +76,7 @@ def test_matrices_of_parameters():
 
 
 def test_a_single_position():
-    drift = psf.second_order(lambda m: m, 0.3, lambda k: [[k]], lambda q: [q[0] ** 3])
+    drift = psf.mechanics.second_order(lambda m: m, 0.3, lambda k: [[k]], lambda q: [q[0] ** 3])
     found = drift_at(drift, [0.5, -1.0], dict(m=2.0, k=4.0))
     np.testing.assert_allclose(found, [-1.0, (0.3 - 2.0 - 0.125) / 2.0], rtol=1e-12)
 
@@ -84,33 +84,37 @@ def test_a_single_position():
 def test_inputs_are_forces_on_the_positions():
     """One each, beside a force without inputs; none without inputs; else where the force says."""
     u, named = [0.9, -0.4], {"inputs": ["left", "right"]}
-    plain = psf.second_order(MASS, DAMPING, STIFFNESS)
+    plain = psf.mechanics.second_order(MASS, DAMPING, STIFFNESS)
     assert_drift(drift_at(plain, X, u=u, **named), LINEAR + u)
-    cubic = psf.second_order(MASS, DAMPING, STIFFNESS, lambda q: q**3)
+    cubic = psf.mechanics.second_order(MASS, DAMPING, STIFFNESS, lambda q: q**3)
     assert_drift(drift_at(cubic, X, u=u, **named), LINEAR - Q**3 + u)
-    ground = psf.second_order(MASS, DAMPING, STIFFNESS, lambda u: [2.0 * u[0], 1.0 * u[0]])
+    ground = psf.mechanics.second_order(
+        MASS, DAMPING, STIFFNESS, lambda u: [2.0 * u[0], 1.0 * u[0]]
+    )
     assert_drift(
         drift_at(ground, X, u=[0.9], inputs=["ground"]), LINEAR - 0.9 * np.array([2.0, 1.0])
     )
-    two = psf.second_order(MASS, DAMPING, STIFFNESS, lambda u: [u[1], 0.0])
+    two = psf.mechanics.second_order(MASS, DAMPING, STIFFNESS, lambda u: [u[1], 0.0])
     assert_drift(drift_at(two, X, u=u, **named), LINEAR - [u[1], 0.0])
 
 
 def test_equal_equations_are_equal_systems():
     def system():
-        return system_of(psf.second_order(MASS, lambda c: c * DAMPING, STIFFNESS))
+        return system_of(psf.mechanics.second_order(MASS, lambda c: c * DAMPING, STIFFNESS))
 
     assert system() == system()
     assert hash(system()) == hash(system())
-    assert system() != system_of(psf.second_order(MASS, lambda c: 2 * c * DAMPING, STIFFNESS))
+    assert system() != system_of(
+        psf.mechanics.second_order(MASS, lambda c: 2 * c * DAMPING, STIFFNESS)
+    )
 
 
 def test_a_mass_matrix_of_parameters_has_its_natural_frequencies():
     """Through the derivative of the solution by the state."""
-    drift = psf.second_order(
+    drift = psf.mechanics.second_order(
         lambda m: [[m, 0.5], [0.5, 1.0]], np.zeros((2, 2)), lambda k: [[k, -3.0], [-3.0, 3.5]]
     )
-    modes = psf.linear_modes(system_of(drift), {"m": 2.0, "k": np.array([7.0, 7.0])})
+    modes = psf.mechanics.linear_modes(system_of(drift), {"m": 2.0, "k": np.array([7.0, 7.0])})
     squares = np.sort(np.linalg.eigvals(np.linalg.solve(MASS, STIFFNESS)).real)
     expected = np.sqrt(squares) / (2 * np.pi)
     for name in ("frequency", "frequency_low", "frequency_high"):
@@ -119,7 +123,7 @@ def test_a_mass_matrix_of_parameters_has_its_natural_frequencies():
 
 
 def drift_with(**changes):
-    return lambda: psf.second_order(
+    return lambda: psf.mechanics.second_order(
         **{"mass": MASS, "damping": DAMPING, "stiffness": STIFFNESS} | changes
     )
 
@@ -151,5 +155,5 @@ WRONG = [
 
 @pytest.mark.parametrize(("make", "message"), WRONG)
 def test_what_is_no_equation_of_motion(make, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(psf.errors.ModelError, match=message):
         make()

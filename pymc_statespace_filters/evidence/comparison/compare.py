@@ -42,7 +42,8 @@ class DimensionCorrection:
 
     Examples
     --------
-    >>> from pymc_statespace_filters import DimensionCorrection, Evidence
+    >>> from pymc_statespace_filters import DimensionCorrection
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> evidence = Evidence(-31.24, 0.02, "chib_jeliazkov", 3, 100, -24.1, "0c5f")
     >>> round(DimensionCorrection(exponent=3).log_prior(evidence), 3)
     -20.723
@@ -167,7 +168,8 @@ def compare_evidence(
 
     Examples
     --------
-    >>> from pymc_statespace_filters import Evidence, compare_evidence
+    >>> from pymc_statespace_filters import compare_evidence
+    >>> from pymc_statespace_filters.evidence import Evidence
     >>> linear = Evidence(-41.0, 0.02, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
     >>> cubic = Evidence(-39.0, 0.02, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
     >>> table = compare_evidence({"linear": linear, "cubic": cubic})

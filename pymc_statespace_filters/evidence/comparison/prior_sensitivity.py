@@ -103,8 +103,9 @@ def prior_sensitivity(
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> linear = psf.Evidence(-41.0, 0.02, "bridge", 2, 100, -35.0, "0c5f")
-    >>> cubic = psf.Evidence(-39.0, 0.02, "bridge", 3, 100, -31.0, "0c5f")
+    >>> from pymc_statespace_filters.evidence import Evidence
+    >>> linear = Evidence(-41.0, 0.02, "bridge", 2, 100, -35.0, "0c5f")
+    >>> cubic = Evidence(-39.0, 0.02, "bridge", 3, 100, -31.0, "0c5f")
     >>> curves = psf.prior_sensitivity({"linear": linear, "cubic": cubic}, exponents=[0, 1, 3])
     >>> curves["prob"].sel(model="cubic").values.round(3)
     array([0.881, 0.425, 0.007])
