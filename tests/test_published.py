@@ -25,7 +25,7 @@ def scripts(monkeypatch):
         sys.modules.pop(path.stem, None)
 
 
-@pytest.mark.filterwarnings("ignore:BootstrapPF:pymc_statespace_filters.FilterWarning")
+@pytest.mark.filterwarnings("ignore:BootstrapPF:pymc_statespace_filters.errors.FilterWarning")
 @pytest.mark.parametrize(
     "name",
     [

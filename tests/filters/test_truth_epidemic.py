@@ -98,7 +98,7 @@ N_REPLICATIONS, N_RANKS = 100, 20
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.FilterWarning")
+@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
 def test_ranks_of_the_posterior_are_uniform():
     """Simulation-based calibration: the truth has any rank among independent draws.
 
