@@ -19,6 +19,7 @@ from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
 # Numba's own index on disk tells processors and versions of Python apart.
 _COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
+_THIS = Path(__file__)
 
 
 class _File(NamedTuple):
@@ -40,13 +41,15 @@ class Sources:
     from it.
 
     It takes a second to parse all files. A file in ``folder`` therefore keeps what was found in
-    them, for other processes that read the same contents.
+    them, for other processes that read the same contents in the same way: the name of the file
+    follows from the text of this module.
     """
 
     def __init__(self, package: Path, folder: Path):
         self._package = package
         # A tree of statements is written differently by different versions of Python.
-        self._kept = folder / f"{package.name}.{sys.implementation.cache_tag}.json"
+        version = f"{sys.implementation.cache_tag}.{_digest(_THIS.read_bytes())[:16]}"
+        self._kept = folder / f"{package.name}.{version}.json"
         self._sources: dict[str, _Source] = {}
         self._digests: dict[str, str] = {}
 
@@ -150,7 +153,7 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-_SOURCES = Sources(Path(__file__).parents[2], NUMBA_CACHE_PATH)
+_SOURCES = Sources(_THIS.parents[2], NUMBA_CACHE_PATH)
 
 
 def key_of(module: str, *parts: str | Callable | None) -> str | None:

@@ -203,3 +203,13 @@ def test_sources_are_parsed_once_for_all_processes(copy, monkeypatch):
     expected = copy.start().digest_of(LOOP)
     monkeypatch.setattr(cache_key.ast, "parse", None)
     assert copy.start().digest_of(LOOP) == expected
+
+
+def test_what_another_version_of_the_parser_kept_is_not_read(copy, monkeypatch, tmp_path):
+    copy.start().digest_of(LOOP)
+    other = tmp_path / "cache_key.py"
+    other.write_text("another text", encoding="utf-8")
+    monkeypatch.setattr(cache_key, "_THIS", other)
+    monkeypatch.setattr(cache_key.ast, "parse", None)
+    with pytest.raises(TypeError, match="not callable"):
+        copy.start().digest_of(LOOP)
