@@ -81,8 +81,6 @@ GROUPS = {
         "reweight",
         "chib_jeliazkov",
         "evidence.Evidence",
-        "DimensionCorrection",
-        "marginal_modes",
     ),
     "Plots": (
         "plot_states",
@@ -112,7 +110,6 @@ GROUPS = {
 
 # Members that a user calls. The others are for other packages here, or for PyMC (of a step method).
 MEMBERS = {
-    "DimensionCorrection": "log_prior",
     "evidence.Evidence": "prior_note",
     "point_estimation.MaximumLikelihoodEstimate": "summary",
     "PFEnKF": "density_method",

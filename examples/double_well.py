@@ -121,9 +121,6 @@ def study(args: argparse.Namespace) -> str:
     )
     estimates = evidences(models, results, args)
     table = psf.compare_evidence(estimates, estimator="chib_jeliazkov")
-    corrected = psf.compare_evidence(
-        estimates, estimator="chib_jeliazkov", correction=psf.DimensionCorrection()
-    )
     summaries = {
         name: az.summary(idata, var_names=[*RIVALS[name], "sigma_m"])
         for name, idata in results.items()
@@ -135,7 +132,7 @@ def study(args: argparse.Namespace) -> str:
     draw(steps * DT, values, results, table, args.out / "double_well.png")
     average = psf.average_models(results, table, drift_curve, random_seed=args.seed)
     psf.plot_average(average).savefig(args.out / "drift.png")
-    return in_words(table, corrected)
+    return in_words(table)
 
 
 def evidences(models: dict, results: dict, args: argparse.Namespace) -> dict:
@@ -151,7 +148,7 @@ def evidences(models: dict, results: dict, args: argparse.Namespace) -> dict:
     return found
 
 
-def in_words(table: pd.DataFrame, corrected: pd.DataFrame) -> str:
+def in_words(table: pd.DataFrame) -> str:
     """Return the comparison as a table of at most 100 columns, and what it means."""
     shown = pd.DataFrame(
         {
@@ -178,15 +175,6 @@ def in_words(table: pd.DataFrame, corrected: pd.DataFrame) -> str:
             f"  {best} against {row.Index}: odds {odds:{',.0f' if odds > 10 else '.1f'}} to 1 "
             f"({row.strength}); numerical error {reverses} reverse this."
         )
-    first = corrected.index[0]
-    probabilities = ", ".join(f"{name} {p:.2f}" for name, p in corrected["prob"].items())
-    lines += [
-        "A prior against parameters (the thesis's correction for dimension) "
-        + (
-            "leaves it the most probable." if first == best else f"makes {first} the most probable."
-        ),
-        f"  Probabilities with it: {probabilities}.",
-    ]
     return "\n".join(lines)
 
 

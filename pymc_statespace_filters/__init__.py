@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 # Names are imported when they are first used; `__init__.pyi` lists them.
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# Names that were once here, and the modules that have them now.
+# Names that were once here.
 _MOVED = {
     "compartments": ("euler_multinomial", "gamma_white_noise"),
     "errors": (
@@ -37,15 +37,20 @@ _MOVED = {
     ),
     "point_estimation": ("MaximumLikelihoodEstimate",),
 }
-_NEW_PLACES = {
-    name: f"{__name__}.{module}.{name}" for module, names in _MOVED.items() for name in names
+_INSTEAD = {
+    name: f"has moved to {__name__}.{module}.{name}"
+    for module, names in _MOVED.items()
+    for name in names
+} | {
+    "DimensionCorrection": "has gone: give compare_evidence a model_prior",
+    "marginal_modes": "has gone: use arviz.mode",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _NEW_PLACES:
+    if name not in _INSTEAD:
         return _import_name(name)
-    text = f"{__name__}.{name} has moved to {_NEW_PLACES[name]}."
+    text = f"{__name__}.{name} {_INSTEAD[name]}."
     # `from ... import` replaces an AttributeError by a text of its own.
     if sys._getframe(1).f_globals.get("__name__") == "importlib._bootstrap":
         raise ImportError(text, name=__name__)

@@ -9,12 +9,10 @@ from .evaluation.log_likelihood import log_likelihood
 from .evaluation.run_filter import run_filter
 from .evaluation.simulate import simulate
 from .evidence import (
-    DimensionCorrection,
     average_models,
     chib_jeliazkov,
     compare_evidence,
     estimate_evidence,
-    marginal_modes,
     prior_sensitivity,
     reweight,
     step_error,
@@ -55,7 +53,6 @@ __all__ = [
     "IPLF",
     "UKF",
     "BootstrapPF",
-    "DimensionCorrection",
     "EnKF",
     "EulerMaruyama",
     "ExactLinear",
@@ -83,7 +80,6 @@ __all__ = [
     "free_run",
     "leave_future_out",
     "log_likelihood",
-    "marginal_modes",
     "maximum_likelihood",
     "mechanics",
     "nearest_steps",

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import arviz as az
 import pandas as pd
+from dimension import dimension_prior
+from marginal_modes import marginal_modes
 from study import Study
 
 import pymc_statespace_filters as psf
@@ -35,9 +37,11 @@ def probabilities(
     if n_observations is not None:
         found = {model: replace(one, n_observations=n_observations) for model, one in found.items()}
     volumes = {model: math.exp(one.log_volume) for model, one in found.items()}
-    correction = psf.DimensionCorrection(EXPONENT) if corrected else None
-    prior = None if uniform else volumes
-    return psf.compare_evidence(found, prior=prior, correction=correction).sort_index()
+    prior = dict.fromkeys(found, 1.0) if uniform else volumes
+    if corrected:
+        weights = dimension_prior(found, EXPONENT)
+        prior = {model: weights[model] * prior[model] for model in found}
+    return psf.compare_evidence(found, model_prior=prior).sort_index()
 
 
 def write_tables(settings: Study, case: int, posteriors: Mapping) -> None:
@@ -95,7 +99,7 @@ def _parameters(posteriors: Mapping) -> pd.DataFrame:
     rows = []
     for (filter, model), post in posteriors.items():
         intervals = az.hdi(post.draws, prob=0.95)
-        modes = psf.marginal_modes(post.draws).loc["posterior"]
+        modes = marginal_modes(post.draws).loc["posterior"]
         for name in modes.index:
             rows.append((filter, name, model, *intervals[name].values, modes[name]))
     return pd.DataFrame(rows, columns=["filter", "parameter", "model", "low", "high", "mode"])

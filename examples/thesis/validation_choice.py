@@ -8,7 +8,7 @@ EXPONENT = 3.0  # alpha of the thesis's correction J^(-k alpha / 2), k the numbe
 
 
 def corrected(log_evidences: xr.DataArray) -> xr.DataArray:
-    """Apply the correction to log-evidences: `psf.DimensionCorrection` for arrays with k and J."""
+    """Apply the correction to log-evidences: `dimension_prior` for arrays with k and J."""
     return log_evidences - EXPONENT / 2 * log_evidences["k"] * np.log(log_evidences["J"])
 
 

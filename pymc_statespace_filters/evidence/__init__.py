@@ -1,10 +1,8 @@
 """Evidence of a model from posterior draws, and model comparison by evidence."""
 
 from .comparison import (
-    DimensionCorrection,
     average_models,
     compare_evidence,
-    marginal_modes,
     prior_sensitivity,
 )
 from .estimation import EvidenceEstimates, chib_jeliazkov, estimate_evidence
@@ -13,14 +11,12 @@ from .reweighting import reweight
 from .shorter_steps import step_error
 
 __all__ = [
-    "DimensionCorrection",
     "Evidence",
     "EvidenceEstimates",
     "average_models",
     "chib_jeliazkov",
     "compare_evidence",
     "estimate_evidence",
-    "marginal_modes",
     "prior_sensitivity",
     "reweight",
     "step_error",

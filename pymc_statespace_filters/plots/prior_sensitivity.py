@@ -1,40 +1,33 @@
-"""Plot of model probabilities against the correction's exponent and the width of priors."""
+"""Plot of model probabilities against the width of the priors."""
 
 from textwrap import fill
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, set_ylim
 
 from ..errors import ModelError
-from ..evidence import prior_sensitivity
 from ..evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
 from .canvas import add_legend, band, canvas, curve, interval, logarithmic_ticks, size_of_panels
 
-LABELS = {
-    "prob": ("exponent", "exponent α of the correction"),
-    "width_prob": ("width", "width of the priors (factor)"),
-}
-LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below a panel and inside it
+ENDS = ("width_prob_low", "width_prob_high")
+LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below the panel and inside it
 
 
 def plot_prior_sensitivity(
-    table: pd.DataFrame | xr.Dataset, *, backend: str | None = None, **pc_kwargs: Any
+    curves: xr.Dataset, *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Plot the dependence of model probabilities on the prior.
+    """Plot model probabilities against the width of the priors.
 
     Parameters
     ----------
-    table : pandas.DataFrame or xarray.Dataset
-        The table of `compare_evidence`: one panel, the probabilities against the exponent of
-        `DimensionCorrection`, ignoring the correction in the table. Or the result of
-        `prior_sensitivity`: a second panel, against the width of the priors, if it has one. Its
-        label names the priors that were left out, or because of which the panel is empty. A curve
-        has no points where the draws do not determine the result; an empty panel tells why.
+    curves : xarray.Dataset
+        The result of `prior_sensitivity`. The label of the axis names the priors that were left
+        out, or because of which the panel is empty. A curve has no points where the draws do not
+        determine the result; an empty panel tells why.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -48,35 +41,38 @@ def plot_prior_sensitivity(
     Raises
     ------
     ModelError
-        If `table` is neither.
+        If `curves` is something else.
 
     Examples
     --------
-    >>> from pymc_statespace_filters import compare_evidence, plot_prior_sensitivity
-    >>> from pymc_statespace_filters.evidence import Evidence
-    >>> linear = Evidence(-41.0, 0.3, "chib_jeliazkov", 2, 100, -35.0, "0c5f")
-    >>> cubic = Evidence(-39.0, 0.2, "chib_jeliazkov", 3, 100, -31.0, "0c5f")
-    >>> collection = plot_prior_sensitivity(compare_evidence({"linear": linear, "cubic": cubic}))
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_prior_sensitivity
+    >>> prob = np.array([[0.2, 0.5, 0.7], [0.8, 0.5, 0.3]])
+    >>> curves = xr.Dataset(
+    ...     {
+    ...         "width_prob": (("model", "width"), prob),
+    ...         "width_prob_low": (("model", "width"), prob - 0.1),
+    ...         "width_prob_high": (("model", "width"), prob + 0.1),
+    ...     },
+    ...     coords={"model": ["linear", "cubic"], "width": [0.5, 1.0, 2.0]},
+    ... )
+    >>> collection = plot_prior_sensitivity(curves)
     >>> collection.savefig("sensitivity.png")  # doctest: +SKIP
     """
-    found = _sensitivity(table)
-    panels = [name for name in LABELS if name in found]
-    if "width_prob" in panels:  # not every backend of arviz_plots has a logarithmic axis
-        found = found.assign_coords(width=np.log10(found["width"]))
-    probs = found[panels]
-    low, high = (
-        found[[f"{name}_{end}" for name in panels]].rename(
-            {f"{name}_{end}": name for name in panels}
-        )
-        for end in ("low", "high")
-    )
+    if not (isinstance(curves, xr.Dataset) and {"width_prob", *ENDS} <= set(curves)):
+        raise ModelError(f"curves must be the result of prior_sensitivity, got {curves!r}")
+    # Not every backend of arviz_plots has a logarithmic axis.
+    found = curves.assign_coords(width=np.log10(curves["width"]))
+    probs = found[["width_prob"]]
+    low, high = (found[[name]].rename({name: "width_prob"}) for name in ENDS)
     collection = canvas(
         probs,
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={"color": ["model"]},
-        size=size_of_panels(len(panels)),
-        n_panels=len(panels),
+        size=size_of_panels(1),
+        n_panels=1,
         cols=["__variable__"],
     )
     collection.map(band, "band", data=interval(low, high), alpha=0.25)
@@ -87,7 +83,7 @@ def plot_prior_sensitivity(
         str(name): {**collection.get_aes_kwargs(["color"], "mapping", {"model": name}), "width": 2}
         for name in probs["model"].values
     }
-    if low.notnull().any().to_array().any():
+    if low["width_prob"].notnull().any():
         share = f"{100 * found.attrs['ci_prob']:g} % " if "ci_prob" in found.attrs else ""
         legend[f"{share}interval"] = {"color": "B3", "alpha": 0.4, "width": 8}
     add_legend(collection, legend)
@@ -95,24 +91,21 @@ def plot_prior_sensitivity(
 
 
 def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
-    settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
-    panels = probs.fillna(0.0)  # a panel without results has axes too
-    further = {"width_prob": _about_priors(probs)} if "width_prob" in probs else {}
-    for name, (dim, label) in LABELS.items():
-        if name not in probs:
-            continue
-        data, ends = panels[[name]], probs[dim].values[[0, -1]]
-        text = label + further.get(name, "")
-        collection.map(labelled_x, data=data, text=text, **settings)
-        collection.map(labelled_y, data=data, text="probability of the model", **settings)
-        collection.map(set_ylim, data=data, limits=(-0.02, 1.02), **settings)
-        if probs[name].isnull().all():
-            margin = 0.05 * (ends[1] - ends[0])
-            limits = (ends[0] - margin, ends[1] + margin)
-            collection.map(set_xlim, data=data, limits=limits, **settings)
-    if "width_prob" in probs:
-        ticks = logarithmic_ticks(probs["width"].values)
-        collection.map(set_xticks, data=panels[["width_prob"]], **ticks, **settings)
+    # A panel without results has axes too.
+    settings: dict[str, Any] = {
+        "data": probs.fillna(0.0),
+        "ignore_aes": "all",
+        "store_artist": False,
+    }
+    text = "width of the priors (factor)" + _about_priors(probs)
+    collection.map(labelled_x, text=text, **settings)
+    collection.map(labelled_y, text="probability of the model", **settings)
+    collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
+    if probs["width_prob"].isnull().all():
+        ends = probs["width"].values[[0, -1]]
+        margin = 0.05 * (ends[1] - ends[0])
+        collection.map(set_xlim, limits=(ends[0] - margin, ends[1] + margin), **settings)
+    collection.map(set_xticks, **logarithmic_ticks(probs["width"].values), **settings)
 
 
 def _about_priors(probs: xr.Dataset) -> str:
@@ -129,8 +122,8 @@ def _about_priors(probs: xr.Dataset) -> str:
 
 
 def _note_empty(collection: PlotCollection, found: xr.Dataset) -> None:
-    """Write into the panel of widths why it is empty, if it is."""
-    if "width_prob" not in found or found["width_prob"].notnull().any():
+    """Write into the panel why it is empty, if it is."""
+    if found["width_prob"].notnull().any():
         return
     lines = [fill(line, NOTE_WIDTH) for line in ("no result at any width:", *_reasons(found))]
     data = xr.Dataset({"width_prob": found["width"].values[[0, -1]].mean()})
@@ -157,13 +150,3 @@ def _reasons(found: xr.Dataset) -> list[str]:
 def note(da: xr.DataArray, target: Any, *, text: str, **kwargs: Any) -> Any:
     """Write a text in the middle of a panel of probabilities."""
     return backend_from_object(target).text(da.item(), 0.5, text, target, **kwargs)
-
-
-def _sensitivity(table: pd.DataFrame | xr.Dataset) -> xr.Dataset:
-    if isinstance(table, pd.DataFrame):
-        return prior_sensitivity(table)
-    if isinstance(table, xr.Dataset) and {"prob", "prob_low", "prob_high"} <= set(table):
-        return table
-    raise ModelError(
-        f"table must be one of compare_evidence or a result of prior_sensitivity, got {table!r}"
-    )

@@ -1,4 +1,4 @@
-"""Model probabilities: Eq. 3.3 by hand, intervals, the correction, and what is refused."""
+"""Model probabilities: Eq. 3.3 by hand, intervals, and what is refused."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, compare_evidence
+from pymc_statespace_filters.evidence import Evidence, compare_evidence
 from pymc_statespace_filters.evidence.evidence import store_evidence
 
 COLUMNS = [
@@ -17,7 +17,6 @@ COLUMNS = [
     "prob_high",
     "log_evidence",
     "se",
-    "correction",
     "log_bayes_factor",
     "n_parameters",
     "n_observations",
@@ -52,7 +51,6 @@ def test_probabilities_and_bayes_factors():
         table["prob"], [1 / total, math.exp(-1) / total, math.exp(-2) / total]
     )
     np.testing.assert_allclose(table["log_bayes_factor"], [0, -1, -2])
-    assert (table["correction"] == 0).all()
 
 
 def test_very_small_evidences_do_not_underflow():
@@ -61,21 +59,9 @@ def test_very_small_evidences_do_not_underflow():
 
 
 def test_prior_probabilities():
-    table = compare_evidence({"a": evidence(-8), "b": evidence(-8)}, prior={"a": 3, "b": 1})
+    table = compare_evidence({"a": evidence(-8), "b": evidence(-8)}, model_prior={"a": 3, "b": 1})
     np.testing.assert_allclose(table.loc[["a", "b"], "prob"], [0.75, 0.25])
     assert table.loc["b", "log_bayes_factor"] == 0
-
-
-def test_correction_of_the_thesis_with_its_own_number_of_observations():
-    """J = 21: the factor between models of 3 and 4 parameters is 21^1.5 = 96.23, not 101^1.5."""
-    rivals = {"m2": evidence(-8, k=3), "m3": evidence(-6, k=4)}
-    table = compare_evidence(rivals, correction=DimensionCorrection(exponent=3))
-    assert table.loc["m2", "correction"] == pytest.approx(-4.5 * math.log(21))
-    odds = table.loc["m3", "prob"] / table.loc["m2", "prob"]
-    assert odds == pytest.approx(math.exp(2) / 96.2341, rel=1e-5)
-    assert list(table.index) == ["m2", "m3"]
-    assert table.loc["m3", "log_bayes_factor"] == pytest.approx(2)  # of the evidences alone
-    assert table.loc["m3", "log_evidence"] == -6
 
 
 def test_bic_has_one_k_ln_j():
@@ -124,7 +110,7 @@ def test_undecided_is_when_the_interval_of_the_odds_holds_one(gap, se, undecided
 def test_what_the_prior_decides_is_not_undecided():
     rivals = {"a": evidence(-8, se=0.1), "b": evidence(-8, se=0.1)}
     assert compare_evidence(rivals)["undecided"].all()
-    assert not compare_evidence(rivals, prior={"a": 99, "b": 1})["undecided"].any()
+    assert not compare_evidence(rivals, model_prior={"a": 99, "b": 1})["undecided"].any()
 
 
 def test_groups_are_accepted():
@@ -215,7 +201,9 @@ def test_words_hold_in_spite_of_the_errors():
 
 
 def test_evidence_that_the_prior_outweighs_is_negative():
-    table = compare_evidence({"a": evidence(-8), "b": evidence(-10)}, prior={"a": 1, "b": 100})
+    table = compare_evidence(
+        {"a": evidence(-8), "b": evidence(-10)}, model_prior={"a": 1, "b": 100}
+    )
     assert table["strength"].to_dict() == {"b": "", "a": "negative"}
     assert table["prior"].to_dict() == pytest.approx({"b": 100 / 101, "a": 1 / 101})
 
@@ -265,7 +253,7 @@ def test_different_data_raise_and_name_the_models():
 
 def test_the_largest_prior_weights_are_equal():
     prior = {"a": 1e308, "b": 1e308}
-    table = compare_evidence({"a": evidence(-9), "b": evidence(-9)}, prior=prior)
+    table = compare_evidence({"a": evidence(-9), "b": evidence(-9)}, model_prior=prior)
     np.testing.assert_allclose(table["prob"], 0.5)
 
 

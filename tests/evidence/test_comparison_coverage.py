@@ -95,7 +95,7 @@ def counts(estimates, errors, level):
             for name, value, se, k in zip(names, values, ses, SIZES, strict=True)
         }
         prior = dict(zip(names, weights, strict=True))
-        table = compare_evidence(models, prior=prior, ci_prob=level).loc[names]
+        table = compare_evidence(models, model_prior=prior, ci_prob=level).loc[names]
         for i, (name, row) in enumerate(table.iterrows()):
             count(f"ln Z, {name}", abs(row["log_evidence"] - truth[i]) < half * row["se"])
             count(f"prob, {name}", row["prob_low"] < 1 / 3 < row["prob_high"])
@@ -103,7 +103,7 @@ def counts(estimates, errors, level):
             pair = [names[i], names[j]]
             two = compare_evidence(
                 {name: models[name] for name in pair},
-                prior={name: prior[name] for name in pair},
+                model_prior={name: prior[name] for name in pair},
                 ci_prob=level,
             ).loc[pair]
             between = f"{pair[0]} against {pair[1]}"

@@ -25,8 +25,8 @@ CLEAR = {
     "cubic": evidence(-39.0, k=3, max_log_likelihood=-31.0),
 }
 COLUMNS_SENTENCE = (
-    "Further columns, shown by .to_string(): correction, log_bayes_factor, n_parameters, "
-    "n_observations, bic, undecided, aic, log_evidence_flat, prior, strength, warning, "
+    "Further columns, shown by .to_string(): log_bayes_factor, n_parameters, n_observations, "
+    "bic, undecided, aic, log_evidence_flat, prior, strength, warning, "
     "max_log_likelihood, approximate."
 )
 

@@ -11,7 +11,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence import DimensionCorrection, Evidence, compare_evidence
+from pymc_statespace_filters.evidence import Evidence, compare_evidence
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
@@ -40,32 +40,25 @@ def of_draws(call):
     return inside
 
 
-def without_observations(correction):
-    return compare_evidence({"a": replace(EVIDENCE, n_observations=0)}, correction=correction)
-
-
 NOT_POSITIVE = [0, -0.1, math.nan, math.inf, "small", True]
 compare = partial(compare_evidence, RIVALS)
-curves = partial(psf.prior_sensitivity, RIVALS)
+curves = partial(psf.prior_sensitivity, RIVALS, models={})
 estimate, chib = of_draws(psf.estimate_evidence), of_draws(psf.chib_jeliazkov)
 TABLE = [
     # tables of models and curves
     *each(
         compare,
-        "prior",
+        "model_prior",
         [{"a": 1}, {"a": 1, "b": 0}, {"a": 1, "b": -1}, {"a": 1, "c": 1}, [1, 1]],
-        "prior must",
+        "model_prior must",
     ),
     *each(
         compare,
-        "prior",
+        "model_prior",
         [{"a": a, "b": b} for a, b in [(1e-320, 1e308), ("much", 1.0), (None, 1.0), (-1, 0)]],
-        "prior must be positive and finite",
+        "model_prior must be positive and finite",
     ),
     *each(compare, "ci_prob", [0, 1, 95, None], "ci_prob must"),
-    *each(compare, "correction", [3], "correction must"),
-    *each(without_observations, "correction", [DimensionCorrection()], "n_observations=0"),
-    *each(DimensionCorrection, "exponent", [math.nan], "must be a finite number, got nan"),
     *each(
         compare_evidence,
         "evidences",
@@ -73,24 +66,9 @@ TABLE = [
         "evidences",
     ),
     *each(curves, "ci_prob", [95], "ci_prob must"),
-    *each(curves, "prior", [{"a": 1}], "prior must"),
-    *each(psf.prior_sensitivity, "evidences", [{"a": 3.0}], "evidences"),
-    *each(curves, "widths", [[1, 2]], "models must be given with widths or var_names"),
-    *each(curves, "var_names", ["w"], "models must be given with widths or var_names"),
+    *each(curves, "model_prior", [{"a": 1}], "model_prior must"),
+    *each(partial(psf.prior_sensitivity, models={}), "evidences", [{"a": 3.0}], "evidences"),
     *each(partial(replace, EVIDENCE), "log_volume", [math.inf], "must be a finite number, got inf"),
-    # draws
-    *each(
-        psf.marginal_modes,
-        "idatas",
-        [{}, None, [DRAWS]],
-        "idatas must be a DataTree or a mapping",
-    ),
-    *each(
-        psf.marginal_modes,
-        "idatas",
-        [{"a": 3}, {"a": az.from_dict({"prior": {"x": LEVELS}})}],
-        r"idatas\['a'\] must be a DataTree with a group 'post",
-    ),
     # estimators
     *(
         row

@@ -1,7 +1,6 @@
-"""Curves of model probability: by hand over the exponent, in closed form over the prior's width."""
+"""Curves of model probability over the width of priors, in closed form."""
 
 import math
-from dataclasses import replace
 
 import arviz as az
 import numpy as np
@@ -11,7 +10,7 @@ import xarray as xr
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters import DimensionCorrection, compare_evidence, prior_sensitivity
+from pymc_statespace_filters import prior_sensitivity
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import Evidence
 from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
@@ -26,56 +25,6 @@ def evidence(log_evidence, se=0.05, k=2):
 
 
 RIVALS = {"small": evidence(-8, k=1), "large": evidence(-6, se=0.2, k=3)}
-
-
-class TestExponents:
-    def test_by_hand(self):
-        """J = 21 and k = 1, 3: the odds 2 - alpha ln 21."""
-        curves = prior_sensitivity(RIVALS, exponents=[0, 0.5, 3])
-        odds = 2 - np.array([0, 0.5, 3]) * math.log(21)
-        assert curves["prob"].dims == ("model", "exponent")
-        np.testing.assert_allclose(curves["prob"].sel(model="large"), 1 / (1 + np.exp(-odds)))
-        np.testing.assert_allclose(curves["prob"].sum("model"), 1)
-        assert list(curves["exponent"].values) == [0, 0.5, 3]
-        assert curves.attrs["ci_prob"] == 0.95
-        assert set(curves.data_vars) == {"prob", "prob_low", "prob_high"}
-
-    def test_every_point_is_what_compare_evidence_says(self):
-        prior = {"small": 3, "large": 1}
-        curves = prior_sensitivity(RIVALS, prior=prior, ci_prob=0.8)
-        assert curves.sizes == {"model": 2, "exponent": 41}
-        for exponent in (0, 1, 4):
-            correction = DimensionCorrection(exponent)
-            table = compare_evidence(RIVALS, prior=prior, correction=correction, ci_prob=0.8)
-            point = curves.sel(exponent=exponent).to_dataframe()
-            for column in ("prob", "prob_low", "prob_high"):
-                np.testing.assert_allclose(point[column], table.loc[point.index, column])
-
-    def test_the_order_is_that_of_the_models_given(self):
-        curves = prior_sensitivity(RIVALS)
-        assert list(curves["model"].values) == ["small", "large"]
-
-    def test_from_the_table_with_its_prior_and_without_its_correction(self):
-        prior = {"small": 3, "large": 1}
-        table = compare_evidence(RIVALS, prior=prior, correction=DimensionCorrection(3))
-        expected = prior_sensitivity(RIVALS, prior=prior)
-        assert prior_sensitivity(table).sel(model=["small", "large"]).equals(expected)
-        assert (
-            prior_sensitivity(table, prior={"small": 1, "large": 1})
-            .sel(model=["small", "large"])
-            .equals(prior_sensitivity(RIVALS))
-        )
-
-    def test_without_an_error_there_are_no_intervals(self):
-        curves = prior_sensitivity(RIVALS | {"laplace": evidence(-7, se=math.nan)})
-        assert curves["prob"].notnull().all()
-        assert curves["prob_low"].isnull().all()
-        assert curves["prob_high"].isnull().all()
-
-    def test_one_of_several_estimators(self):
-        several = {"bridge": evidence(-8), "laplace": replace(evidence(-9), estimator="laplace")}
-        found = prior_sensitivity({"a": several, "b": evidence(-8)}, estimator="bridge")
-        np.testing.assert_allclose(found["prob"], 0.5)
 
 
 class Rival:
@@ -109,7 +58,7 @@ class TestWidths:
         """Six numbers within 4 of their errors: a right implementation fails once in 2600 seeds."""
         rivals = {"line": Rival(2, 1), "plane": Rival(3, 2, se=0.02)}
         widths = [0.5, 1.0, 2.0]
-        curves = curves_of(rivals, widths=widths, prior={"line": 1, "plane": 2})
+        curves = curves_of(rivals, widths=widths, model_prior={"line": 1, "plane": 2})
         exact = np.array([[rival.log_evidence(w) for w in widths] for rival in rivals.values()])
         error, se = curves["width_log_evidence"] - exact, curves["width_se"]
         assert curves["width_prob"].dims == se.dims == ("model", "width")
@@ -127,10 +76,8 @@ class TestWidths:
         np.testing.assert_allclose(curves["width_prob"], softmax(weights, axis=0))
         assert (curves["width_prob_low"] < curves["width_prob"]).all()
         assert (curves["width_prob"] < curves["width_prob_high"]).all()
-        # The width's curves know no correction.
-        np.testing.assert_allclose(
-            curves["width_prob"].sel(width=1), curves["prob"].sel(exponent=0)
-        )
+        assert list(curves["model"].values) == ["line", "plane"]
+        assert curves.attrs["ci_prob"] == 0.95
 
     def test_what_is_not_known_is_missing_with_its_reason(self):
         curves = curves_of({"line": Rival(2, 1), "plane": Rival(3, 2)}, widths=[0.05, 1, 2])
@@ -170,11 +117,10 @@ class TestWidths:
 
 
 class TestWhatIsRefused:
-    @pytest.mark.parametrize("name", ["exponents", "widths"])
     @pytest.mark.parametrize("given", [[], 3, [[1, 2]], [1, math.nan], "abc", [1, "x"]])
-    def test_grids(self, name, given):
-        with pytest.raises(ModelError, match=rf"{name} must be one-dimensional finite numbers"):
-            curves_of({"line": Rival(2, 1)}, **{name: given})
+    def test_widths_that_are_no_list_of_numbers(self, given):
+        with pytest.raises(ModelError, match="widths must be one-dimensional finite numbers"):
+            curves_of({"line": Rival(2, 1)}, widths=given)
 
     def test_widths_that_are_not_positive(self):
         with pytest.raises(ModelError, match=r"widths must be positive, got \[0, 1\]"):
@@ -182,9 +128,8 @@ class TestWhatIsRefused:
 
     def test_widths_without_draws(self):
         models = {"small": pm.Model(), "large": pm.Model()}
-        for given in (RIVALS, compare_evidence(RIVALS)):
-            with pytest.raises(ModelError, match=r"evidences must be DataTrees .* got none of \['"):
-                prior_sensitivity(given, models=models)
+        with pytest.raises(ModelError, match=r"evidences must be DataTrees .* got none of \['"):
+            prior_sensitivity(RIVALS, models=models)
 
     def test_models_of_other_names(self):
         rival = Rival(2, 1)
@@ -204,12 +149,12 @@ class TestWhatIsRefused:
         ):
             prior_sensitivity({"line": line.idata}, models={"line": plane.model})
 
-    def test_a_table_of_something_else(self):
-        table = compare_evidence(RIVALS)
-        with pytest.raises(ModelError, match=r"without the columns \['se', 'prior'\]"):
-            prior_sensitivity(table.drop(columns=["se", "prior"]))
-        with pytest.raises(ModelError, match="estimator must not be given with a table"):
-            prior_sensitivity(table, estimator="bridge")
+    @pytest.mark.parametrize(
+        ("name", "instead"), [("prior", "give model_prior="), ("exponents", "a model_prior for")]
+    )
+    def test_former_names(self, name, instead):
+        with pytest.raises(TypeError, match=rf"'{name}' any more: .*{instead}"):
+            curves_of({"line": Rival(2, 1)}, **{name: None})
 
 
 class Undetermined:

@@ -1,45 +1,24 @@
-"""Curves of probability: those of `compare_evidence` at each exponent, and of a given Dataset."""
+"""Curves of probability against the width of the priors, of a given Dataset."""
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import DimensionCorrection, compare_evidence, plot_prior_sensitivity
+from pymc_statespace_filters import plot_prior_sensitivity
 from pymc_statespace_filters.errors import ModelError
 from tests.plots.drawn import drawn
 
-PRIOR = {"linear": 3, "cubic": 1, "quintic": 2}
 
-
-@pytest.mark.parametrize("of_table", [None, DimensionCorrection(exponent=2)])
-def test_curves_are_those_of_compare_evidence(rivals, of_table):
-    table = compare_evidence(rivals, prior=PRIOR, correction=of_table)
-    collection = plot_prior_sensitivity(table, backend="none")
-    for exponent in (0.0, 1.0, 3.0):
-        correction = DimensionCorrection(exponent=exponent)
-        expected = compare_evidence(rivals, prior=PRIOR, correction=correction)
-        for name, curve in drawn(collection, "curve", "prob").items():
-            at = np.flatnonzero(np.isclose(curve["x"], exponent)).item()
-            row = expected.loc[name]
-            np.testing.assert_allclose(curve["y"][at], row["prob"], rtol=1e-9)
-            # Quantiles of 50 000 normals, dealt to the models in another order: where the density
-            # of the probability is above 0.2, five standard errors of a difference are below 0.025.
-            band = drawn(collection, "band", "prob")[name]
-            np.testing.assert_allclose(band["y_bottom"][at], row["prob_low"], atol=0.025)
-            np.testing.assert_allclose(band["y_top"][at], row["prob_high"], atol=0.025)
-
-
-def test_widths_have_a_panel_of_their_own_with_a_logarithmic_axis():
+def test_the_axis_of_widths_is_logarithmic():
     widths = np.array([0.1, 1.0, 10.0])
     values = np.array([[0.2, 0.8], [0.5, 0.5], [0.9, 0.1]])
     found = xr.Dataset(
         {
-            **{name: (("exponent", "model"), values) for name in ("prob", "prob_low", "prob_high")},
             "width_prob": (("width", "model"), values),
             "width_prob_low": (("width", "model"), values - 0.1),
             "width_prob_high": (("width", "model"), values + 0.1),
         },
-        coords={"exponent": [0, 1, 2], "width": widths, "model": ["a", "b"]},
+        coords={"width": widths, "model": ["a", "b"]},
     )
     collection = plot_prior_sensitivity(found, backend="none")
     curve = drawn(collection, "curve", "width_prob")["a"]
@@ -54,15 +33,14 @@ def test_widths_have_a_panel_of_their_own_with_a_logarithmic_axis():
 
 
 def of_widths(values, **more):
-    """Curves of two models against three widths, without those of the exponent."""
+    """Curves of two models against three widths."""
     models = ("width", "model")
     return xr.Dataset(
         {
-            **{name: (("exponent", "model"), np.full((3, 2), 0.5)) for name in PROBS},
             **{f"width_{name}": (models, np.array(values)) for name in PROBS},
             **{name: (models, np.array(value)) for name, value in more.items()},
         },
-        coords={"exponent": [0, 1, 2], "width": [0.1, 1.0, 10.0], "model": ["a", "b"]},
+        coords={"width": [0.1, 1.0, 10.0], "model": ["a", "b"]},
     )
 
 
@@ -87,7 +65,7 @@ def test_a_panel_without_results_tells_why():
         "the prior",
     ]
     assert (note["x"], note["y"]) == (0.0, 0.5)
-    axes = plot_prior_sensitivity(found).viz["figure"].item().axes[1]
+    axes = plot_prior_sensitivity(found).viz["figure"].item().axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == (
         "width of the priors (factor)",
         "probability of the model",
@@ -119,11 +97,9 @@ def test_the_axis_tells_at_how_many_widths_there_is_no_result():
 )
 def test_the_panel_of_widths_names_the_priors_that_it_is_without(attrs, lines):
     values = np.full((3, 2), np.nan if attrs.get("width_unknown") else 0.5)
-    curves = {f"{of}prob{end}": values for of in ("", "width_") for end in ("", "_low", "_high")}
-    dims = {True: ("width", "model"), False: ("exponent", "model")}
     found = xr.Dataset(
-        {name: (dims[name.startswith("width")], curve) for name, curve in curves.items()},
-        coords={"exponent": [0, 1, 2], "width": [0.5, 1, 2], "model": ["a", "b"]},
+        {f"width_{name}": (("width", "model"), values) for name in PROBS},
+        coords={"width": [0.5, 1, 2], "model": ["a", "b"]},
         attrs=attrs,
     )
     collection = plot_prior_sensitivity(found, backend="none")
@@ -131,16 +107,15 @@ def test_the_panel_of_widths_names_the_priors_that_it_is_without(attrs, lines):
     assert [one["string"].split("\n") for one in panel if one["function"] == "xlabel"] == [lines]
 
 
-def test_an_evidence_without_error_leaves_curves_without_bands(rivals, table):
-    unknown = table.assign(se=[np.nan, 0.1, 0.1])
+def test_evidences_without_errors_leave_curves_without_bands():
+    found = of_widths([[0.5, 0.5]] * 3)
+    unknown = found.assign({name: found[name] * np.nan for name in list(found) if "prob_" in name})
     collection = plot_prior_sensitivity(unknown, backend="none")
-    assert set(drawn(collection, "band", "prob").values()) == {None}
-    assert None not in drawn(collection, "curve", "prob").values()
+    assert set(drawn(collection, "band", "width_prob").values()) == {None}
+    assert None not in drawn(collection, "curve", "width_prob").values()
 
 
 def test_what_is_refused(table):
-    for given in (xr.Dataset(), None):
-        with pytest.raises(ModelError, match="table must be one of compare_evidence or a result"):
+    for given in (xr.Dataset(), None, table):
+        with pytest.raises(ModelError, match="curves must be the result of prior_sensitivity, got"):
             plot_prior_sensitivity(given)
-    with pytest.raises(ModelError, match="table of compare_evidence, got one without the columns"):
-        plot_prior_sensitivity(table[["prob"]])

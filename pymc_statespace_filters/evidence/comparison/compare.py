@@ -3,14 +3,14 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ...errors import EvidenceWarning, ModelError
+from ...errors import EvidenceWarning
+from ...former_names import former_names
 from ..evidence import Evidence
 from .selection import EvidenceLike, check_ci_prob, prior_weights, probabilities, select_evidences
 from .sentences import needs_warning, sentences, step_error_columns
@@ -22,54 +22,14 @@ STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DimensionCorrection:
-    """The thesis's correction for the number of parameters, c = J^(k alpha / 2) (after Eq. 3.7).
-
-    It amounts to a prior over models, P(M) proportional to J^(-k alpha / 2), where k is the number
-    of free scalar variables of the model and J its number of observations.
-
-    Parameters
-    ----------
-    exponent : float
-        alpha. The thesis used 3; under flat priors, 1 is the penalty of the Bayesian information
-        criterion.
-
-    Raises
-    ------
-    ModelError
-        If `exponent` is not a finite number.
-
-    Examples
-    --------
-    >>> from pymc_statespace_filters import DimensionCorrection
-    >>> from pymc_statespace_filters.evidence import Evidence
-    >>> evidence = Evidence(-31.24, 0.02, "chib_jeliazkov", 3, 100, -24.1, "0c5f")
-    >>> round(DimensionCorrection(exponent=3).log_prior(evidence), 3)
-    -20.723
-    """
-
-    exponent: float = 3.0
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.exponent, int | float) and math.isfinite(self.exponent)):
-            raise ModelError(f"exponent must be a finite number, got {self.exponent!r}")
-
-    def log_prior(self, evidence: Evidence) -> float:
-        """Return -ln c, the term added to the log-evidence."""
-        if evidence.n_observations < 1:
-            raise ModelError(
-                "correction needs a model with observed variables, "
-                f"got n_observations={evidence.n_observations}"
-            )
-        return -0.5 * evidence.n_parameters * self.exponent * math.log(evidence.n_observations)
-
-
+@former_names(
+    prior="give model_prior=",
+    correction="give model_prior=, proportional to J^(-k alpha / 2) for k parameters",
+)
 def compare_evidence(
     evidences: Mapping[str, EvidenceLike],
     *,
-    prior: Mapping[str, float] | None = None,
-    correction: DimensionCorrection | None = None,
+    model_prior: Mapping[str, float] | None = None,
     ci_prob: float = 0.95,
     estimator: str | None = None,
     step_errors: Mapping[str, pd.DataFrame] | None = None,
@@ -81,10 +41,8 @@ def compare_evidence(
     evidences : mapping of str to Evidence, xarray.DataTree, or mapping of str to Evidence
         One entry per model, all of the same data: an `Evidence`, a DataTree with the group
         ``evidence``, or the result of `estimate_evidence`.
-    prior : mapping of str to float, optional
+    model_prior : mapping of str to float, optional
         Positive prior weight of every model, normalised here; equal by default.
-    correction : DimensionCorrection, optional
-        A further factor of the prior, reported in its own column.
     ci_prob : float
         Probability of the intervals.
     estimator : str, optional
@@ -106,9 +64,7 @@ def compare_evidence(
             Probability, and its central interval under normal errors of the log-evidences (from
             50 000 fixed draws, so that the same evidences give the same table).
         ``log_evidence``, ``se``
-            As estimated, without prior and correction.
-        ``correction``
-            The term that the correction adds to the log-evidence.
+            As estimated, without the prior of the model.
         ``log_bayes_factor``
             Log-evidence minus that of the first row.
         ``n_parameters``, ``n_observations``
@@ -124,14 +80,13 @@ def compare_evidence(
             The log-evidence with the density of each Uniform prior replaced by one on the same
             support: the thesis's number (Eq. 3.7). It depends on the units of the parameters.
         ``prior``
-            Prior weight of the model without correction; ``prob`` is proportional to it.
+            Prior weight of the model; ``prob`` is proportional to it.
         ``strength``
             Kass and Raftery's category of the evidence for the first row against this one: "barely
             worth mentioning", "positive", "strong" or "very strong", with limits at 2, 6 and 10 of
             twice the log Bayes factor. The factor is taken at the weaker end of its interval, but
             not below 1, so that the category is conservative. "negative" if the evidence favours
-            this row, and only prior or correction place it below the first. Empty for the first
-            row.
+            this row, and only the prior places it below the first. Empty for the first row.
         ``warning``
             Whether the evidence has ``doubts``, no standard error, an improper prior, or chains
             that held a noise seed, whose error ``se`` excludes.
@@ -182,18 +137,15 @@ def compare_evidence(
     model
     cubic  0.881    0.875     0.887      -39.000  0.020
     linear 0.119    0.113     0.125      -41.000  0.020
-    Further columns, shown by .to_string(): correction, log_bayes_factor,
-      n_parameters, n_observations, bic, undecided, aic, log_evidence_flat, prior,
-      strength, warning, max_log_likelihood, approximate.
+    Further columns, shown by .to_string(): log_bayes_factor, n_parameters,
+      n_observations, bic, undecided, aic, log_evidence_flat, prior, strength,
+      warning, max_log_likelihood, approximate.
     """
     found, how_chosen = select_evidences(evidences, estimator)
     check_ci_prob(ci_prob)
-    if not (correction is None or isinstance(correction, DimensionCorrection)):
-        raise ModelError(f"correction must be a DimensionCorrection or None, got {correction!r}")
-    weights = prior_weights(prior, list(found))
+    weights = prior_weights(model_prior, list(found))
     _warn_of_improper(found)
-    added = [correction.log_prior(one) if correction else 0.0 for one in found.values()]
-    table = _columns(found, weights, np.array(added), ci_prob)
+    table = _columns(found, weights, ci_prob)
     if step_errors is not None:
         table = table.join(step_error_columns(step_errors, list(found)))
     in_order = {name: found[name] for name in table.index}
@@ -201,14 +153,12 @@ def compare_evidence(
     return EvidenceTable(table, sentences=[*said, *sentences(table, in_order, ci_prob)])
 
 
-def _columns(
-    found: Mapping[str, Evidence], weights: Array, added: Array, ci_prob: float
-) -> pd.DataFrame:
-    """All columns, most probable model first, for prior weights and corrections of the models."""
+def _columns(found: Mapping[str, Evidence], weights: Array, ci_prob: float) -> pd.DataFrame:
+    """All columns, most probable model first, for prior weights of the models."""
     models = list(found.values())
     log_evidence = np.array([one.log_evidence for one in models])
     se = np.array([one.se for one in models])
-    log_weight = log_evidence + added + np.log(weights)
+    log_weight = log_evidence + np.log(weights)
     probs = probabilities(log_weight, se, ci_prob)
     best = int(np.argmax(log_weight))
     error = norm.ppf((1 + ci_prob) / 2) * np.hypot(se, se[best])  # of a difference from the best
@@ -220,7 +170,6 @@ def _columns(
             "prob_high": probs.high,
             "log_evidence": log_evidence,
             "se": se,
-            "correction": added,
             "log_bayes_factor": log_bayes_factor,
             "n_parameters": [one.n_parameters for one in models],
             "n_observations": [one.n_observations for one in models],
@@ -254,7 +203,7 @@ def _warn_of_improper(found: Mapping[str, Evidence]) -> None:
             f"improper or unnormalised priors in {', '.join(improper)}: the model probabilities "
             "depend on the units of these parameters; give them proper priors",
             EvidenceWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

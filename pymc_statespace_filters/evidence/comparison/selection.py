@@ -46,20 +46,24 @@ def probabilities(log_weight: Array, se: Array, ci_prob: float) -> Probabilities
     return Probabilities(prob, np.minimum(low, prob), np.maximum(high, prob))
 
 
-def prior_weights(prior: Mapping[str, float] | None, names: list[str]) -> Array:
+def prior_weights(model_prior: Mapping[str, float] | None, names: list[str]) -> Array:
     """Check and normalise prior weights of models; equal ones by default."""
-    if prior is None:
+    if model_prior is None:
         return np.full(len(names), 1 / len(names))
-    if not isinstance(prior, Mapping) or set(prior) != set(names):
-        raise ModelError(f"prior must give a weight to exactly the models {names}, got {prior!r}")
+    if not isinstance(model_prior, Mapping) or set(model_prior) != set(names):
+        raise ModelError(
+            f"model_prior must give a weight to exactly the models {names}, got {model_prior!r}"
+        )
     try:
-        weights = np.array([prior[name] for name in names], dtype=np.float64)
+        weights = np.array([model_prior[name] for name in names], dtype=np.float64)
     except (TypeError, ValueError):
         weights = np.array(np.nan)
     # Divide by the largest first: the sum may overflow. Ratios may still underflow to zero.
     ratios = np.clip(weights, 0, None) / (weights.max() if weights.max() > 0 else 1)
     if not (np.isfinite(weights).all() and (ratios > 0).all()):
-        raise ModelError(f"prior must be positive and finite for every model, got {prior!r}")
+        raise ModelError(
+            f"model_prior must be positive and finite for every model, got {model_prior!r}"
+        )
     return ratios / ratios.sum()
 
 

@@ -10,7 +10,7 @@ from arviz_base.sel_utils import xarray_sel_iter
 from arviz_stats import ess, kde
 from numpy.typing import NDArray
 
-from ...errors import ModelError
+from pymc_statespace_filters.errors import ModelError
 
 MIN_INDEPENDENT = 100  # draws for a bandwidth
 
@@ -50,21 +50,6 @@ def marginal_modes(
     would otherwise give too small a bandwidth. With 1000 effective draws the standard error of a
     mode is about 15 per cent of a standard deviation; a mode at the end of a support, such as that
     of a scale that may be zero, is only found to be near it.
-
-    Examples
-    --------
-    >>> import arviz as az
-    >>> import numpy as np
-    >>> import pymc_statespace_filters as psf
-    >>> rng = np.random.default_rng(1)
-    >>> linear = az.from_dict({"posterior": {"alpha": rng.normal(4, 0.1, (4, 1000))}})
-    >>> draws = {"alpha": rng.gamma(3, 1, (4, 1000)), "beta": rng.normal(-4, 1, (4, 1000))}
-    >>> cubic = az.from_dict({"posterior": draws})
-    >>> psf.marginal_modes({"linear": linear, "cubic": cubic}).round(0)
-            alpha  beta
-    model
-    linear    4.0   NaN
-    cubic     2.0  -4.0
     """
     models = {"posterior": idatas} if isinstance(idatas, xr.DataTree) else idatas
     if not isinstance(models, Mapping) or not models:

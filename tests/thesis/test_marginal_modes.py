@@ -1,16 +1,21 @@
 """Modes of marginal densities that are known, and the table in which they come."""
 
+from importlib import import_module
+
 import arviz as az
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import gamma, norm
 
-from pymc_statespace_filters import marginal_modes
 from pymc_statespace_filters.errors import ModelError
 
 # Quantiles stand for independent draws.
 LEVELS = np.random.default_rng(1).permutation((np.arange(4000) + 0.5) / 4000).reshape(4, 1000)
+
+
+def marginal_modes(*arguments, **keywords):
+    return import_module("marginal_modes").marginal_modes(*arguments, **keywords)
 
 
 def idata(**posterior):
