@@ -35,7 +35,6 @@ ENSEMBLES = {
 KERNELS = {
     "PFEnKF predictive": psf.PFEnKF(130),
     "PFEnKF weights": psf.PFEnKF(130, likelihood="weights"),
-    "PFEnKF as printed": psf.PFEnKF(130, likelihood="as_printed"),
 }
 BOOTSTRAPS = {
     "BootstrapPF systematic": psf.BootstrapPF(200),

@@ -23,7 +23,7 @@ FILTERS = (
     *((psf.BootstrapPF(n), 20) for n in (250, 1250, 5000, 20_000, 80_000)),
     *(
         (psf.PFEnKF(n, likelihood=likelihood), n_seeds)
-        for likelihood in ("predictive", "weights", "as_printed")
+        for likelihood in ("predictive", "weights")
         for n, n_seeds in ((250, 10), (1000, 4))
     ),
 )

@@ -21,7 +21,7 @@ from .ensemble.kalman_update import (
 from .ensemble.loop import Outcome, failed
 from .ensemble.noise import observation_normals
 from .ensemble.particle_filter import ParticleFilter, particle_filter
-from .ensemble.weights import log_sum, normalise_weights
+from .ensemble.weights import normalise_weights
 from .kernel_density.density import density_method, importance_workspace, reweight
 from .outcomes import NONE
 from .plan import log_density, observe
@@ -29,8 +29,8 @@ from .protocol import System
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
 
-_LIKELIHOODS = ("predictive", "weights", "as_printed")
-_PREDICTIVE, _WEIGHTS, _AS_PRINTED = range(3)
+_LIKELIHOODS = ("predictive", "weights")
+_PREDICTIVE = 0
 
 
 @njit_internal
@@ -64,29 +64,21 @@ def update(system, j, k, t, d, noise, members, local, work):
 
     # Proposal (Eqs. 4.30-4.35) and weights (Eq. 4.36); without a proposal those of Eq. 4.28
     copy_members(X, members.X_f)
-    as_printed = likelihood == _AS_PRINTED
     if not (
         _propose(d, members, forecast.spread, system.free, local, scratch.moments)
-        and reweight(system, k, t, d, members, forecast, n_previous, local, scratch, as_printed)
+        and reweight(system, k, t, d, members, forecast, n_previous, local, scratch)
     ):
         copy_members(members.X_f, X)
         log_density(system, k, t, d, X, members.log_p)
         for i in range(log_w.size):
             log_w[i] += members.log_p[i]
-    log_printed, n_printed = 0.0, 0.0
-    if as_printed:
-        log_printed, n_printed = log_sum(
-            _log_weighted_density(members, scratch), scratch.w_equal, local
-        )
     log_total, n_weighted = normalise_weights(log_w, members.w, local)  # Eqs. 4.37, 4.43
 
     # Increment of the log-likelihood, the log of a mean, and the effective number of its weights
     if likelihood == _PREDICTIVE:  # Eq. 4.42 without its double count
         increment, n_effective = log_alive + forecast.log_sum, forecast.n_effective
-    elif likelihood == _WEIGHTS:  # of the mean unnormalised weight: importance sampling
+    else:  # of the mean unnormalised weight: importance sampling
         increment, n_effective = log_alive + log_total, n_weighted
-    else:  # Eq. 4.42 as printed: the ratio of two means
-        increment, n_effective = log_printed - log_total, min(n_printed, n_weighted)
     if not (np.isfinite(increment) and np.isfinite(log_total)):
         mark_finite(X, X, alive)
         return failed(failure_of_all(system, k, t, d, members, local))
@@ -125,11 +117,9 @@ class PFEnKF(ParticleFilter):
         Resampling scheme; "multinomial" is the thesis's, "systematic" has less noise. "sorted" is
         systematic resampling of sorted particles: by size with one state, along a Hilbert curve
         with two to eight. The estimate then changes little when its normals do.
-    likelihood : {"predictive", "weights", "as_printed"}
+    likelihood : {"predictive", "weights"}
         How p(d_j | d_1 .. d_{j-1}) is estimated. "predictive": previous weights on the forecast
-        particles. "weights": log of the mean unnormalised weight. "as_printed": Eqs. 4.36 and 4.42
-        to the letter, which count the previous weights and the likelihood twice and come out too
-        high, by 0.3 (coarse sensor) to 1.2 (precise sensor) nats per observation.
+        particles. "weights": log of the mean unnormalised weight.
 
     Raises
     ------
@@ -139,11 +129,13 @@ class PFEnKF(ParticleFilter):
 
     Notes
     -----
-    Differences from the source. The factor w_{d(j)-1,i} of Eq. 4.36 is dropped (except
-    "as_printed"): the sum over the previous weights in its numerator already carries it. N_eff in
-    Eq. 4.39 is that of the weights before the update. A direction in which the forecast has no
-    spread is left out of the densities. Where no proposal can be built (one particle has all the
-    weight, or a covariance is singular or not finite) the update is that of the bootstrap filter.
+    Differences from the source. The factor w_{d(j)-1,i} of Eq. 4.36 is dropped: the sum over the
+    previous weights in its numerator already carries it. "predictive" is Eq. 4.42 with the weights
+    from before the update, on the forecast particles: as printed it counts the observation twice.
+    N_eff in Eq. 4.39 is that of the weights before the update. A direction in which the forecast
+    has no spread is left out of the densities. Where no proposal can be built (one particle has all
+    the weight, or a covariance is singular or not finite) the update is that of the bootstrap
+    filter.
 
     With `observation_dist` or `observation_logp` observations are not simulated, no particle is
     moved, and the filter is the bootstrap filter.

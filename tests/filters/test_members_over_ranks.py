@@ -185,7 +185,7 @@ def test_sums_are_those_of_exact_arithmetic_and_the_same_on_any_number_of_ranks(
 # ---- whole filters
 
 
-LIKELIHOODS = ("predictive", "weights", "as_printed")
+LIKELIHOODS = ("predictive", "weights")
 CASES = [
     (EnKF(N), OSCILLATOR, NUMBERS),
     (EnKF(N, likelihood="gaussian"), OSCILLATOR, NUMBERS),

@@ -59,15 +59,13 @@ def numpy_pf_enkf(system, steps, observed, N, seed, likelihood, resample_below):
         n = len(X)
         K = covariance[:n, n:] @ np.linalg.inv(covariance[n:, n:])
         X_a = X + K @ (d[seen][:, None] - D)
-        factor = w if likelihood == "as_printed" else equal
-        log_w = np.log(factor) + log_p(X_a)
+        log_w = np.log(equal) + log_p(X_a)
         log_w += kernel_density(X, w, X_a) - kernel_density(X_a, equal, X_a)
         new = np.exp(log_w - logsumexp(log_w))
         terms.append(
             {
                 "predictive": logsumexp(np.log(w) + log_p(X)),
                 "weights": logsumexp(log_w),
-                "as_printed": logsumexp(np.log(new) + log_p(X_a)),
             }[likelihood]
         )
         X, w = X_a, new
@@ -80,7 +78,7 @@ def numpy_pf_enkf(system, steps, observed, N, seed, likelihood, resample_below):
 
 @pytest.mark.parametrize(
     ("likelihood", "resample_below"),
-    [("predictive", 0.9), ("weights", 0), ("as_printed", 0)],
+    [("predictive", 0.9), ("weights", 0)],
 )
 def test_is_its_equations_written_in_numpy(likelihood, resample_below):
     filter_ = PFEnKF(150, likelihood=likelihood, resample_below=resample_below)
@@ -98,12 +96,6 @@ def test_approaches_kalman():
     # the kernel's smoothing leaves a bias of some hundredths; 4 standard errors of the mean
     assert abs(errors.mean()) < 0.05 + 4 * errors.std() / np.sqrt(40)
     assert errors.std() < 0.3
-
-
-def test_as_printed_is_too_high_by_tenths_of_a_nat_per_observation():
-    terms, _ = run(PFEnKF(1000, likelihood="as_printed"), *LINE)
-    n_observed = np.count_nonzero(terms)
-    assert 0.3 * n_observed < terms.sum() - kalman(*LINE).sum() < 1.5 * n_observed
 
 
 def test_without_any_spread_it_is_the_bootstrap_filter():

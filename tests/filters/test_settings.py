@@ -32,8 +32,8 @@ TABLE = [
     *each(
         partial(psf.PFEnKF, 10),
         "likelihood",
-        ["ensemble", "gaussian"],
-        "likelihood must be one of 'predictive', 'weights', 'as_printed'",
+        ["ensemble", "gaussian", "as_printed"],
+        "likelihood must be one of 'predictive', 'weights'",
     ),
 ]
 for filter in PARTICLE_FILTERS:

@@ -9,10 +9,7 @@ import pytest
 import pymc_statespace_filters as psf
 from tests.references.records import (
     DOUBLE_WELL,
-    PRECISE_DOUBLE_WELL,
-    Record,
     double_well,
-    double_well_with_surprises,
 )
 from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters, log_likelihoods
 
@@ -67,21 +64,3 @@ def test_bootstrap_likelihood_has_the_right_mean():
     error = of_double_well(psf.BootstrapPF(1000), DOUBLE_WELL, double_well(), 400) - truth
     assert error.var() < 2.5
     assert_mean(np.exp(error), 1.0)
-
-
-@pytest.mark.parametrize(
-    ("reference", "whole_record", "nats_per_observation"),
-    [(DOUBLE_WELL, double_well(), 0.33), (PRECISE_DOUBLE_WELL, double_well_with_surprises(), 1.16)],
-    ids=["noisy_sensor", "precise_sensor"],
-)
-def test_likelihood_as_printed_counts_the_observation_twice(
-    reference, whole_record, nats_per_observation
-):
-    """Its limit is known: the mean of p(d_j | x) under the state's density given d_j as well."""
-    record = Record(*(part[:101] for part in whole_record))
-    answer = reference.point_mass_filter().run(*record)
-    printed = of_double_well(psf.PFEnKF(500, likelihood="as_printed"), reference, record, n_seeds=8)
-    excess = (printed - answer.terms.sum()) / len(record.steps)
-    limit = (answer.seen_twice.sum() - answer.terms.sum()) / len(record.steps)
-    assert limit == pytest.approx(nats_per_observation, abs=0.01)
-    assert excess.mean() == pytest.approx(limit, abs=0.05)

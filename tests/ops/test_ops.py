@@ -108,7 +108,7 @@ def test_filters_and_their_settings_have_machine_code_of_their_own():
         *(psf.EnKF(n, likelihood=word) for n in (20, 21) for word in ("ensemble", "gaussian")),
         *(psf.BootstrapPF(20, resample_below=r) for r in (0.0, 1 / 3, 1.0)),
         psf.BootstrapPF(20, resampling="multinomial"),
-        *(psf.PFEnKF(20, likelihood=w) for w in ("predictive", "weights", "as_printed")),
+        *(psf.PFEnKF(20, likelihood=w) for w in ("predictive", "weights")),
     ]
     keys = [cache_key(PAIR, filter.compile(compile_system(PAIR))) for filter in filters]
     keys.append(cache_key(PAIR, psf.EKF().compile_gradient(compile_system(PAIR))))

@@ -21,9 +21,6 @@ class GridAnswer(NamedTuple):
     terms: Array  # (J,) log p(d_j | d_1 .. d_{j-1})
     predicted_mean: Array  # (J,)
     predicted_sd: Array  # (J,), observation noise included
-    seen_twice: (
-        Array  # (J,) log of the mean of p(d_j | x) under p(x | d_1 .. d_j): Eq. 4.42 as printed
-    )
 
 
 def normal_density(x: Array, mean: Array | float, variance: float) -> Array:
@@ -82,12 +79,11 @@ class PointMassFilter:
 
     def run(self, steps: NDArray[np.int64], observed: Array) -> GridAnswer:
         """Terms and predictive moments for a record; NaN is a missing observation with term 0."""
-        terms, means, sds, seen_twice = (np.zeros(len(steps)) for _ in range(4))
+        terms, means, sds = (np.zeros(len(steps)) for _ in range(3))
         density, now = self.prior, 0
         for j, (step, observation) in enumerate(zip(steps, observed, strict=True)):
             density, now = self.predict(density, int(step) - now), int(step)
             means[j], sds[j] = self.moments(density)
             if not np.isnan(observation):
                 terms[j], density = self.update(density, observation)
-                seen_twice[j], _ = self.update(density, observation)
-        return GridAnswer(terms, means, sds, seen_twice)
+        return GridAnswer(terms, means, sds)

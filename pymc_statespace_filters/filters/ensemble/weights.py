@@ -133,15 +133,9 @@ def normalise_weights(log_w, w, local):
     Returns the log of their former sum and their effective number (thesis, Eq. 4.43). NaN and +inf
     are weights of zero. If every weight is zero, the log is -inf and the weights are useless.
     """
-    log_total, n_effective = log_sum(log_w, w, local)
+    weigh(log_w, w, local, FIRST_ROW)
+    allgather_sums(local, FIRST_ROW + 3)
+    log_total, n_effective = total_weight(local, FIRST_ROW)
     if log_total > -np.inf:
         normalise_local(log_total, log_w, w, local, FIRST_ROW)
     return log_total, n_effective
-
-
-@njit_internal
-def log_sum(log_w, scratch, local):
-    """Log of the sum of the weights of all members, and their effective number."""
-    weigh(log_w, scratch, local, FIRST_ROW)
-    allgather_sums(local, FIRST_ROW + 3)
-    return total_weight(local, FIRST_ROW)

@@ -187,11 +187,11 @@ def importance_workspace(system, local):
 
 
 @njit_internal
-def reweight(system, k, t, d, members, forecast, n_effective, local, scratch, keeps_previous):
+def reweight(system, k, t, d, members, forecast, n_effective, local, scratch):
     """Write the unnormalised log-weights of X to log_w and log p(d | x^a) to log_p.
 
-    ``keeps_previous`` keeps the factor w_{d(j)-1,i} of Eq. 4.36. Returns False, with log_w
-    unchanged, if proposal and forecast do not spread in the same directions.
+    Returns False, with log_w unchanged, if proposal and forecast do not spread in the same
+    directions.
     """
     X, w, log_w, log_p = members.X, members.w, members.log_w, members.log_p
     free, n, n_alive, w_equal = system.free, system.n, forecast.n_alive, scratch.w_equal
@@ -206,8 +206,7 @@ def reweight(system, k, t, d, members, forecast, n_effective, local, scratch, ke
     log_kernel_density(local, w, members.X_f, X, free, kernel_f, density, log_prior)
     log_kernel_density(local, w_equal, X, X, free, kernel_a, density, log_proposal)
     for i in range(w.size):
-        previous = log_w[i] if keeps_previous else -math.log(n_alive)
-        log_weight = previous + log_p[i] + (log_prior[i] - log_proposal[i])
+        log_weight = -math.log(n_alive) + log_p[i] + (log_prior[i] - log_proposal[i])
         log_w[i] = log_weight if members.alive[i] else -np.inf
     return True
 
