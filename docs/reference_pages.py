@@ -101,6 +101,7 @@ GROUPS = {
         "errors.LoweringError",
         "errors.CheckpointError",
         "errors.ParallelError",
+        "errors.ModelWarning",
         "errors.FilterWarning",
         "errors.EvidenceWarning",
         "errors.CheckpointWarning",

@@ -13,6 +13,7 @@ __all__ = [
     "GradientUnavailableError",
     "LoweringError",
     "ModelError",
+    "ModelWarning",
     "ParallelError",
     "ParallelWarning",
     "StateSpaceFiltersError",
@@ -137,6 +138,18 @@ class ParallelWarning(UserWarning):
     >>> import pymc_statespace_filters as psf
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("error", psf.errors.ParallelWarning)
+    """
+
+
+class ModelWarning(UserWarning):
+    """The model is probably not the one that was meant, for example because of a misspelt name.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> import pymc_statespace_filters as psf
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", psf.errors.ModelWarning)
     """
 
 

@@ -18,7 +18,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.observation import (
     conditional_moments,
-    differentiable_log_density,
+    observation_log_density,
     unknown_moments,
 )
 from ..errors import ModelError
@@ -60,8 +60,7 @@ class IPLF(GaussianFilterBase):
     not checked for convergence. With ``n_iterations=1`` and Gaussian noise the state is that of
     `UKF`. The posterior of the state stays Gaussian with a covariance from the variances of the
     observation: outliers of a Student t pull the state as they would pull it with Gaussian noise.
-    A variance that is infinite, of a Student t with ``nu <= 2``, gives minus infinity. A partly
-    missing row of ``observation_dist`` counts as missing.
+    A variance that is infinite, of a Student t with ``nu <= 2``, gives minus infinity.
 
     Examples
     --------
@@ -126,7 +125,7 @@ class PosteriorLinearization(SigmaPoints):
 
     def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
         """The observation ``values["d"]``, linearised over its posterior."""
-        datum, n = _datum(system, values["d"]), system.n
+        datum, n = values["d"], system.n
         moments = at_points(conditional_moments, system, values)
         nothing = pt.zeros((system.p, n))
         posterior = _Posterior(pt.zeros((n,)), nothing, nothing, nothing, pt.zeros(()))
@@ -136,7 +135,7 @@ class PosteriorLinearization(SigmaPoints):
             jac = posterior.by_prior(line.jac)
             observation = seen(datum, line._replace(mean=line.mean - jac @ posterior.mean, jac=jac))
             posterior = _posterior(observation)
-        term = self._log_density(system, {**values, "d": datum}, state, posterior)
+        term = self._log_density(system, values, state, posterior)
         return observation._replace(term=term)
 
     def _log_density(
@@ -185,11 +184,4 @@ def _posterior(observation: Seen) -> _Posterior:
 
 def _log_p(system: StateSpaceModel, values: Symbols) -> list[TensorVariable]:
     """log p(d | x)."""
-    return [differentiable_log_density(system, values)]
-
-
-def _datum(system: StateSpaceModel, d: TensorVariable) -> TensorVariable:
-    """The datum; of distributions, a partly missing row counts as missing."""
-    if system.gaussian_observation:
-        return d
-    return pt.switch(pt.any(pt.isnan(d)), np.nan, d)
+    return [observation_log_density(system, values)]

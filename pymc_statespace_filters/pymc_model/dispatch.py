@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytensor.tensor as pt
 from pymc.logprob.abstract import _logprob
 from pytensor.graph.basic import Variable
@@ -20,7 +21,9 @@ from ..ops.likelihood import LogLikelihood, vectorized
 from ..ops.unplanned import cache_key, check_of_rows, end_of_record, single_record
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
+from .inspection import state_space_nodes
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
+from .unused_priors import warn_of_unused_priors
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
 
@@ -94,6 +97,14 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
     return draw, None if key is None else int(key[:15], 16)
 
 
+def _warn_about_model(op: StateSpaceRV) -> None:
+    """Warn of what may be wrong, where the log-density of the model in context is asked for."""
+    warn_of_held_seed(op.filter)
+    model = pm.Model.get_context(error_if_none=False)
+    if model is not None and op in [node.op for node in state_space_nodes(model).values()]:
+        warn_of_unused_priors(model)
+
+
 @_logprob.register(StateSpaceRV)
 def _log_density(
     op: StateSpaceRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
@@ -101,7 +112,7 @@ def _log_density(
     """log p(d_j | d_1 .. d_{j-1}), one term per observation, 0 for those that are not scored."""
     (value,) = values
     theta, steps, inputs, t0, seed = params
-    warn_of_held_seed(op.filter)
+    _warn_about_model(op)
     likelihood = LogLikelihood(op.system, op.filter)
     terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
     if op.score_from == 0:
@@ -119,7 +130,7 @@ def _log_density_of_panel(
     """The same for every record; the first rows of each are not scored."""
     (value,) = values
     theta, rows, inputs, t0, seed = params
-    warn_of_held_seed(op.filter)
+    _warn_about_model(op)
     likelihood = LogLikelihood(op.system, op.filter, PANEL)
     terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
     if op.score_from == 0:

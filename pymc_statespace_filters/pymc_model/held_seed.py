@@ -22,7 +22,8 @@ _SAMPLERS = ("pymc.step_methods.", "pymc.smc.")
 # Those with gradients, of which there are none: an error says so.
 _WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
 _GRAPHS = ("pymc.logprob.", "pymc.model.", "pytensor.", "functools", f"{__package__}.")
-_INSIDE = (
+# Files between a warning and the line of the user.
+INSIDE = (
     str(Path(__file__).parents[1]),
     *(str(Path(module.__file__).parent) for module in (pymc, pytensor)),
     functools.__file__.removesuffix(".py"),
@@ -39,7 +40,7 @@ def warn_of_held_seed(filter: Filter) -> None:
             "posterior under that seed, with the error of the estimate. Use psf.sample_dram() or "
             "pm.sample(step=psf.DRAM()), which draw new noise for each proposal.",
             FilterWarning,
-            skip_file_prefixes=_INSIDE,
+            skip_file_prefixes=INSIDE,
         )
 
 

@@ -70,7 +70,8 @@ def check_floats(name: str, value: Any, ndim: int | None, *, missing: bool = Fal
     if np.ma.isMaskedArray(value):
         value = np.ma.filled(np.ma.asarray(value, dtype="float64"), np.nan)
     try:
-        array = np.array(value, dtype="float64")
+        # By rows, as compiled code reads it: the numbers of a DataFrame are stored by columns.
+        array = np.array(value, dtype="float64", order="C")
     except (TypeError, ValueError):
         raise ModelError(f"{name} must be numbers, got {shortened(value)}") from None
     if ndim is not None and array.ndim != ndim:

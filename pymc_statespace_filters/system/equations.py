@@ -23,6 +23,18 @@ RESERVED = {
     "u": "the inputs",
     "t": "the time",
 }
+FUNCTIONS_OF_STATE = (
+    "transition", "drift", "diffusion", "process_dist",
+    "observation", "observation_dist", "observation_logp",
+)  # fmt: skip
+_WITHOUT_STATE = (
+    "It has no argument x, the state, and other names than "
+    f"{', '.join(f'{name} ({what})' for name, what in RESERVED.items())} are parameters, which are "
+    "numbers unless shapes= says otherwise"
+)
+_HOW_TO_WRITE = (
+    "Write it with pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or if"
+)
 # What has a row for each state, whose number is that of the initial mean.
 ROWS_ARE_STATES = ("transition", "drift", "diffusion", "A", "B", "offset")
 
@@ -47,9 +59,15 @@ class Equation:
         except Exception as error:
             raise ModelError(
                 f"{self.role} could not be traced with symbolic arguments "
-                f"({', '.join(arguments)}): {type(error).__name__}: {error}. Write it with "
-                f"pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or if"
+                f"({', '.join(arguments)}): {type(error).__name__}: {error}. "
+                + (_WITHOUT_STATE if self._may_lack_state else _HOW_TO_WRITE)
             ) from error
+
+    @property
+    def _may_lack_state(self) -> bool:
+        """Whether an argument may be the state under another name."""
+        has_state = "x" in self.symbols or not self.parameters
+        return self.role in FUNCTIONS_OF_STATE and not has_state
 
 
 def read_equation(role: str, function: Any, symbols: Sequence[str]) -> Equation:

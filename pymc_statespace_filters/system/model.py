@@ -8,6 +8,7 @@ from typing import Any
 from ..errors import ModelError
 from .graph_digest import describe, digest
 from .integrators.protocol import Integrator, bound_to_states
+from .labels import default_names
 from .signature import checked_names, names_of_states, read_signature, size_of
 from .tracing import Equations, read, size, trace
 
@@ -49,7 +50,8 @@ class StateSpaceModel:
     observation_dist : callable, optional
         ``f(x, ...)`` returning one PyMC distribution per observable, independent given ``x``.
     observation_logp : callable, optional
-        ``f(d, x, ...)`` returning the log-density of one observation ``d``, shape (p,).
+        ``f(d, x, ...)`` returning the log-density of one observation ``d``, shape (p,), in which a
+        missing component is NaN.
     dt : float, optional
         Length of a step where the transition is a function; default 1.
     initial_mean, initial_cov : array_like or callable
@@ -125,7 +127,7 @@ class StateSpaceModel:
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs)
         symbols = size(functions, signature, bool(accumulators))
-        state_names = checked_names("states", states, [f"x{i}" for i in range(symbols.n)])
+        state_names = checked_names("states", states, default_names("x", symbols.n))
         totals = names_of_states("accumulators", accumulators, state_names)
         equations, seen = trace(
             functions, symbols, observables, [state_names.index(name) for name in totals]
@@ -142,7 +144,7 @@ class StateSpaceModel:
             r=r,
             n_inputs=len(signature.inputs),
             states=state_names,
-            observables=checked_names("observables", observables, [f"y{i}" for i in range(p)]),
+            observables=checked_names("observables", observables, default_names("y", p)),
             inputs=signature.inputs,
             carried=names_of_states("carried", carried, state_names),
             accumulators=totals,

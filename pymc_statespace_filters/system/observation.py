@@ -15,6 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .equations import (
+    RESERVED,
     Equation,
     as_symbol,
     as_vector,
@@ -25,6 +26,9 @@ from .equations import (
 from .graph_digest import freeze
 
 Values = Mapping[str, TensorVariable]
+
+# At which log-densities and their derivatives are finite, or known to be outside of the support.
+_ANY_VALUE = 0.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class GaussianObservation:
             raise ModelError(
                 "observation_noise must be the covariance of the observation, got None"
             )
-        self.observation = read_equation("observation", observation, "xeut")
+        self.observation = _of_state(read_equation("observation", observation, "xeut"))
         self.covariance = read_covariance("observation_noise", covariance)
 
     @property
@@ -130,10 +134,12 @@ class DensityObservation:
         self.simulated = (
             None if observation is None else GaussianObservation(observation, observation_noise)
         )
-        self.dist = None if dist is None else read_equation("observation_dist", dist, "xut")
+        self.dist = None
+        if dist is not None:
+            self.dist = _of_state(read_equation("observation_dist", dist, "xut"))
         self.logp = None
         if logp is not None:
-            self.logp = read_equation("observation_logp", logp, ("d", *"xut"))
+            self.logp = _of_state(read_equation("observation_logp", logp, ("d", *"xut")))
             if "d" not in self.logp.symbols:
                 raise ModelError("observation_logp must have the argument d, the observation")
 
@@ -165,6 +171,17 @@ class DensityObservation:
         )
 
 
+def _of_state(equation: Equation) -> Equation:
+    """The equation, which must have the state: without it data say nothing of the state."""
+    if "x" not in equation.symbols:
+        raise ModelError(
+            f"{equation.role} must have the argument x, the state, got the arguments "
+            f"{[*equation.symbols, *equation.parameters]}: names other than "
+            f"{', '.join(RESERVED)} are parameters"
+        )
+    return equation
+
+
 def _trace_distributions(
     dist: Equation, values: Values, n_observables: int | None
 ) -> TracedObservation:
@@ -180,13 +197,13 @@ def _trace_distributions(
     return TracedObservation(
         noise=pt.tensor("e", shape=(0,), dtype="float64"),
         datum=datum,
-        # A partly missing row counts as missing.
-        logp=pt.switch(pt.any(pt.isnan(datum)), 0.0, pt.sum(pt.stack(terms))),
+        logp=pt.sum(pt.stack(terms)),
         draw=pt.stack([pt.cast(variable, "float64") for variable in variables]),
     )
 
 
 def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
+    """The log-density of one component, 0 where it is missing: it is independent of the others."""
     if not isinstance(variable, TensorVariable) or variable.type.ndim != 0:
         raise ModelError(
             "observation_dist must return one scalar PyMC distribution per observable "
@@ -194,14 +211,19 @@ def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
         )
     if variable.owner is None:
         raise ModelError(f"observation_dist must return distributions, got {variable}")
+    missing = pt.isnan(value)
+    # A number in place of NaN, which would survive in a gradient.
+    value = pt.switch(missing, _ANY_VALUE, value)
     try:
         if "int" in variable.type.dtype:
             # A value that is not an integer has probability zero.
             whole = pm.logp(variable, pt.cast(pt.round(value), variable.type.dtype))
-            return pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
-        return pm.logp(variable, value)
+            there = pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
+        else:
+            there = pm.logp(variable, value)
     except NotImplementedError as error:
         raise ModelError(
             f"observation_dist must return distributions with a log-density, got {variable}: "
             f"{error}"
         ) from error
+    return pt.switch(missing, 0.0, there)

@@ -13,7 +13,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pytensor.tensor as pt
+import xarray as xr
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
@@ -38,7 +40,8 @@ def _own_inputs(inputs: Any, records: Records) -> list[Any] | None:
             )
         return [inputs[label] for label in records.labels]
     is_list = isinstance(inputs, list | tuple) and all(
-        isinstance(part, np.ndarray | Variable) and part.ndim for part in inputs
+        isinstance(part, np.ndarray | Variable | pd.DataFrame | xr.DataArray) and part.ndim
+        for part in inputs
     )
     if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
         return None

@@ -33,7 +33,8 @@ def panel_from(
         The column of times, in the unit of `dt`. Every record starts at ``t0`` by this clock: of
         dates, subtract the start of each record before.
     values : str or sequence of str
-        The column of each observable, in the order of the system's; NaN where missing.
+        The column of each observable; NaN where missing. Several have the names of the system's
+        observables, in any order; a single column may have any name.
     dt : float
         Length of a step of the system. Times are rounded to the nearest steps.
     t0 : float
@@ -87,7 +88,7 @@ def panel_from(
         raise ModelError(f"every row of frame must have a record, got none in row {row!r}")
     times, observed = _floats(frame, [time])[:, 0], _floats(frame, columns)
     order = np.lexsort([times, numbers])
-    labels = np.asarray(frame[record])[order]
+    labels, data = np.asarray(frame[record])[order], observed[order]
     records = records_of(labels)
     steps = [
         _steps(frame, order[rows], times[order[rows]], label, dt, t0)
@@ -96,7 +97,7 @@ def panel_from(
     return {
         "panel": labels,
         "steps": np.concatenate(steps),
-        "observed": observed[order],
+        "observed": data if len(columns) == 1 else pd.DataFrame(data, columns=columns),
         "t0": t0,
     }
 

@@ -10,6 +10,7 @@ from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
+from .labels import rows_in_order
 from .model import StateSpaceModel
 from .panel import SymbolicPanel
 from .panel_records import Records
@@ -130,7 +131,7 @@ def panel_parameters(
     check_complete(system, values)
     n_records, parts = len(records.labels), [np.zeros((len(records.labels), 0))]
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        part = numbers(name, values[name])
+        part = numbers(name, _by_record(name, values[name], shape, records))
         _check_shape(name, shape, part.shape, n_records)
         whole = np.broadcast_to(part, (n_records, *shape))
         parts.append(whole.reshape(n_records, -1))
@@ -149,7 +150,7 @@ def symbolic_panel_parameters(
     n_records = len(panel.records.labels)
     parts: list[Any] = [np.zeros((n_records, 0))] if not system.parameters else []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
-        value = values[name]
+        value = _by_record(name, values[name], shape, panel.records)
         symbol = pt.as_tensor(value if isinstance(value, Variable) else numbers(name, value))
         _check_shape(name, shape, symbol.type.shape, n_records)
         size = int(np.prod(shape, dtype=int))
@@ -162,6 +163,13 @@ def symbolic_panel_parameters(
                 part = CheckAndRaise(ModelError, _OTHER_NUMBER.format(name=name))(part, fits)
         parts.append(pt.cast(part, "float64"))
     return pt.specify_shape(pt.concatenate(parts, axis=1), (None, system.n_theta))
+
+
+def _by_record(name: str, value: Any, shape: tuple[int, ...], records: Records) -> Any:
+    """A value with a row for each record, if it has rows, in the order of the records."""
+    if isinstance(value, Variable) or np.ndim(value) == len(shape):
+        return value
+    return rows_in_order(f"parameter {name!r}", value, records.labels)
 
 
 def _check_shape(name: str, shape: tuple[int, ...], found: tuple, n_records: int) -> None:

@@ -14,6 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..errors import ModelError
 from .accumulators import n_input_rows, with_resets, with_symbolic_resets
 from .checks import check_finite, check_floats, shortened
+from .labels import columns_in_order
 from .model import StateSpaceModel
 from .steps import steps_of
 
@@ -119,6 +120,7 @@ def check_system(system: Any) -> None:
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:
     """The data as (J, p); NaN marks what is missing."""
+    observed = columns_in_order("observed", observed, system.observables, "observables")
     array = check_floats("observed", observed, None, missing=True)
     if array.ndim == 1 and system.p == 1:
         array = array[:, None]
@@ -148,6 +150,7 @@ def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, steps: np.ndarra
             f"inputs must be None for a system without inputs, got {shortened(inputs)}; name them "
             f"in the system (StateSpaceModel(inputs=[...]))"
         )
+    inputs = columns_in_order("inputs", inputs, system.inputs, "inputs")
     array = check_floats("inputs", inputs, None)
     if array.ndim == 1 and system.n_inputs == 1:
         array = array[:, None]

@@ -114,8 +114,10 @@ def test_counts_have_the_density_of_scipy():
     with pytest.warns(psf.errors.FilterWarning, match="-inf"):  # not a whole number
         (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), point, [[4.5, 0.1]], steps=[0])
     assert term == -np.inf
-    (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), point, [[np.nan, 0.1]], steps=[0])
-    assert term == 0.0  # a partly missing row counts as missing
+    count, place = stats.poisson(np.exp(1.3)).logpmf(4), stats.norm(0.3, 0.5).logpdf(0.1)
+    for row, density in (([np.nan, 0.1], place), ([4.0, np.nan], count)):
+        (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), point, [row], steps=[0])
+        assert term == pytest.approx(density, rel=1e-12)
 
 
 def test_a_density_of_the_users_own():

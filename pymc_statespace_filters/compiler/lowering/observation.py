@@ -61,21 +61,6 @@ def observation_log_density(
     return log_normal(*without_missing(symbols["d"], mean, cov))
 
 
-def differentiable_log_density(
-    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
-) -> TensorVariable:
-    """log p(d | x) with a gradient where data are missing.
-
-    A missing datum of distributions is replaced, because its gradient would be NaN.
-    """
-    if system.equations.observation_draw is None:
-        return observation_log_density(system, symbols)
-    missing = pt.isnan(symbols["d"])
-    datum = pt.switch(missing, 1.0, symbols["d"])
-    there = observation_log_density(system, {**symbols, "d": datum})
-    return pt.switch(pt.any(missing), 0.0, there)
-
-
 def expected_observation(
     system: StateSpaceModel, given: Mapping[str, TensorVariable]
 ) -> TensorVariable:

@@ -7,7 +7,7 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.codegen.function_types import Graph
-from ...compiler.lowering.observation import differentiable_log_density
+from ...compiler.lowering.observation import observation_log_density
 from ...compiler.lowering.symbols import call, symbols_of
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
@@ -161,7 +161,7 @@ def deterministic_functions(system: StateSpaceModel) -> GaussianFilterFunctions:
     start = call(system.equations.initial_mean, system, values)
     step = call(system.equations.transition, system, state)
     # A copy: the derivative of the term by s would be lost beside s itself as an output.
-    seen = [pt.tensor_copy(values["s"]), pt.atleast_1d(differentiable_log_density(system, state))]
+    seen = [pt.tensor_copy(values["s"]), pt.atleast_1d(observation_log_density(system, state))]
     return GaussianFilterFunctions(
         system,
         # Measured for Runge-Kutta steps: explicit rows take 45 % longer than propagation.

@@ -10,6 +10,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
 from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds, noisy_filters
+from ...pymc_model.unused_priors import warn_of_unused_priors
 from .initial_points import PriorDraws
 from .settings import DRAMSettings
 from .variables import RaveledVariables, check_noise_dependencies, continuous_value_vars
@@ -49,6 +50,7 @@ class SampledModel:
     """
 
     def __init__(self, model: Model, vars: Sequence[TensorVariable] | None, settings: DRAMSettings):
+        warn_of_unused_priors(model)
         self.settings = settings
         variables = continuous_value_vars(vars, model)
         self._seeds = noise_seeds(model)

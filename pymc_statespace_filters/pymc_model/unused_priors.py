@@ -1,0 +1,88 @@
+"""The warning that a prior reaches no likelihood, as one whose name is misspelt does."""
+
+import difflib
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import pymc as pm
+from pytensor.graph.traversal import ancestors
+from pytensor.tensor.basic import Join
+from pytensor.tensor.shape import SpecifyShape
+
+from ..errors import ModelWarning
+from ..system.equations import RESERVED
+from .held_seed import INSIDE
+from .inspection import state_space_nodes
+
+# Of the similarity of two names from 0 to 1: "beta" and "b" have 0.4.
+_SIMILAR = 0.35
+
+
+def warn_of_unused_priors(model: pm.Model) -> None:
+    """Warn of free variables whose posterior is their prior; of those in Deterministics do not."""
+    nodes = state_space_nodes(model)
+    fixed = {
+        name: label for label, node in nodes.items() for name in _constant_parameters(model, node)
+    }
+    for name in _unused_priors(model, nodes):
+        warnings.warn(
+            f"the prior of {name!r} reaches no likelihood, so its posterior is the prior"
+            + _probable_cause(name, fixed),
+            ModelWarning,
+            skip_file_prefixes=INSIDE,
+        )
+
+
+def _unused_priors(model: pm.Model, nodes: dict[str, Any]) -> Iterator[str]:
+    """Names of free variables that neither data nor a Deterministic depend on.
+
+    A variable that depends on one that reaches data is predicted, and not unused.
+    """
+    data = [*model.observed_RVs, *model.potentials]
+    if not (data and nodes):
+        return
+    free = set(model.free_RVs)
+    reached = free & set(ancestors([*data, *(node.outputs[1] for node in nodes.values())]))
+    shown = free & set(ancestors(model.deterministics))
+    for rv in model.free_RVs:
+        if rv not in reached | shown and not reached & set(ancestors([rv])):
+            yield rv.name
+
+
+def _constant_parameters(model: pm.Model, node: Any) -> list[str]:
+    """The parameters of a StateSpace variable that depend on no random variable."""
+    theta, parameters = node.inputs[-5], node.op.system.parameters
+    while theta.owner is not None and isinstance(theta.owner.op, SpecifyShape):
+        theta = theta.owner.inputs[0]
+    is_joined = theta.owner is not None and isinstance(theta.owner.op, Join)
+    parts = theta.owner.inputs if is_joined else [theta]
+    if len(parts) != len(parameters):
+        return []
+    random = set(model.basic_RVs)
+    return [
+        name
+        for name, part in zip(parameters, parts, strict=True)
+        if random.isdisjoint(ancestors([part]))
+    ]
+
+
+def _probable_cause(name: str, fixed: dict[str, str]) -> str:
+    """What was probably meant, given the fixed parameters and the variables that have them."""
+    if name in RESERVED:
+        return (
+            f": {name!r} is {RESERVED[name]} in the functions of a system, never a parameter. Give "
+            "the parameter another name"
+        )
+    similar = difflib.get_close_matches(name.lower(), fixed, n=1, cutoff=_SIMILAR)
+    if similar:
+        (near,) = similar
+        return (
+            f". The parameter {near!r} of {fixed[near]!r} is fixed at a number, its default if you "
+            f"gave none: name the prior {near!r}, or give params={{{near!r}: {name}}}"
+        )
+    others = f"; of the parameters, {list(fixed)} are fixed at numbers" if fixed else ""
+    return (
+        f"{others}. Give a parameter of the system this name, or remove the prior; one that you "
+        "want to keep is used in a pm.Deterministic"
+    )

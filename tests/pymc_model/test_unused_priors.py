@@ -1,0 +1,84 @@
+"""Priors that reach no likelihood are named, and those that are meant so are not."""
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError, ModelWarning
+from pymc_statespace_filters.pymc_model.unused_priors import warn_of_unused_priors
+from pymc_statespace_filters.sampling.target.sampled_model import SampledModel
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from tests.systems import PAIR, PAIR_DATA, STEPS, pair_terms
+
+pytestmark = pytest.mark.usefixtures("interpreted")
+
+
+def model_with(add):
+    """PAIR, whose parameter b has a default, with a prior of a and what ``add`` adds."""
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.2)
+        add()
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
+    return model
+
+
+def test_a_misspelt_prior_is_named_with_the_default_that_is_used_instead():
+    model = model_with(lambda: pm.Normal("beta"))
+    said = r"prior of 'beta' reaches no likelihood.*parameter 'b' of 'd' is fixed.*'b': beta"
+    with pytest.warns(ModelWarning, match=said):
+        SampledModel(model, None, DRAMSettings())
+    with model, pytest.warns(ModelWarning, match=said):  # as a sampler of PyMC asks
+        found = model.logp(vars=[model["d"]])
+    at = {model.rvs_to_values[model["a"]]: 0.5}
+    np.testing.assert_allclose(found.eval(at), pair_terms(0.5).sum(), rtol=1e-12)
+
+
+def test_a_prior_with_a_reserved_name_is_named():
+    with pytest.warns(ModelWarning, match=r"prior of 't' .*: 't' is the time .* never a parameter"):
+        warn_of_unused_priors(model_with(lambda: pm.HalfNormal("t")))
+
+
+def test_a_group_of_priors_that_reaches_nothing_is_named():
+    def chain():
+        pm.Normal("level", pm.Normal("mean"))
+
+    with pytest.warns(ModelWarning) as caught:
+        warn_of_unused_priors(model_with(chain))
+    assert [str(w.message).split("'")[1] for w in caught] == ["mean", "level"]
+
+
+@pytest.mark.parametrize(
+    "add",
+    [
+        lambda: pm.Normal("b"),
+        lambda: pm.Deterministic("y", 2.0 * pm.Normal("b0")),
+        lambda: pm.Potential("p", -(pm.Normal("c") ** 2)),
+        lambda: pm.Normal("other", pm.Normal("c"), observed=[1.0]),
+        lambda: pm.Normal("new group", pm.Normal("b")),
+        lambda: psf.StateSpace("e", PAIR, psf.EKF(), steps=STEPS, params={"a": pm.Normal("c")}),
+    ],
+    ids=["reached", "Deterministic", "Potential", "other data", "predicted", "simulated"],
+)
+def test_what_is_meant_is_not_named(add, recwarn):
+    warn_of_unused_priors(model_with(add))
+    assert not recwarn
+
+
+def test_a_model_without_data_has_no_unused_prior(recwarn):
+    with pm.Model() as model:
+        pm.Normal("a")
+        pm.Normal("beta")
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS)
+    warn_of_unused_priors(model)
+    assert not recwarn
+
+
+SETTINGS = dict(initial_mean=[0.0], initial_cov=[[1.0]], observation_noise=[[1.0]])
+
+
+def test_a_state_by_another_name_is_refused_with_the_names_that_are_reserved():
+    with pytest.raises(ModelError, match=r"transition .*IndexError.* no argument x, the state"):
+        psf.StateSpaceModel(lambda state, a: [a * state[0]], lambda x: [x[0]], **SETTINGS)
+    with pytest.raises(ModelError, match=r"observation must have the argument x, .*'state'"):
+        psf.StateSpaceModel(lambda x, a: [a * x[0]], lambda state: [state], **SETTINGS)
