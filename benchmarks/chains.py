@@ -23,7 +23,7 @@ from benchmarks.sampling import double_well_model
 from benchmarks.systems import DOUBLE_WELL_TRUTH
 from benchmarks.timing import Timed
 from pymc_statespace_filters.sampling.kernel.transition import evaluate
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
 ROUNDS = 5
@@ -63,9 +63,15 @@ def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
     """Return the time of a one-stage chain, warm-up or draws, apart from its evaluations."""
     model = four_normals()
     run = partial(
-        psf.sample_dram, chains=1, cores=1, stages=1, random_seed=1, progressbar=False, model=model
+        psf.sample_dram,
+        chains=1,
+        cores=1,
+        kernel=RandomWalkSettings(stages=1),
+        random_seed=1,
+        progressbar=False,
+        model=model,
     )
-    target = Target(model, None, DRAMSettings())
+    target = Target(model, None, RandomWalkSettings())
     target.prepare()
     bound = target.density.bind()
     long = {"tune": n, "draws": 1} if tune else {"tune": 1, "draws": n}

@@ -294,16 +294,16 @@ GRADIENTS = {
     "rate and total": ("EKF", "UKF"),
     "ring": ("EKF",),
 }
-CHAINS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "EKF": ("linear", "EKF", {}),
-    "EKF in one stage": ("oscillator", "EKF", {"stages": 1}),
-    "BootstrapPF": ("double well", "BootstrapPF systematic", {}),
-    "held noise": ("linear", "EnKF ensemble", {"refresh_noise": False}),
+CHAINS: dict[str, tuple[str, str, psf.RandomWalkSettings | None]] = {
+    "EKF": ("linear", "EKF", None),
+    "EKF in one stage": ("oscillator", "EKF", psf.RandomWalkSettings(stages=1)),
+    "BootstrapPF": ("double well", "BootstrapPF systematic", None),
+    "held noise": ("linear", "EnKF ensemble", psf.RandomWalkSettings(refresh_noise=False)),
     "correlated noise": (
-        "linear", "BootstrapPF sorted", {"stages": 1, "correlation": 0.9},
+        "linear", "BootstrapPF sorted", psf.RandomWalkSettings(stages=1, correlation=0.9),
     ),
-    "screened": ("double well", "GuidedPF", {"screen": psf.EKF()}),
-    "counts": ("epidemic", "BootstrapPF systematic", {}),
+    "screened": ("double well", "GuidedPF", psf.RandomWalkSettings(screen=psf.EKF())),
+    "counts": ("epidemic", "BootstrapPF systematic", None),
 }  # fmt: skip
 N_DRAWS = 12
 TIMED = ("time_per_draw", "perf_counter_diff", "process_time_diff", "perf_counter_start")
@@ -351,8 +351,8 @@ def of_gradients() -> Evaluations:
 
 
 def of_chains() -> Evaluations:
-    for what, (name, who, settings) in CHAINS.items():
-        yield f"chain | {what}", partial(_draws, name, who, **settings)
+    for what, (name, who, kernel) in CHAINS.items():
+        yield f"chain | {what}", partial(_draws, name, who, kernel=kernel)
     yield "chain | panel", partial(_draws, "linear", "BootstrapPF sorted", panel=True)
 
 

@@ -12,7 +12,7 @@ import pymc as pm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.sampling.run import model_task
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
 CHAINS, WALKERS = 4, 32
@@ -157,7 +157,7 @@ class Density:
     """The compiled log-density as a Python function that counts its calls; draws of the prior."""
 
     def __init__(self, model: pm.Model) -> None:
-        self._target = Target(model, None, DRAMSettings())
+        self._target = Target(model, None, RandomWalkSettings())
         self._target.prepare()
         self._bound, self.calls = self._target.density.bind(), 0
 

@@ -175,7 +175,12 @@ def all_parameters(case: Case) -> str:
     for screen in (None, case.fast):
         chains, of_chains = timed(
             lambda screen=screen: psf.sample_dram(
-                1000, 200, model=exact, pilot=draws, screen=screen, **settings
+                1000,
+                200,
+                model=exact,
+                pilot=draws,
+                kernel=psf.RandomWalkSettings(screen=screen),
+                **settings,
             )
         )
         ess = min(float(az.ess(chains["posterior"][name].values)) for name in names)

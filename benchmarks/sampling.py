@@ -136,7 +136,10 @@ def by_pymcmcstat() -> Chains:
 def sampling() -> list[Chains]:
     return [
         of_runs("psf.sample_dram()", psf.sample_dram),
-        of_runs("psf.sample_dram(stages=1)", partial(psf.sample_dram, stages=1)),
+        of_runs(
+            "psf.sample_dram(stages=1)",
+            partial(psf.sample_dram, kernel=psf.RandomWalkSettings(stages=1)),
+        ),
         by_pymc("pm.sample(step=psf.DRAM())", psf.DRAM),
         by_pymc("pm.sample(step=psf.DRAM(stages=1))", lambda: psf.DRAM(stages=1)),
         by_pymc("pm.sample(step=pm.DEMetropolisZ())", pm.DEMetropolisZ),

@@ -84,7 +84,8 @@ def main() -> None:
         print(row("none", model, plan, {}), flush=True)
         for name, screen in SCREENS.items():
             for power in plan.powers:
-                settings = {"screen": screen, "screen_power": power}
+                kernel = psf.RandomWalkSettings(screen=screen, screen_power=power)
+                settings = {"kernel": kernel}
                 print(row(f"{name}, power {power:g}", model, plan, settings), flush=True)
 
 

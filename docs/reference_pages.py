@@ -54,7 +54,10 @@ GROUPS = {
     ),
     "In a PyMC model": (
         "StateSpace",
+        "sample",
         "sample_dram",
+        "RandomWalkSettings",
+        "Ranks",
         "DRAM",
         "find_starts",
         "suggest_particles",

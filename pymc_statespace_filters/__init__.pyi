@@ -31,7 +31,16 @@ from .plots import (
 )
 from .point_estimation import maximum_likelihood
 from .pymc_model.distribution import StateSpace
-from .sampling import DRAM, find_starts, run_models, sample_dram, suggest_particles
+from .sampling import (
+    DRAM,
+    RandomWalkSettings,
+    Ranks,
+    find_starts,
+    run_models,
+    sample,
+    sample_dram,
+    suggest_particles,
+)
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.integrators import (
     EulerMaruyama,
@@ -61,6 +70,8 @@ __all__ = [
     "LocalLinearization",
     "Milstein",
     "PFEnKF",
+    "RandomWalkSettings",
+    "Ranks",
     "RungeKutta4",
     "SemiImplicitEuler",
     "StateSpace",
@@ -97,6 +108,7 @@ __all__ = [
     "reweight",
     "run_filter",
     "run_models",
+    "sample",
     "sample_dram",
     "simulate",
     "smoothed_states",

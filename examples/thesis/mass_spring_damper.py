@@ -69,10 +69,9 @@ def chains(
     settings = {key: length * run.sampling(name)[key] for key in ("draws", "tune")}
     # The noise of a filter is held fixed: another seed changes the log-likelihood by some 0.2, and
     # a new seed for each evaluation would nearly double the time of an EnKF.
-    settings |= {"refresh_noise": False, "pilot": pilot, "screen": screen}
-    if pilot is not None:
-        settings["stages"] = 1
-    return run.sample(f"{case.slug}_{name}", model, **settings)
+    stages = (2, 1) if pilot is None else 1
+    kernel = psf.RandomWalkSettings(stages=stages, refresh_noise=False, screen=screen)
+    return run.sample(f"{case.slug}_{name}", model, pilot=pilot, kernel=kernel, **settings)
 
 
 def summary(found: dict[str, dict[str, xr.DataTree]]) -> pd.DataFrame:

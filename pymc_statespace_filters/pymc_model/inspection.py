@@ -152,6 +152,16 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
     return [node.outputs[1] for node in likelihood_nodes(graphs)]
 
 
+def gradient_obstacle(model: pm.Model) -> str:
+    """Why gradients of a likelihood do not help a sampler; empty if they do."""
+    for name, node in state_space_nodes(model).items():
+        if not node.op.filter.has_gradient:
+            return f"the likelihood of {name!r} has no gradient"
+        if not compile_system(node.op.system).is_smooth:
+            return f"the equations of {name!r} have kinks or jumps"
+    return ""
+
+
 def exactness(model: pm.Model) -> bool:
     """Whether sampling targets the model's posterior exactly, without the bias of a filter."""
     ops = [node.op for node in state_space_nodes(model).values()]

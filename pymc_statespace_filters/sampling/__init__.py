@@ -1,8 +1,20 @@
 """Samplers of a model's log-density and noise seeds, independent of its filters."""
 
 from .particle_number.suggest import suggest_particles
-from .sample import run_models, sample_dram
+from .run.ranks import Ranks
+from .sample import sample
+from .sample_dram import run_models, sample_dram
 from .starts.find_starts import find_starts
 from .step import DRAM
+from .target.settings import RandomWalkSettings
 
-__all__ = ["DRAM", "find_starts", "run_models", "sample_dram", "suggest_particles"]
+__all__ = [
+    "DRAM",
+    "RandomWalkSettings",
+    "Ranks",
+    "find_starts",
+    "run_models",
+    "sample",
+    "sample_dram",
+    "suggest_particles",
+]

@@ -1,9 +1,9 @@
-"""`sample_dram` and `run_models`: whole chains in machine code, results as from ``pm.sample``."""
+"""`sample`: one call that chooses the sampler."""
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from pymc.model import Model
@@ -11,172 +11,102 @@ from xarray import DataTree
 
 from ..errors import ModelError
 from ..pymc_model.inspection import given_model
-from ..system.checks import check_flag
-from .checkpoint.checkpoint import folder_name
+from .checkpoint.checkpoint import checked_folder
+from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
+from .run.continuation import appended, former_chains
 from .run.driver import sample_models
-from .run.request import ExecutionOptions, sampling_request
-from .run.warm_start import warm_started, warm_started_models
+from .run.ranks import Ranks
+from .run.request import ExecutionOptions, SamplingRequest, sampling_request
+from .target.settings import RandomWalkSettings
+
+_SAMPLERS = ("auto", NUTS, DRAM)
+_NAMES = {DRAM: "DRAM", NUTS: "NUTS"}
+# Seconds within which chains go on to reach ``until_ess``.
+TIME_LIMIT = 300.0
+# Iterations of each chain at most, in draws, unless ``max_draws`` says so.
+_MOST_THIN = {DRAM: 1024, NUTS: 64}
+
+_log = logging.getLogger("pymc.sampling.psf")
 
 
-@overload
-def sample_dram(
-    draws: int = ..., tune: int = ..., *, comm: None = ..., **settings: Any
-) -> DataTree: ...
-
-
-@overload
-def sample_dram(
-    draws: int = ..., tune: int = ..., *, comm: Any, **settings: Any
-) -> DataTree | None: ...
-
-
-def sample_dram(
+def sample(
     draws: int = 1000,
     tune: int = 1000,
     *,
-    until_ess: float | None = None,
+    model: Model | None = None,
+    until_ess: float | None = 400.0,
     max_draws: int | None = None,
     chains: int = 4,
     cores: int | None = None,
-    model: Model | None = None,
-    random_seed: int | np.random.Generator | None = None,
+    sampler: str = "auto",
+    kernel: RandomWalkSettings | None = None,
+    continue_from: DataTree | None = None,
     initvals: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
-    pilot: DataTree | None = None,
+    random_seed: int | np.random.Generator | None = None,
     progressbar: bool | str = True,
-    discard_tuned_samples: bool = True,
-    compute_convergence_checks: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
-    ranks_per_chain: int = 1,
-    gather: str = "root",
-    **dram_settings: Any,
 ) -> DataTree | None:
-    """Sample a model by adaptive Metropolis-Hastings, with whole chains in machine code.
+    """Draw from the posterior of a model, by the sampler that suits it.
 
-    Chains start in the posterior, which a population finds first, see `find_starts`. Some proposals
-    are the random walk of `DRAM` with delayed rejection, the others are drawn from a mixture of
-    Student-t distributions. It is fitted to the draws of all chains after each quarter of the
-    warm-up, and its share of the proposals follows the jumps that it has made. Both are then
-    frozen, so that the draws are exact, with an estimated likelihood too. There is no Python
-    between the draws: one costs as much as its likelihood. Chains run in threads, and with MPI on
-    several machines.
+    That is NUTS (of nutpie) where every likelihood has a gradient and the posterior has so many
+    parameters that gradients pay, and else the random walk of `sample_dram`. A line of the log
+    says which, and why. Both start in the posterior, found as by `find_starts`.
 
-    If a model has a panel of several records (``StateSpace(panel=)``) and parameters that belong to
-    single ones, the records are moved one by one: each makes a random walk in its own parameters,
-    accepted by its own estimate of its likelihood, which it then keeps. Parameters of the
-    population make random walks without a likelihood, shared ones are accepted by the likelihoods
-    of all records. This too is exact. There is no delayed rejection and no mixture, each record
-    starts at the likeliest of fifty draws of its prior, and ``sample_stats`` has the acceptance
-    (``record_accepted``) and the noise seed of each record.
+    A draw is the last of k iterations. First k is 1; it is doubled, and every second draw dropped,
+    until the draws are worth ``until_ess``. The result has the size of ``draws``, however slowly
+    the chains mix, and the report says how many iterations stand behind a draw.
 
     Parameters
     ----------
     draws, tune : int
-        Iterations of each chain that are kept, and of the warm-up before them, during which the
-        proposals are adapted.
-    until_ess : float, optional
-        Go on until the bulk effective sample size of every parameter, over all chains, is at least
-        this and no R-hat is above 1.01, which takes four chains some 400 to 1000 effective draws.
-        Both are checked after ``draws`` iterations, and then whenever there are half as many again.
-        All chains end with the same number of draws, which depends on the draws alone. Default:
-        stop after ``draws``.
-    max_draws : int, optional
-        With ``until_ess``, the most draws of each chain, after which a warning says what was
-        reached. Default: 20 times ``draws``.
-    chains : int
-        Independent chains, whose agreement R-hat measures.
-    cores : int, optional
-        Threads on each rank. Default: the number of available processors, at most the number of
-        chains. The draws do not depend on it.
+        Draws of each chain that are kept, and iterations of its warm-up, which are not.
     model : pymc.Model, optional
-        Default: the model of the ``with`` block. All its free variables must be continuous.
-    random_seed : int or numpy.random.Generator, optional
-        The draws follow from it and the number of chains alone. Default: other draws at every call.
+        Default: the model of the ``with`` block. Its free variables must be continuous.
+    until_ess : float, optional
+        Effective draws of every parameter over all chains, of the bulk and of the tails, with R-hat
+        of at most 1.01. None keeps the first ``draws`` iterations.
+    max_draws : int, optional
+        Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
+        times with NUTS. The run also ends where the next doubling would take it beyond five
+        minutes; a warning says what would do. Apart from this limit, the result depends on
+        ``random_seed`` and the number of chains alone.
+    chains, cores : int
+        Number of chains, and of those that run at a time. Default: as many as there are processors.
+    sampler : {"auto", "nuts", "dram"}
+        The sampler, if it is not to be chosen.
+    kernel : RandomWalkSettings, optional
+        Settings of the random walk; with them it is the sampler.
+    continue_from : xarray.DataTree, optional
+        Draws of an earlier call, or of `sample_dram`, whose chains go on: ``draws`` are appended,
+        bit for bit those of one longer run, without a warm-up. Model, data, ``chains`` and
+        ``kernel`` must be the same, and as many iterations stand behind a draw; ``tune`` and
+        ``until_ess`` are not used. Draws of NUTS cannot go on.
     initvals : dict, or sequence of dict, optional
-        Initial values, for all chains or for each, as in ``pm.sample``. Default: with
-        ``tune > 0``, points of a population that is led from the prior to the posterior; the best
-        of a few draws from the prior if a prior is improper, or with ``correlation``. With a
-        particle, ensemble or grid filter the population is smaller if ``chains * tune`` is below
-        4000, and there is none below 800.
-    pilot : xarray.DataTree, optional
-        Draws from a posterior close to the model's, such as that of the same parameters with a
-        cheaper filter. Chains start at the last draws of its chains. Their proposal covariance is
-        the one that its chains used last, if they were sampled and adapted by DRAM, else that of
-        its draws; it is adapted only if ``adapt_every`` or ``adaptation`` is given. Independence
-        proposals come from a mixture fitted to some 500 of its draws, from the first iteration. A
-        mode that the pilot has missed is missed again. If the pilot lacks some variables of the
-        model, as that of a smaller model does, the search for starts begins at its draws, completed
-        by draws of the prior, and ``tune`` must be positive. Other variables of the pilot are
-        ignored. With ``checkpoint`` the pilot must be the same in each call; with ``comm`` all
-        ranks pass it (``gather="all"``).
+        Initial values of all chains or, with the random walk, of each.
+    random_seed : int or numpy.random.Generator, optional
     progressbar : bool or str
-        As in ``pm.sample``. Beside what that shows, the largest R-hat and the smallest bulk
-        effective sample size so far, computed every two seconds, or as often as takes 1 % of the
-        time; with ``comm``, of the chains that run on rank 0 and those that have ended. Unless it
-        is False, a report on the run is logged at its end at level INFO, by the logger
-        "pymc.stats.convergence"; otherwise at level DEBUG.
-    discard_tuned_samples : bool
-        Whether to leave out the warm-up; otherwise it is in the groups ``warmup_posterior`` and
-        ``warmup_sample_stats``.
-    compute_convergence_checks : bool
-        As in ``pm.sample``: whether R-hat and effective sample sizes are checked at the end, which
-        takes long for many draws. With it, filters that are not exact for their systems are
-        compared with unbiased ones, as by `check_filter`, in two seconds or a tenth of the time of
-        the run; not after fewer than 600 iterations. Warnings about single chains are given in any
-        case.
-    checkpoint : str or path, optional
-        A folder in which the chains are stored every few seconds. If the process ends for any
-        reason, the same call resumes the run and returns bitwise the same draws as an uninterrupted
-        one. With ``comm``, the folder must be visible to all ranks.
-    comm : mpi4py.MPI.Comm or "world", optional
-        Ranks over which the chains are distributed; all of them make this call. "world" is all
-        ranks started by ``mpiexec``, or this process alone without ``mpiexec``. The draws do not
-        depend on the number of ranks.
-    ranks_per_chain : int
-        Number of ranks that evaluate the likelihoods of a chain together, each on its part of the
-        particles; for likelihoods that take seconds.
-    gather : {"root", "all"}
-        Ranks that get the result.
-    **dram_settings
-        Settings of `DRAM`: ``stages``, ``stage_scale``, ``adaptation``, ``adapt_every``,
-        ``proposal_cov``, ``refresh_noise``, ``screen``, ``screen_power``, ``correlation``. Where
-        records are moved one by one, ``stages`` must be 1 or the default, ``screen`` and
-        ``correlation`` None, ``ranks_per_chain`` 1, and of ``proposal_cov`` each block takes its
-        own part.
+        As in ``pm.sample``. If it is False, nothing but warnings is logged.
+    checkpoint, comm
+        As in `sample_dram`, which then is the sampler.
 
     Returns
     -------
     xarray.DataTree
-        As returned by ``pm.sample``; None on ranks that do not get it. After Ctrl-C, the draws made
-        until then: of the chains that together have most, cut to one length; a warning names those
-        left out. The attributes ``exact`` (1 if the chains target the posterior itself, 0 if one
-        with the bias of a filter), ``refresh_noise`` (0 or 1) and ``correlation`` describe the
-        target, and ``filter``, a JSON text, names the filter of every StateSpace variable:
-        ``'{"d": "BootstrapPF(200)"}'``.
-        ``log_likelihood_variance``, for runs of at least 600 iterations with a noisy likelihood, is
-        the variance of the estimated log-likelihood over 12 noise seeds at the draw of highest
-        density; of the record whose variance is largest, if records are moved one by one.
-        ``filter_check``, a JSON text, has the outcome of that check for every StateSpace variable.
+        As returned by ``pm.sample``, with the attributes of `sample_dram`, and ``sampler``,
+        ``sampler_reason`` and ``iterations_per_draw``. None on ranks that do not get it.
 
     Raises
     ------
     ModelError
-        If an argument is not as described, a free variable is discrete, the log-density draws
-        random numbers, or no starting point with finite log-density is found.
-    DataMismatchError
-        If the checkpoint belongs to a run with other arguments, another model or other data, if
-        ranks differ in these, or if the pilot has no parameter of the model, or one of another
-        shape or outside its support.
-    ParallelError
-        If another rank has failed; the message names the rank, the chain and the error.
-    CheckpointError
-        If a file of the checkpoint cannot be written or read.
+        If an argument is not as described, or asks for what the sampler cannot do.
+    DataMismatchError, ParallelError, CheckpointError
+        As `sample_dram`.
 
     Warns
     -----
     FilterWarning
-        If a filter is found to be off, with another one that works. The report says where it is
-        not, and where that could not be decided.
+        As `sample_dram`.
 
     Examples
     --------
@@ -186,152 +116,95 @@ def sample_dram(
     ...     mu = pm.Normal("mu", 0, 10)
     ...     sigma = pm.HalfNormal("sigma", 2)
     ...     y = pm.Normal("y", mu, sigma, observed=[1.2, 0.7, 2.9, 1.8])
-    ...     idata = psf.sample_dram(500, tune=500, chains=2, random_seed=1, progressbar=False)
-    >>> idata["posterior"]["mu"].shape
-    (2, 500)
+    ...     idata = psf.sample(500, random_seed=1, progressbar=False)
+    >>> idata["posterior"]["mu"].shape, idata.attrs["sampler"]
+    ((4, 500), 'dram')
     """
     model = given_model(model)
+    choice = _choice(
+        model,
+        sampler,
+        {
+            "kernel": kernel,
+            "continue_from": continue_from,
+            "checkpoint": checkpoint,
+            "comm": comm,
+        },
+        chains=chains,
+        tune=tune,
+    )
+    request = _request(
+        choice.sampler, draws, tune, chains, random_seed, initvals, until_ess, max_draws, kernel
+    )
+    if continue_from is not None:
+        request = _continued(request, continue_from, model)
+    level = logging.INFO if progressbar else logging.DEBUG
+    _log.log(level, "%s: %s", _NAMES[choice.sampler], choice.reason)
+    tree: DataTree | None
+    if choice.sampler == NUTS:
+        from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
+
+        tree = sample_nuts(model, request, cores=cores, progressbar=progressbar)
+    else:
+        options = ExecutionOptions(cores, progressbar, True, Ranks.of(comm))
+        folders = [] if checkpoint is None else [checked_folder(checkpoint)]
+        trees = sample_models({"": model}, [request], options, folders)
+        tree = None if trees is None else trees[""]
+        if continue_from is not None and tree is not None:
+            tree = appended(continue_from, tree)
+    if tree is not None:
+        tree.attrs |= {"sampler": choice.sampler, "sampler_reason": choice.reason}
+    return tree
+
+
+def _choice(
+    model: Model, sampler: Any, only_dram: Mapping[str, Any], *, chains: int, tune: int
+) -> Choice:
+    """The sampler that the user has named, or that the model and the arguments ask for."""
+    if sampler not in _SAMPLERS:
+        raise ModelError(f"sampler must be one of {_SAMPLERS}, got {sampler!r}")
+    asked = [name for name, value in only_dram.items() if value is not None]
+    if sampler == NUTS:
+        if asked:
+            raise ModelError(f"{asked[0]} must be None with sampler='nuts': sampler='dram' has it")
+        if reason := why_no_nuts(model):
+            raise ModelError(f"sampler must be 'dram' for this model, got 'nuts': {reason}")
+    if sampler != "auto":
+        return Choice(sampler, f"sampler={sampler!r}")
+    if asked:
+        return Choice(DRAM, f"NUTS has no {asked[0]}")
+    return choose_sampler(model, chains, tune)
+
+
+def _request(
+    sampler: str,
+    draws: int,
+    tune: int,
+    chains: int,
+    random_seed: Any,
+    initvals: Any,
+    until_ess: float | None,
+    max_draws: int | None,
+    kernel: RandomWalkSettings | None,
+) -> SamplingRequest:
     request = sampling_request(
-        draws,
-        tune,
-        chains,
-        random_seed,
-        initvals,
-        not check_flag("discard_tuned_samples", discard_tuned_samples),
-        until_ess,
-        max_draws,
-        dram_settings,
+        draws, tune, chains, random_seed, initvals, False, until_ess, max_draws, kernel
     )
-    if pilot is not None:
-        adapts = not dram_settings.keys().isdisjoint({"adapt_every", "adaptation"})
-        request = warm_started(request, model, pilot, adapts=adapts)
-    options = ExecutionOptions(
-        cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
+    if until_ess is None:
+        return request
+    most = max_draws or _MOST_THIN[sampler] * draws
+    return request._replace(max_draws=most, doubles_thin=True, seconds=TIME_LIMIT)
+
+
+def _continued(request: SamplingRequest, idata: DataTree, model: Model) -> SamplingRequest:
+    """The request of more draws of the chains of ``idata``."""
+    for name, value in {
+        "initvals": request.initvals,
+        "random_seed": request.entropy if request.is_seeded else None,
+    }.items():
+        if value is not None:
+            raise ModelError(f"{name} must be None with continue_from, whose chains have theirs")
+    former = former_chains(idata, model, request.settings, request.chains)
+    return request._replace(
+        tune=0, thin=former.thin, until_ess=None, max_draws=None, doubles_thin=False, former=former
     )
-    folders = [] if checkpoint is None else [_checked_folder(checkpoint)]
-    trees = sample_models({"": model}, [request], options, folders)
-    return None if trees is None else trees[""]
-
-
-@overload
-def run_models(
-    models: Mapping[str, Model], *, comm: None = ..., **settings: Any
-) -> dict[str, DataTree]: ...
-
-
-@overload
-def run_models(
-    models: Mapping[str, Model], *, comm: Any, **settings: Any
-) -> dict[str, DataTree] | None: ...
-
-
-def run_models(
-    models: Mapping[str, Model],
-    *,
-    draws: int = 1000,
-    tune: int = 1000,
-    until_ess: float | None = None,
-    max_draws: int | None = None,
-    chains: int = 4,
-    cores: int | None = None,
-    random_seed: int | np.random.Generator | None = None,
-    initvals: Mapping[str, Any] | None = None,
-    pilot: DataTree | Mapping[str, DataTree] | None = None,
-    progressbar: bool | str = True,
-    discard_tuned_samples: bool = True,
-    compute_convergence_checks: bool = True,
-    checkpoint: str | os.PathLike | None = None,
-    comm: Any = None,
-    ranks_per_chain: int = 1,
-    gather: str = "root",
-    **dram_settings: Any,
-) -> dict[str, DataTree] | None:
-    """Sample several models in one run, each as by `sample_dram`.
-
-    The chains of all models share the threads, and with MPI the ranks: an idle thread takes the
-    next chain, most expensive model first.
-
-    Parameters
-    ----------
-    models : mapping of str to pymc.Model
-    draws, tune, until_ess, max_draws, chains, cores, random_seed, initvals
-        As in `sample_dram`, for every model. A model's draws are those of `sample_dram` with the
-        same seed and do not depend on the other models; with ``until_ess`` each stops on its own.
-    pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
-        As in `sample_dram`, of the models with these names. A single one is the pilot of every
-        model that has a free variable in common with it.
-    progressbar, discard_tuned_samples, compute_convergence_checks
-        As in `sample_dram`.
-    checkpoint : str or path, optional
-        A folder with a subfolder for each model. If the process ends for any reason, the same call
-        resumes the run.
-    comm, ranks_per_chain, gather
-        As in `sample_dram`.
-    **dram_settings
-        Settings of `DRAM`.
-
-    Returns
-    -------
-    dict of str to xarray.DataTree
-        As returned by `sample_dram`; None on ranks that do not get them. After Ctrl-C, those of the
-        models that have draws; a warning names the others.
-
-    Raises
-    ------
-    ModelError, DataMismatchError, ParallelError, CheckpointError
-        As `sample_dram`.
-
-    Warns
-    -----
-    FilterWarning
-        As `sample_dram`.
-
-    Examples
-    --------
-    >>> import pymc as pm
-    >>> import pymc_statespace_filters as psf
-    >>> rivals = {}
-    >>> for name, sd in (("narrow", 1.0), ("wide", 5.0)):
-    ...     with pm.Model() as rivals[name]:
-    ...         mu = pm.Normal("mu", 0, sd)
-    ...         y = pm.Normal("y", mu, 1.0, observed=[1.2, 0.7, 2.9, 1.8])
-    >>> trees = psf.run_models(rivals, draws=200, tune=200, random_seed=1, progressbar=False)
-    >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
-    {'narrow': (4, 200), 'wide': (4, 200)}
-    """
-    if not isinstance(models, Mapping) or not models:
-        raise ModelError(
-            f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
-        )
-    for name, model in models.items():
-        if not isinstance(name, str) or not name:
-            raise ModelError(f"names of models must be non-empty strings, got {name!r}")
-        if not isinstance(model, Model):
-            raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
-    request = sampling_request(
-        draws,
-        tune,
-        chains,
-        random_seed,
-        initvals,
-        not check_flag("discard_tuned_samples", discard_tuned_samples),
-        until_ess,
-        max_draws,
-        dram_settings,
-    )
-    adapts = not dram_settings.keys().isdisjoint({"adapt_every", "adaptation"})
-    requests = warm_started_models(request, models, pilot, adapts=adapts)
-    options = ExecutionOptions(
-        cores, progressbar, compute_convergence_checks, comm, ranks_per_chain, gather
-    )
-    folders = []
-    if checkpoint is not None:
-        folder = _checked_folder(checkpoint)
-        folders = [Path(folder, folder_name(name)) for name in models]
-    return sample_models(models, requests, options, folders)
-
-
-def _checked_folder(checkpoint: Any) -> str | os.PathLike:
-    if not isinstance(checkpoint, str | os.PathLike) or not os.fspath(checkpoint):
-        raise ModelError(f"checkpoint must be the path of a folder, got {checkpoint!r}")
-    return checkpoint

@@ -21,7 +21,7 @@ from .kernel.state import ChainState, draw_key
 from .output import sample_stats
 from .output.warnings import PhaseStatistics, closing_warning
 from .run.chain import Chain
-from .target.settings import DRAMSettings
+from .target.settings import RandomWalkSettings
 from .target.target import Target
 
 
@@ -36,7 +36,7 @@ class DRAMState(StepMethodState):
     _statistics: PhaseStatistics
     _n_draws: int
     _disperse: bool
-    settings: DRAMSettings = field(metadata={"frozen": True})
+    settings: RandomWalkSettings = field(metadata={"frozen": True})
 
 
 class DRAM(BlockedStep):
@@ -194,7 +194,7 @@ class DRAM(BlockedStep):
         blocked: bool = True,
     ):
         model = modelcontext(model)
-        self.settings = DRAMSettings(
+        self.settings = RandomWalkSettings(
             stages,
             stage_scale,
             adaptation,

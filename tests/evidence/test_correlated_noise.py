@@ -28,7 +28,11 @@ def test_the_evidence_is_that_of_the_exact_likelihood():
     truth = np.log(np.mean(np.exp(terms - terms.max()))) + terms.max()
     with model_with(psf.BootstrapPF(40)) as noisy:
         idata = psf.sample_dram(
-            2000, chains=2, stages=1, correlation=0.9, random_seed=1, progressbar=False
+            2000,
+            chains=2,
+            kernel=psf.RandomWalkSettings(stages=1, correlation=0.9),
+            random_seed=1,
+            progressbar=False,
         )
         found = psf.chib_jeliazkov(idata, random_seed=1)
     assert "d_seed" not in idata["sample_stats"]

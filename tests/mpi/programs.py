@@ -15,6 +15,7 @@ from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.run import chain_task
+from tests.kernels import with_kernel
 from tests.sampling.test_sample_dram import state_space_model
 
 CHAINS = 3
@@ -51,7 +52,7 @@ def failing(chain: str) -> None:
         cores=2,
         model=model,
         initvals=[{"mu": 7.0 if i == int(chain) else 0.0} for i in range(CHAINS)],
-        proposal_cov=[[1e-9]],
+        kernel=psf.RandomWalkSettings(proposal_cov=[[1e-9]]),
         progressbar=False,
         comm="world",
     )
@@ -67,7 +68,7 @@ def resumed(**settings):
         model=state_space_model(psf.BootstrapPF(20)),
         random_seed=1,
         progressbar=False,
-        **settings,
+        **with_kernel(settings),
     )
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 import pymc_statespace_filters as psf
+from tests.kernels import with_kernel
 from tests.mpi.launch import on_ranks
 from tests.sampling.test_sample_dram import state_space_model
 
@@ -21,7 +22,7 @@ def draws_of_all(**settings):
         random_seed=4,
         discard_tuned_samples=False,
         progressbar=False,
-        **settings,
+        **with_kernel(settings),
     )
     return {
         (model, group, name): tree[group][name].values

@@ -31,7 +31,7 @@ def ends(comm):
         if comm.rank == 0:
             patch.setattr(ChainTask, "run", _fails_when_others_are_done)
         with pytest.raises((ArithmeticError, psf.errors.ParallelError)) as caught:
-            psf.sample_dram(**quick, progressbar=False, gather="all")
+            psf.sample_dram(**quick, progressbar=False, comm=psf.Ranks(None, gather="all"))
     heard.append(str(caught.value))
 
     made, told = ChainTask._advance, []
@@ -47,7 +47,12 @@ def ends(comm):
         patch.setattr(ChainTask, "_advance", advance_and_interrupt)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         tree = psf.sample_dram(
-            10**5, tune=0, **call, progressbar=False, proposal_cov=[[1.0]], gather="all"
+            10**5,
+            tune=0,
+            **call,
+            progressbar=False,
+            kernel=psf.RandomWalkSettings(proposal_cov=[[1.0]]),
+            comm=psf.Ranks(None, gather="all"),
         )
     heard.append(dict(tree["posterior"].sizes))
     return heard

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from tests.kernels import with_kernel
 from tests.mpi.launch import Job, mpiexec, on_ranks
 from tests.mpi.programs import resumed
 from tests.sampling.test_sample_dram import state_space_model
@@ -58,7 +59,7 @@ def disagreements(comm):
         {"random_seed": 2},
         {"checkpoint": "never-made"},
         {"gather": "all"},
-        {"ranks_per_chain": 2},
+        {"per_chain": 2},
         {"initvals": {"phi": 0.1}},
         {"models": {"another": model}},
         {"models": {"M": model, "M2": model}},
@@ -70,7 +71,9 @@ def disagreements(comm):
     heard = []
     for changes in variants:
         with pytest.raises(psf.errors.DataMismatchError) as caught:
-            psf.run_models(**{"models": {"M": model}} | call | (changes if comm.rank == 1 else {}))
+            psf.run_models(
+                **with_kernel({"models": {"M": model}} | call | (changes if comm.rank == 1 else {}))
+            )
         heard.append(str(caught.value))
     return heard
 
@@ -80,7 +83,7 @@ def test_ranks_that_make_different_calls_are_told():
     assert zero == one
     said = [re.search("rank 1 of 2 and rank 0 differ in (.*);", text).group(1) for text in zero]
     assert said[:6] == [
-        "draws", "random_seed", "checkpoint", "gather", "ranks_per_chain", "initvals"
+        "draws", "random_seed", "checkpoint", "gather", "per_chain", "initvals"
     ]  # fmt: skip
     assert said[6:8] == ["models", "models"]
     assert said[8].startswith("model")

@@ -6,7 +6,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.parallel.communicator import Communicator
 from pymc_statespace_filters.sampling.target import leader_follower as lockstep
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.mpi.launch import mpiexec, on_ranks
 from tests.sampling.test_one_chain_on_ranks import led, run_chain, two_records
@@ -15,7 +15,7 @@ MODEL = two_records(psf.EnKF(256), psf.BootstrapPF(300))
 
 
 def chain(group=None):
-    draws, state, spread = run_chain(Target(MODEL, None, DRAMSettings(), group=group))
+    draws, state, spread = run_chain(Target(MODEL, None, RandomWalkSettings(), group=group))
     return *draws, *state, np.array(spread)
 
 

@@ -17,8 +17,7 @@ def draws(comm=None):
         random_seed=4,
         progressbar=False,
         compute_convergence_checks=False,
-        comm=comm,
-        gather="all",
+        comm=psf.Ranks(comm, gather="all"),
     )
     return {
         (group, name): tree[group][name].values

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from tests.kernels import with_kernel
 from tests.mpi.launch import on_ranks
 from tests.sampling.test_sample_dram import state_space_model
 
@@ -28,7 +29,7 @@ def draws_of_all(**settings):
     """Everything that was drawn, by model, group and name."""
     return {
         (model, group, name): values.to_numpy()
-        for model, tree in psf.run_models(models(), **SETTINGS | settings).items()
+        for model, tree in psf.run_models(models(), **with_kernel(SETTINGS | settings)).items()
         for group in ("posterior", "warmup_posterior", "sample_stats")
         for name, values in tree[group].data_vars.items()
     }
@@ -36,24 +37,22 @@ def draws_of_all(**settings):
 
 def shared(comm):
     """By one group of four ranks, and by two of two."""
-    return [draws_of_all(comm=comm, ranks_per_chain=n, gather="all") for n in (4, 2)], refusals(
-        comm
-    )
+    return [draws_of_all(comm=comm, per_chain=n, gather="all") for n in (4, 2)], refusals(comm)
 
 
 def refusals(comm):
     """What is said of chains that ranks cannot share."""
-    settings = SETTINGS | {"comm": comm, "ranks_per_chain": 4}
+    settings = SETTINGS | {"comm": comm, "per_chain": 4}
     asked = [
         (psf.EKF(), {}),
         (psf.EnKF(130), {}),
-        (psf.EnKF(300), {"ranks_per_chain": 3}),
+        (psf.EnKF(300), {"per_chain": 3}),
         (psf.EnKF(300), {"correlation": 0.9, "stages": 1}),
     ]
     said = []
     for filter, changes in asked:
         with pytest.raises((psf.errors.ModelError, psf.errors.ParallelError)) as caught:
-            psf.sample_dram(model=state_space_model(filter), **settings | changes)
+            psf.sample_dram(model=state_space_model(filter), **with_kernel(settings | changes))
         said.append(str(caught.value))
     return said
 
@@ -68,5 +67,5 @@ def test_draws_do_not_depend_on_who_evaluates():
         nothing, blocks, groups, moved = said
         assert "a model without a StateSpace variable whose filter has particles" in nothing
         assert "64" in blocks
-        assert "ranks_per_chain=3 with 4 ranks" in groups
+        assert "per_chain=3 with 4 ranks" in groups
         assert "correlation=0.9" in moved

@@ -30,7 +30,7 @@ from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import sampling_request
 from pymc_statespace_filters.sampling.target.log_density import screening_density
 from pymc_statespace_filters.sampling.target.record_target import target_of
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.sampling.rank_uniformity import chi_square_p, ecdf_p
 from tests.systems import autoregression
@@ -181,7 +181,7 @@ class Replications:
         with pm.Model() as self.model:
             problem.prior()
             psf.StateSpace("d", LINEAR, setting.filter, observed=self.record, **problem.rows)
-        settings = DRAMSettings.from_arguments(setting.dram)
+        settings = RandomWalkSettings(**setting.dram)
         if setting.graph:
             self._target = Target(self.model, None, settings, graph=setting.graph(self.model))
         else:
@@ -204,7 +204,7 @@ class Replications:
         with self._lock:
             self.record.set_value(self.truth_and_record(index)[1])
             task.prepare()
-            task.population = task.find_population(progressbar=False)
+            task.set_population(task.find_population(progressbar=False))
             chain = task.chain_task(0)
         if self._setting.run:
             chain.__class__ = self._setting.run

@@ -17,7 +17,7 @@ from pymc_statespace_filters.sampling.kernel.adaptation_state import (
 )
 from pymc_statespace_filters.sampling.kernel.independence import no_mixture
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
 
@@ -58,7 +58,7 @@ def warm_up(adapt, cov, start, first_cov, n, *, seed, stages=2):
         precision = pm.Data("precision", np.linalg.inv(cov))
         pm.Potential("log_density", -0.5 * (x[:, None] * precision * x).sum())
     scheme = "chain" if adapt is adapt_by_blocks else "continuous"
-    settings = DRAMSettings(stages=stages, adaptation=scheme)
+    settings = RandomWalkSettings(stages=stages, adaptation=scheme)
     target = Target(model, None, settings, first_cov)
     target.prepare()
     task = ChainTask(

@@ -14,6 +14,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
 from pymc_statespace_filters.sampling.run import chain_task
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from tests.kernels import with_kernel
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
 from tests.waiting import wait_until
 
@@ -29,7 +30,7 @@ def sample_kind(kind, **changes):
     """A run long enough to be killed in its midst."""
     filter, settings = KINDS[kind]
     arguments = {"draws": 6000, "tune": 3000, "discard_tuned_samples": False} | settings
-    return sample_dram(state_space_model(filter), **arguments | changes)
+    return sample_dram(state_space_model(filter), **with_kernel(arguments | changes))
 
 
 # With an argument it says when a chain begins and has made so many iterations, and waits there to
@@ -95,7 +96,7 @@ def small():
 def finished(small, tmp_path_factory):
     """The folder of a run and its draws, which no test may change."""
     folder = tmp_path_factory.mktemp("finished")
-    return folder, sample_dram(small, checkpoint=folder, **SMALL)
+    return folder, sample_dram(small, checkpoint=folder, **with_kernel(SMALL))
 
 
 @pytest.fixture
@@ -104,27 +105,27 @@ def often(monkeypatch):
 
 
 def test_a_checkpoint_changes_no_draw(small, finished):
-    assert_identical(sample_dram(small, **SMALL), finished[1])
+    assert_identical(sample_dram(small, **with_kernel(SMALL)), finished[1])
 
 
 def test_a_segment_torn_anywhere(small, finished, tmp_path, often):
     folder, (_, expected) = tmp_path / "run", finished
-    assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
+    assert_identical(sample_dram(small, checkpoint=folder, **with_kernel(SMALL)), expected)
     for share in (0.0, 0.3, 1.0):
         path = sorted(folder.glob("chains.*/chain-1.*.segment"))[int(-share)]
         content = path.read_bytes()
         path.write_bytes(content[: int(share * (len(content) - 1))])
         with pytest.warns(CheckpointWarning, match="chain-1.*: record"):
-            found = sample_dram(small, checkpoint=folder, **SMALL)
+            found = sample_dram(small, checkpoint=folder, **with_kernel(SMALL))
         assert_identical(found, expected)
         # It is mended: not a byte differs in what is stored of the draws.
-        assert_identical(sample_dram(small, checkpoint=folder, **SMALL), expected)
+        assert_identical(sample_dram(small, checkpoint=folder, **with_kernel(SMALL)), expected)
 
 
 def test_a_finished_run_returns_at_once(small, finished, monkeypatch):
     folder, first = finished
     monkeypatch.setattr(chain_task.ChainTask, "_advance", None)
-    assert_identical(sample_dram(small, checkpoint=folder, cores=1, **SMALL), first)
+    assert_identical(sample_dram(small, checkpoint=folder, cores=1, **with_kernel(SMALL)), first)
 
 
 @pytest.mark.parametrize("random_seed", [None, "generator"])
@@ -142,13 +143,15 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
     with monkeypatch.context() as patch:
         patch.setattr(chain_task.ChainTask, "_advance", die)
         with pytest.raises(MemoryError):
-            sample_dram(small, checkpoint=tmp_path, random_seed=seed(), cores=1, **SMALL)
+            sample_dram(
+                small, checkpoint=tmp_path, random_seed=seed(), cores=1, **with_kernel(SMALL)
+            )
     assert sum(path.stat().st_size for path in tmp_path.glob("chains.*/chain-0.*")) > 10_000
-    tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
-    again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **SMALL)
+    tree = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **with_kernel(SMALL))
+    again = sample_dram(small, checkpoint=tmp_path, random_seed=seed(), **with_kernel(SMALL))
     assert_identical(again, tree)
     if random_seed:
-        assert_identical(sample_dram(small, random_seed=seed(), **SMALL), tree)
+        assert_identical(sample_dram(small, random_seed=seed(), **with_kernel(SMALL)), tree)
 
 
 @pytest.mark.parametrize(
@@ -167,14 +170,14 @@ def test_resumed_with_any_seed(small, tmp_path, often, monkeypatch, random_seed)
 )
 def test_a_checkpoint_of_another_run(small, finished, changes, message):
     with pytest.raises(DataMismatchError, match=message):
-        sample_dram(**{"model": small, **SMALL} | changes, checkpoint=finished[0])
+        sample_dram(**with_kernel({"model": small, **SMALL} | changes), checkpoint=finished[0])
 
 
 def test_numbers_of_numpy_are_numbers(small, tmp_path):
     plain = SMALL | {"adapt_every": 50, "stage_scale": 0.5}
-    first = sample_dram(small, checkpoint=tmp_path, **plain)
+    first = sample_dram(small, checkpoint=tmp_path, **with_kernel(plain))
     of_numpy = {name: np.array(value)[()] for name, value in plain.items()}
-    assert_identical(sample_dram(small, checkpoint=tmp_path, **of_numpy), first)
+    assert_identical(sample_dram(small, checkpoint=tmp_path, **with_kernel(of_numpy)), first)
 
 
 def test_a_checkpoint_of_other_data(tmp_path):
@@ -197,10 +200,11 @@ def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ChainPool, "finished", interrupted)
-    part = sample_dram(small, **asked)
+    part = sample_dram(small, **with_kernel(asked))
     monkeypatch.setattr(ChainPool, "finished", finished)
     assert_identical(
-        sample_dram(small, **asked), sample_dram(small, **asked | {"checkpoint": None})
+        sample_dram(small, **with_kernel(asked)),
+        sample_dram(small, **with_kernel(asked | {"checkpoint": None})),
     )
     assert next(looks) == 1
     assert "warmup_posterior" in part.children

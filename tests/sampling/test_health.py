@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 
 import numpy as np
 import pymc as pm
@@ -14,6 +15,7 @@ from pymc_statespace_filters.sampling.output import likelihood_variance
 from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of, start_warning
 from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
 from pymc_statespace_filters.sampling.target.target import Growth
+from tests.kernels import with_kernel
 from tests.sampling.test_dram import nan_beyond, sample, simple_model
 from tests.sampling.test_sample_dram import sample_dram, state_space_model
 from tests.systems import autoregression
@@ -43,8 +45,9 @@ def both_ways(model, caplog, **settings):
     """Messages of chain 1 by ``sample_dram``, and of any chain by the step method."""
     run = {name: settings.pop(name) for name in ("draws", "tune") if name in settings}
     with caplog.at_level(logging.WARNING, logger=LOGGER):
-        sample_dram(model, **run, **settings)
-        whole = [m.removeprefix("Chain 1: ") for m in caplog.messages if m.startswith("Chain 1: ")]
+        sample_dram(model, **with_kernel(run), **with_kernel(settings))
+        named = [re.match(r"Chains? (?:\d and )?1: (.*)", m) for m in caplog.messages]
+        whole = [match[1] for match in named if match]
         caplog.clear()
         with model:
             sample(DRAM(**settings), **run)
@@ -92,6 +95,7 @@ def draws_with(stages):
     n = len(stages)
     counts = np.zeros((n, state.N_COUNTS), dtype=np.int64)
     counts[:, state.STAGE] = stages
+    counts[:, state.N_ACCEPTED] = counts[:, state.STAGE] > 0
     counts[:, state.N_EVALUATIONS] = 1
     numbers = np.full((n, state.N_NUMBERS), np.inf)
     none = np.empty((n, 0))
@@ -123,7 +127,7 @@ def test_a_stay_of_a_fifth_of_the_draws_is_said():
     assert closing_warning(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
     phase = PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck))
     warning, of_noise = closing_warning(phase), closing_warning(phase, remedy="Use more.")
-    assert "stayed at one point for 206 of 1007 draws" in warning.message
+    assert "stayed at one point for 206 of 1007 iterations" in warning.message
     assert "more particles" not in warning.message
     assert "more particles" in of_noise.message
     # Of few draws a fifth is soon passed by chance.
@@ -180,7 +184,7 @@ def test_the_spread_at_the_highest_draw(caplog):
     ],
 )
 def test_the_spread_is_measured_where_it_says_something(filter, settings):
-    tree = sample_dram(state_space_model(filter), **settings)
+    tree = sample_dram(state_space_model(filter), **with_kernel(settings))
     assert "log_likelihood_variance" not in tree.attrs
 
 
@@ -203,7 +207,9 @@ def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch)
     monkeypatch.setattr(likelihood_variance, "HOPELESS", 1e-3)
     model = state_space_model(psf.BootstrapPF(3))
     with caplog.at_level(logging.WARNING, logger=LOGGER):
-        tree = sample_dram(model, draws=700, tune=0, proposal_cov=[[1e12]])
+        tree = sample_dram(
+            model, draws=700, tune=0, kernel=psf.RandomWalkSettings(proposal_cov=[[1e12]])
+        )
     stood = (tree["sample_stats"]["stage"][:, :100] == 0).all("draw").to_numpy()
     assert stood.any()
     for chain_, has_stood in enumerate(stood):

@@ -41,7 +41,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
     random_block,
 )
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from pymc_statespace_filters.student_mixture import DEGREES_OF_FREEDOM, StudentMixture
 
@@ -119,7 +119,7 @@ def chain_on_two_modes(share, *, stages=1, n=40_000):
         narrow, wide = -0.5 * ((x + 2.0) / 0.4) ** 2, -0.5 * (x - 2.0) ** 2
         terms = [np.log(0.8 / 0.4) + narrow, np.log(0.2) + wide]
         pm.Potential("two", pm.math.logaddexp(*terms))
-    target = Target(model, None, DRAMSettings(stages=stages), [[0.5]])
+    target = Target(model, None, RandomWalkSettings(stages=stages), [[0.5]])
     target.prepare()
     mixture = StudentMixture(
         np.array([0.15, 0.85]), np.array([[-1.0], [3.0]]), np.array([[[1.0]], [[2.0]]])

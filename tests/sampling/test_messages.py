@@ -6,6 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
 from tests.systems import autoregression
 
@@ -31,7 +32,13 @@ def inside(make_model, call):
 
 def run_chains(**arguments):
     settings = {"draws": 200, "tune": 200, "chains": 2, "cores": 2, "random_seed": 1}
-    return psf.sample_dram(**{"model": simple_model(), "progressbar": False} | settings | arguments)
+    return psf.sample_dram(
+        **with_kernel({"model": simple_model(), "progressbar": False} | settings | arguments)
+    )
+
+
+def run_in_model(**arguments):
+    return psf.sample_dram(**with_kernel(arguments))
 
 
 def suggest(**arguments):
@@ -39,11 +46,13 @@ def suggest(**arguments):
 
 
 def run_models(**arguments):
-    return psf.run_models(**{"models": {"a": simple_model()}, "progressbar": False} | arguments)
+    return psf.run_models(
+        **with_kernel({"models": {"a": simple_model()}, "progressbar": False} | arguments)
+    )
 
 
 step, noisy_step = inside(simple_model, psf.DRAM), inside(noisy_model, psf.DRAM)
-noisy_chains = inside(noisy_model, psf.sample_dram)
+noisy_chains = inside(noisy_model, run_in_model)
 find_starts = inside(simple_model, psf.find_starts)
 
 TABLE = [
@@ -144,8 +153,7 @@ TABLE = [
     (run_models, {"models": {"": simple_model()}}, "names of models must be .* got ''"),
     (run_models, {"models": {"a": "b"}}, r"models\['a'\] must be a pymc.Model, got 'b'"),
     (run_models, {"gather": "some"}, "gather must be .* got 'some'"),
-    (run_models, {"ranks_per_chain": 0}, "ranks_per_chain must be .* got 0"),
-    (run_models, {"ranks_per_chain": 2}, "ranks_per_chain=2 needs comm"),
+    (run_models, {"per_chain": 0}, "per_chain must be .* got 0"),
     (run_models, {"cores": 0}, "cores must be .* got 0"),
     (run_models, {"draws": -1}, "draws must be .* got -1"),
     # numbers of particles, and starts
@@ -174,7 +182,7 @@ def test_a_wrong_argument_is_named(call, arguments, message):
     ("arguments", "error", "message"),
     [
         ({"progressbar": "wide"}, ValueError, r"Invalid value for `progressbar`"),
-        ({"step": None}, TypeError, r"argument 'step': the settings of DRAM are proposal_cov, sta"),
+        ({"step": None}, TypeError, r"unexpected keyword argument 'step'$"),
     ],
 )
 def test_other_errors(arguments, error, message):

@@ -11,8 +11,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.kernel.state import STAGE
 from pymc_statespace_filters.sampling.run.chain import Chain
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
+from tests.kernels import with_kernel
 from tests.sampling.test_state_space import DATA as RECORD
 from tests.sampling.test_state_space import LINEAR, STEPS, linear_model, worst_deviations
 from tests.systems import autoregression, counts
@@ -28,7 +29,7 @@ def chains(draws=20_000, tune=1000, model=None, **settings):
         model=model or linear_model(FEW),
         random_seed=4,
         progressbar=False,
-        **settings,
+        **with_kernel(settings),
     )
 
 
@@ -154,7 +155,7 @@ def test_screen_and_target_of_the_same_system():
 
 
 def test_no_correlation_is_fresh_noise():
-    assert DRAMSettings(correlation=0.0) == DRAMSettings()
+    assert RandomWalkSettings(correlation=0.0) == RandomWalkSettings()
 
 
 def brittle(x, q, phi, narrow):
@@ -195,7 +196,7 @@ def test_a_screen_that_fails_where_another_step_moved():
 
 def test_the_noise_of_a_proposal_is_as_correlated_as_it_is_asked_to_be():
     """2080 normals and more: 0.02 is four standard errors at most."""
-    settings = DRAMSettings(stages=1, correlation=0.9)
+    settings = RandomWalkSettings(stages=1, correlation=0.9)
     target = Target(linear_model(psf.EnKF(30)), None, settings)
     target.prepare()
     chain = Chain(target, np.array([1, 2], dtype=np.uint64), 200, 0)

@@ -16,7 +16,7 @@ from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.target import leader_follower
 from pymc_statespace_filters.sampling.target.leader_follower import follow, release_followers
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.ranks import on_ranks
 from tests.systems import FORCE, FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS
@@ -83,7 +83,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_chain_is_that_of_one_rank(name):
-    settings = DRAMSettings.from_arguments({"adapt_every": 10} | SETTINGS[name])
+    settings = RandomWalkSettings(**{"adapt_every": 10} | SETTINGS[name])
     alone = run_chain(Target(MODEL, None, settings))
 
     def call(ranks):
@@ -103,7 +103,7 @@ def test_a_chain_is_that_of_one_rank(name):
 
 def test_a_group_of_one_is_no_group():
     def call(ranks):
-        target = Target(MODEL, None, DRAMSettings(refresh_noise=False), group=ranks)
+        target = Target(MODEL, None, RandomWalkSettings(refresh_noise=False), group=ranks)
         target.prepare()
         density = target.density.bind()
         return density(np.zeros(2), (), target.fixed_seeds), target.density._leader
@@ -130,7 +130,7 @@ def test_a_record_is_sent_once():
         kinds = kinds_sent(ranks)
 
         def evaluate():
-            target = Target(MODEL, None, DRAMSettings(), group=ranks)
+            target = Target(MODEL, None, RandomWalkSettings(), group=ranks)
             target.prepare()
             density = target.density.bind()
             for i in range(5):
@@ -190,11 +190,11 @@ def test_two_models_by_turns():
 def test_other_modes_of_pytensor_call_back():
     """Where PyTensor has no machine code of its own, that of the filters is called all the same."""
     kwargs = {"mode": "FAST_COMPILE"}
-    alone = Target(MODEL, None, DRAMSettings(), compile_kwargs=kwargs)
+    alone = Target(MODEL, None, RandomWalkSettings(), compile_kwargs=kwargs)
     alone.prepare()
 
     def evaluate(ranks):
-        target = Target(MODEL, None, DRAMSettings(), compile_kwargs=kwargs, group=ranks)
+        target = Target(MODEL, None, RandomWalkSettings(), compile_kwargs=kwargs, group=ranks)
         target.prepare()
         return target.density.bind()(np.ones(2), (), [3, 4])
 
@@ -241,7 +241,7 @@ def test_followers_that_do_not_hear_are_not_left_behind(monkeypatch):
 
 
 def evaluate_ten(ranks):
-    target = Target(MODEL, None, DRAMSettings(), group=ranks)
+    target = Target(MODEL, None, RandomWalkSettings(), group=ranks)
     target.prepare()
     density = target.density.bind()
     return [density(np.zeros(2), (), [i, i]) for i in range(10)]
@@ -249,7 +249,7 @@ def evaluate_ten(ranks):
 
 def evaluate_rows(ranks=None):
     """Log-densities at ten points, and what the watch hears of them."""
-    target = Target(MODEL, None, DRAMSettings(), group=ranks)
+    target = Target(MODEL, None, RandomWalkSettings(), group=ranks)
     target.prepare()
     rows, counts = target.density.at_rows(), []
     rows.on_progress = counts.append
@@ -348,12 +348,12 @@ def test_a_wrong_record_is_the_leaders_matter_and_can_be_mended():
         (
             MODEL,
             {"correlation": 0.9, "stages": 1},
-            r"ranks_per_chain must be 1 with correlation=0.9, got 4",
+            r"per_chain must be 1 with correlation=0.9, got 4",
         ),
         (
             two_records(psf.EKF(), psf.EKF()),
             {},
-            r"ranks_per_chain must be 1 for a model without .* particles, got 4",
+            r"per_chain must be 1 for a model without .* particles, got 4",
         ),
         (MODEL, {}, r"EnKF.* 3 of 4 ranks"),
         (two_records(psf.EKF(), psf.PFEnKF(200)), {}, r"PFEnKF.* 3 of 4 ranks"),
@@ -365,4 +365,4 @@ def test_what_cannot_be_shared_is_said_before_anything_is_sent(model, settings, 
         rank, size = 0, 4
 
     with pytest.raises(ModelError, match=message):
-        Target(model, None, DRAMSettings.from_arguments(settings), group=Four())
+        Target(model, None, RandomWalkSettings(**settings), group=Four())

@@ -9,6 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from tests.kernels import with_kernel
 
 # The state is white noise about a level, so that a record is a sample of independent normals and
 # the posterior of levels and mean, given the other variances, is Gaussian.
@@ -66,7 +67,7 @@ def exact():
 
 def chains(model, draws=3000, tune=800, **settings):
     options = {"chains": 4, "random_seed": 4, "progressbar": False} | settings
-    return psf.sample_dram(draws, tune, model=model, **options)
+    return psf.sample_dram(draws, tune, model=model, **with_kernel(options))
 
 
 def worst_deviation(idata):

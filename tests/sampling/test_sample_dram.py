@@ -23,6 +23,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.output.report import left_out_warnings
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from tests.kernels import with_kernel
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
 from tests.systems import autoregression
@@ -40,7 +41,7 @@ def sample_dram(model, **changes):
         "random_seed": 1,
         "progressbar": False,
     }
-    return psf.sample_dram(model=model, **settings | changes)
+    return psf.sample_dram(model=model, **with_kernel(settings | changes))
 
 
 SYSTEM = autoregression(spread=0.5**0.5)
@@ -111,7 +112,7 @@ def test_generators_are_seeds():
 
 def test_a_chain_is_the_same_among_more_chains_until_they_share_a_mixture():
     model, settings = simple_model(), {"tune": 400, "discard_tuned_samples": False}
-    two, three = (sample_dram(model, chains=chains, **settings) for chains in (2, 3))
+    two, three = (sample_dram(model, chains=chains, **with_kernel(settings)) for chains in (2, 3))
     mine, theirs = (tree["warmup_posterior"]["mu"].values[:2] for tree in (two, three))
     np.testing.assert_array_equal(mine[:, :100], theirs[:, :100])
     assert (mine[:, 100:200] != theirs[:, 100:200]).any(axis=1).all()
@@ -133,19 +134,20 @@ def test_data_changed_between_runs():
 
 def two_trees(model, **changes):
     """By ``sample_dram`` and by ``pm.sample``, which do not draw the same numbers."""
-    mine = sample_dram(model, draws=30, tune=20, **changes)
+    mine = sample_dram(model, draws=30, tune=20, **with_kernel(changes))
     with model:
         return mine, sample(DRAM(), draws=30, tune=20, **changes)
 
 
 def without_values(tree):
-    """All of a tree but its numbers."""
+    """All of a tree but its numbers, and the states of the chains."""
     return xr.DataTree.from_dict(
         {
             name: xr.zeros_like(group.to_dataset())
             if name.removeprefix("warmup_") in ("posterior", "sample_stats")
             else group.to_dataset()
             for name, group in tree.children.items()
+            if name != "sampler_state"
         }
     )
 
@@ -231,12 +233,14 @@ def test_frozen_models(noisy):
 
 def test_starting_values():
     model, still = simple_model(), {"draws": 4, "tune": 4, "proposal_cov": 1e-20 * np.eye(2)}
-    for_all = sample_dram(model, initvals={"mu": 7.0}, **still)["posterior"]
+    for_all = sample_dram(model, initvals={"mu": 7.0}, **with_kernel(still))["posterior"]
     np.testing.assert_allclose(for_all["mu"], 7.0, atol=1e-6)
-    each = sample_dram(model, initvals=[{"mu": 7.0}, {model["sigma"]: 3.0}], **still)["posterior"]
+    each = sample_dram(model, initvals=[{"mu": 7.0}, {model["sigma"]: 3.0}], **with_kernel(still))[
+        "posterior"
+    ]
     np.testing.assert_allclose(each["mu"][:, 0], [7.0, model.initial_point()["mu"]], atol=1e-6)
     np.testing.assert_allclose(each["sigma"][1], 3.0, atol=1e-6)
-    dispersed = sample_dram(model, **still)["posterior"]["mu"]
+    dispersed = sample_dram(model, **with_kernel(still))["posterior"]["mu"]
     assert len(np.unique(dispersed[:, 0])) == 2
 
 
@@ -405,13 +409,14 @@ def test_an_interrupt_names_the_chains_that_had_not_begun(monkeypatch, caplog):
 def test_convergence_is_judged_if_it_is_asked_for(asked, caplog):
     """What the chains have met is said in any case."""
     caplog.set_level("INFO", LOGGER)
-    still = {"draws": 99, "tune": 0, "proposal_cov": 1e12 * np.eye(2)}
-    sample_dram(simple_model(), compute_convergence_checks=asked, **still)
-    assert ("too small to check convergence" in caplog.text) == asked
-    assert caplog.text.count("accepted 0 of") == 2
+    call = {"tune": 0, "compute_convergence_checks": asked}
+    sample_dram(simple_model(), draws=99, **call)
+    assert ("The chains have not mixed" in caplog.text) == asked
+    sample_dram(simple_model(), draws=99, **with_kernel({"proposal_cov": 1e12 * np.eye(2)}), **call)
+    assert caplog.text.count("Chains 0 and 1: DRAM accepted 0 of 99") == 1
 
 
-@pytest.mark.parametrize("last", ["spread_at_highest_draw", "run_convergence_checks"])
+@pytest.mark.parametrize("last", ["spread_at_highest_draw", "check_filters"])
 def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
     def interrupted(*arguments):
         raise KeyboardInterrupt

@@ -89,7 +89,9 @@ def test_are_initial_values_of_both_samplers():
             assert 0.0 < start["below"] < start["scale"]
         settings = {"chains": 2, "initvals": starts, "random_seed": 1, "progressbar": False}
         settings |= {"draws": 4, "tune": 0, "compute_convergence_checks": False}
-        chains = psf.sample_dram(stages=1, proposal_cov=1e-20 * np.eye(4), **settings)
+        chains = psf.sample_dram(
+            kernel=psf.RandomWalkSettings(stages=1, proposal_cov=1e-20 * np.eye(4)), **settings
+        )
         for chain, start in enumerate(starts):
             for name, value in start.items():
                 first = chains["posterior"][name].isel(chain=chain, draw=0)

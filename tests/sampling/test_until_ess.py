@@ -191,7 +191,7 @@ def test_the_warm_up_is_kept(model, stopped):
     tree = sample_dram(model, **RULE | {"discard_tuned_samples": False})
     np.testing.assert_array_equal(draws_of(tree), draws_of(stopped))
     assert tree["warmup_posterior"].sizes["draw"] == RULE["tune"]
-    assert tree["sample_stats"]["proposal_cov"].sizes["draw"] == draws_of(stopped).shape[1]
+    assert "draw" not in tree["sample_stats"]["proposal_cov"].dims
 
 
 def test_each_model_stops_on_its_own(model, stopped):
@@ -209,7 +209,7 @@ def test_a_limit_is_said_with_what_was_reached(model, caplog):
     assert tree["posterior"].sizes["draw"] == 170
     (message,) = [text for text in caplog.messages if "until_ess" in text]
     found = convergence(list(draws_of(tree)))
-    assert "until_ess=300 was not reached with max_draws=170 draws in each chain" in message
+    assert "until_ess=300 was not reached with 170 iterations of each chain" in message
     assert f"effective sample size is {found.ess.min():.0f} (" in message
     assert f"R-hat {found.rhat.max():.3f} (" in message
 

@@ -272,6 +272,11 @@ class CompiledSystem:
         return structure.has_smooth_transition(self.model)
 
     @cached_property
+    def is_smooth(self) -> bool:
+        """Whether no equation has a kink or jump in states or parameters; False if unknown."""
+        return structure.is_smooth(self.model)
+
+    @cached_property
     def jumping_equations(self) -> tuple[str, ...]:
         """Those of "transition" and "observation" that are known to jump in the state."""
         return jumping_equations(self.model)

@@ -177,12 +177,29 @@ def has_smooth_sensor(system: StateSpaceModel) -> bool:
     return _is_smooth(call(system.equations.observation, system, symbols), symbols)
 
 
-def _is_smooth(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
+def is_smooth(system: StateSpaceModel) -> bool:
+    """Whether no equation of a step or an observation has a kink or jump; False where undecided.
+
+    As a function of states and parameters. Distributions of observations count as smooth.
+    """
+    if not system.has_gaussian_steps:
+        return False
+    symbols = symbols_of(system)
+    inputs = [f"x.{i}" for i in range(system.n)]
+    inputs += [f"theta.{i}" for i in range(symbols["theta"].type.shape[0] or 0)]
+    equations = [system.equations.transition, system.equations.observation]
+    vectors = [call(graph, system, symbols) for graph in equations if graph is not None]
+    return all(_is_smooth(vector, symbols, inputs) for vector in vectors)
+
+
+def _is_smooth(
+    vector: TensorVariable, symbols: Mapping[str, TensorVariable], inputs: Sequence[str] = ("x.0",)
+) -> bool:
     try:
         (values,) = unrolled(Graph(symbols, [vector]))
     except NotUnrollableError:
         return False
-    return not any(isinstance(e.op, _KINKED) for e in depends_on(values, frozenset({"x.0"})))
+    return not any(isinstance(e.op, _KINKED) for e in depends_on(values, frozenset(inputs)))
 
 
 def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:

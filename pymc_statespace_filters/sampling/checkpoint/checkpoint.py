@@ -49,7 +49,7 @@ class Checkpoint:
         self._journals: dict[int | str, ChainJournal] = {}
 
     def journal(self, chain: int | str) -> ChainJournal:
-        """The journal of a chain, 0 the first, or of "starts"; always the same object.
+        """The journal of a chain, 0 the first, or of "starts" or "length"; always the same object.
 
         One rank at a time uses the journal of a chain, and begins with `ChainJournal.read`.
         """
@@ -200,3 +200,10 @@ def _take_chains(folder: Path, lease: Path) -> None:
             shutil.rmtree(former)  # with unfinished files
     sync_folder(current)
     sync_folder(folder)
+
+
+def checked_folder(checkpoint: Any) -> str | os.PathLike:
+    """The folder of a checkpoint, as the user gave it; a `ModelError` if it is no path."""
+    if not isinstance(checkpoint, str | os.PathLike) or not os.fspath(checkpoint):
+        raise ModelError(f"checkpoint must be the path of a folder, got {checkpoint!r}")
+    return checkpoint

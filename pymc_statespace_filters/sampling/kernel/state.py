@@ -22,7 +22,8 @@ LOG_DENSITY, N_EFFECTIVE, LOG_SCREEN = range(3)
 ACCEPTANCE, SCALING = 2, 3
 N_NUMBERS = 4
 STAGE, N_EVALUATIONS, N_FAILED, FAILURE, N_SCREENED, N_SCREEN_FAILED, INDEPENDENT = range(7)
-N_COUNTS = 7
+N_ACCEPTED = 7
+N_COUNTS = 8
 # If records are moved one by one, the counts of a draw have more columns: what each record has
 # accepted, then what the blocks of the shared parameters and of the population have.
 N_COMMON_BLOCKS = 2
@@ -90,9 +91,10 @@ class Draws(NamedTuple):
 
     positions: np.ndarray  # (n, d)
     numbers: np.ndarray  # (n, 4), columns LOG_DENSITY, N_EFFECTIVE, ACCEPTANCE, SCALING
-    # int64 (n, 7), columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS,
+    # int64 (n, 8), columns STAGE (whose proposal was accepted, 0 if none was), N_EVALUATIONS,
     # N_FAILED, FAILURE (the last failure code), N_SCREENED, N_SCREEN_FAILED, INDEPENDENT (1 if
-    # the proposal was drawn from the mixture)
+    # the proposal was drawn from the mixture), N_ACCEPTED (1 if one was accepted); where only the
+    # last of several iterations is kept, of all of them, see `thinned_draws`
     counts: np.ndarray
     seeds: np.ndarray  # int64 (n, noisy)
     covs: np.ndarray  # (n_covs, d, d), of the first stage's proposals, in the first iterations only
@@ -106,14 +108,14 @@ class Evaluation(NamedTuple):
     n_effective: float  # smallest number of particles in any filter, infinity without noisy filters
 
 
-def has_moved(counts: np.ndarray) -> np.ndarray:
-    """Whether an iteration accepted a proposal, of each record if it moves them one by one.
+def n_accepted(counts: np.ndarray) -> np.ndarray:
+    """In how many iterations a proposal was accepted, of each record if it moves them one by one.
 
     From counts (n, columns), shape (n, records) or (n, 1).
     """
     if counts.shape[1] == N_COUNTS:
-        return counts[:, STAGE : STAGE + 1] > 0
-    return counts[:, N_COUNTS:-N_COMMON_BLOCKS] > 0
+        return counts[:, N_ACCEPTED : N_ACCEPTED + 1]
+    return counts[:, N_COUNTS:-N_COMMON_BLOCKS]
 
 
 def random_block(key: np.ndarray, index: int, n_stages: int, dim: int, n_noisy: int) -> RandomBlock:

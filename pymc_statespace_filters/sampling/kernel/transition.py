@@ -41,6 +41,7 @@ from .state import (
     INDEPENDENT,
     LOG_DENSITY,
     LOG_SCREEN,
+    N_ACCEPTED,
     N_DONE,
     N_EFFECTIVE,
     N_EVALUATIONS,
@@ -286,6 +287,7 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
         if counts[FAILURE] == RAISED:
             break
         counts[INDEPENDENT] = is_free
+        counts[N_ACCEPTED] = 1 if counts[STAGE] > 0 else 0
         copy_into(draws.positions[at], state.position)
         copy_into(draws.seeds[at], state.seeds)
         numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]

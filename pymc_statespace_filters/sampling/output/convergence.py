@@ -11,28 +11,36 @@ from .datatree import most_iterations
 MAX_RHAT = 1.01
 # Fewest draws of a chain from which ArviZ computes either.
 _FEWEST = 4
+_TAILS = (0.05, 0.95)  # whose effective sample size is that of the tails
 
 
 class Convergence(NamedTuple):
     """Diagnostics of all chains together, on the unconstrained space.
 
-    The effective sample size is ArviZ's "bulk", R-hat its "rank". Both are computed from ranks, and
-    the effective sample size is the same for a parameter as for its logarithm. R-hat is also that
-    of the distances from the median, which may differ there in the third decimal.
+    The effective sample sizes are ArviZ's "bulk" and "tail", R-hat its "rank": the larger one of
+    the ranks and of the distances from the median ("folded"). Effective sample sizes are the same
+    for a parameter as for its logarithm; R-hat may differ there in the third decimal.
     """
 
-    ess: np.ndarray  # (d,), 0 where no chain has moved
+    ess: np.ndarray  # (d,), bulk, 0 where no chain has moved
+    tail: np.ndarray  # (d,), of the quantiles of 5 and 95 %
     rhat: np.ndarray  # (d,), infinity where no chain has moved
 
     def reaches(self, until_ess: float) -> bool:
         """Whether every effective sample size is large enough, and no R-hat above `MAX_RHAT`."""
-        return bool(self.ess.min() >= until_ess and self.rhat.max() <= MAX_RHAT)
+        return bool(self.least_ess >= until_ess and self.rhat.max() <= MAX_RHAT)
+
+    @property
+    def least_ess(self) -> float:
+        """The smallest effective sample size, of bulk and tails."""
+        return float(min(self.ess.min(), self.tail.min()))
 
     def described(self, names: Sequence[str]) -> str:
         """Name the smallest effective sample size and the largest R-hat, and whose they are."""
-        least, most = int(self.ess.argmin()), int(self.rhat.argmax())
+        least, tail, most = int(self.ess.argmin()), int(self.tail.argmin()), int(self.rhat.argmax())
         return (
             f"the smallest bulk effective sample size is {self.ess[least]:.0f} ({names[least]}), "
+            f"the smallest of the tails {self.tail[tail]:.0f} ({names[tail]}), "
             f"the largest R-hat {self.rhat[most]:.3f} ({names[most]})"
         )
 
@@ -54,17 +62,20 @@ def convergence(chains: Sequence[np.ndarray], most_draws: int | None = None) -> 
     return Convergence(*np.transpose(values))
 
 
-def _of_element(draws: np.ndarray) -> tuple[float, float]:
-    """Effective sample size and R-hat of draws of one number, shape (chains, n)."""
+def _of_element(draws: np.ndarray) -> tuple[float, float, float]:
+    """Effective sample sizes and R-hat of draws of one number, shape (chains, n)."""
     # It takes as long to import as the rest of what sampling needs, and the first diagnostics are
     # wanted while chains run.
     from arviz_stats.base import array_stats
 
     if np.ptp(draws) == 0.0:  # ArviZ takes these for independent draws
-        return 0.0, np.inf
+        return 0.0, 0.0, np.inf
     halves = draws[0, : draws.shape[1] // 2 * 2].reshape(2, -1)
     with np.errstate(invalid="ignore", divide="ignore"):  # chains that never moved
-        ess = array_stats.ess(draws, chain_axis=0, draw_axis=1, method="bulk")
+        ess, tail = (
+            array_stats.ess(draws, chain_axis=0, draw_axis=1, method=method, prob=prob)
+            for method, prob in (("bulk", None), ("tail", _TAILS))
+        )
         compared = draws if len(draws) > 1 else halves
         rhat = array_stats.rhat(compared, chain_axis=0, draw_axis=1, method="rank")
-    return float(ess), float(rhat)
+    return float(ess), float(tail), float(rhat)

@@ -21,6 +21,8 @@ from .deterministics import Deterministics
 
 # Groups with draws, and those with statistics of them.
 SAMPLE_STATS = {"sample_stats", "warmup_sample_stats"}
+# Statistics that do not change after the warm-up.
+FROZEN = ("proposal_cov",)
 SAMPLED = {"posterior", "warmup_posterior"} | SAMPLE_STATS
 
 
@@ -97,6 +99,7 @@ def to_datatree(
     for name, values in fixed_stats.items():
         _add_fixed(tree, name, values)
     _name_dims(tree, stat_dims or {})
+    _store_once(tree)
     return tree
 
 
@@ -171,6 +174,15 @@ def _add_fixed(tree: DataTree, name: str, values: np.ndarray) -> None:
         shape = (len(values), n_draws, *values.shape[1:])
         repeated = np.broadcast_to(values[:, None], shape)
         tree[group].update(dict_to_dataset({name: repeated}))
+
+
+def _store_once(tree: DataTree) -> None:
+    """Keep for each chain, not for each draw, what is constant after the warm-up."""
+    if "posterior" not in tree.children:
+        return
+    stats = tree["sample_stats"].to_dataset()
+    frozen = {name: stats[name].isel(draw=-1, drop=True) for name in FROZEN if name in stats}
+    tree["sample_stats"] = DataTree(stats.assign(frozen))
 
 
 def _name_dims(tree: DataTree, stat_dims: Mapping[str, tuple[str, Sequence]]) -> None:

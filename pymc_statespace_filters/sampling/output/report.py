@@ -1,13 +1,10 @@
 """The paragraph about a run that is logged at its end."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from pymc.stats.convergence import SamplerWarning
 
 from ...filters.outcomes import Failure
-from ...lower_chains import LowerChain
-from ...progress import MIN_ACCEPT_RATE
 from .convergence import MAX_RHAT, Convergence
 from .datatree import most_iterations
 from .warnings import PhaseStatistics, sampler_warning
@@ -19,36 +16,98 @@ _ENOUGH_PER_CHAIN = 100
 def closing_report(
     statistics: Mapping[int, PhaseStatistics],
     tune: int,
-    lower: Sequence[LowerChain],
     found: Convergence | None,
     names: Sequence[str],
-    until_ess: float | None,
+    thin: int,
 ) -> str:
-    """Describe a run in one paragraph, with what to do about it.
+    """Describe a run in one paragraph; what is wrong with it, warnings say.
 
     ``statistics`` are those after the warm-up, by chain, ``names`` those of the elements of a
     position. ``found`` is None if convergence was not asked for, or there are too few draws.
     """
     sentences = [
-        _size(statistics, tune, found, names),
+        _size(statistics, tune, thin, found, names),
         _acceptance(statistics),
         _failures(statistics),
-        *(f"{str(chain).capitalize()}." for chain in lower),
-        _advice(statistics, lower, found, until_ess),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def until_ess_warning(
-    until_ess: float, draws: int, found: Convergence | None, names: Sequence[str]
-) -> SamplerWarning:
-    """Warn that chains ended at ``max_draws`` before they had reached ``until_ess``."""
-    reached = "" if found is None else f"; {found.described(names)}"
-    return sampler_warning(
-        f"until_ess={until_ess:g} was not reached with max_draws={draws} draws in each chain: it "
-        f"asks for that bulk effective sample size and R-hat of at most {MAX_RHAT} for every "
-        f"parameter{reached}. Give a larger max_draws, or make the chains mix better."
+def mixing_warning(
+    found: Convergence | None,
+    names: Sequence[str],
+    n_chains: int,
+    n_iterations: int,
+    seconds: float,
+    ways: Callable[[str], str],
+) -> SamplerWarning | None:
+    """Warn of chains that disagree, or whose draws are worth too little, with what would do.
+
+    ``ways`` gives what works for the model if an element with this name is slow.
+    """
+    if found is None:
+        return sampler_warning("The number of draws is too small to check convergence.")
+    enough = float(_ENOUGH_PER_CHAIN * n_chains)
+    if found.reaches(enough):
+        return None
+    text = f"The chains have not mixed: {found.described(names)}. "
+    if found.least_ess < enough:
+        text += f"{needed(found, enough, n_iterations, seconds)} (until_ess={enough:g} does it). "
+    if found.rhat.max() > MAX_RHAT:
+        text += f"If R-hat stays above {MAX_RHAT}, {ways(names[int(found.rhat.argmax())])}."
+    return sampler_warning(text.strip())
+
+
+def needed(found: Convergence, enough: float, n_iterations: int, seconds: float) -> str:
+    """How many iterations would do, and what they take."""
+    factor = max(1.0, enough / max(found.least_ess, 1.0))
+    return (
+        f"About {rounded(factor * n_iterations)} iterations of each chain would do, in "
+        f"{duration(factor * seconds)}"
     )
+
+
+def below_known_warning(nats: float) -> SamplerWarning:
+    """Warn of chains far below a point that the search for starts has met."""
+    return sampler_warning(
+        f"The chains never reached the posterior: their median log-density stayed {nats:.0f} nats "
+        "or more below that of points which the search for starts has found. Tune longer, or start "
+        "there (initvals=psf.find_starts())."
+    )
+
+
+def until_ess_warning(
+    until_ess: float,
+    n_iterations: int,
+    seconds: float,
+    found: Convergence | None,
+    names: Sequence[str],
+    remedy: str,
+) -> SamplerWarning:
+    """Warn that chains have ended before they had reached ``until_ess``, with what would do."""
+    reached, would_do = "", ""
+    if found is not None:
+        reached = f": {found.described(names)}"
+        would_do = f"{needed(found, until_ess, n_iterations, seconds)}; "
+    return sampler_warning(
+        f"until_ess={until_ess:g} was not reached with {n_iterations} iterations of each chain in "
+        f"{duration(seconds)}{reached}. {would_do}{remedy}."
+    )
+
+
+def rounded(number: float) -> str:
+    """A number with two digits, without an exponent."""
+    return f"{float(f'{number:.1e}'):.0f}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words, roughly."""
+    if seconds < 0.95:
+        return "less than a second"
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 100.0 else f"{minutes / 60.0:.0f} h"
 
 
 def left_out_warnings(lengths: Sequence[int], skipped: int) -> list[SamplerWarning]:
@@ -83,28 +142,25 @@ def no_draws_warning(name: str) -> SamplerWarning:
 def _size(
     statistics: Mapping[int, PhaseStatistics],
     tune: int,
+    thin: int,
     found: Convergence | None,
     names: Sequence[str],
 ) -> str:
-    lengths = sorted({chain.iterations for chain in statistics.values()})
+    lengths = sorted({chain.iterations // thin for chain in statistics.values()})
     chains = "1 chain" if len(statistics) == 1 else f"{len(statistics)} chains"
     draws = " to ".join(str(length) for length in dict.fromkeys((lengths[0], lengths[-1])))
     found_text = "" if found is None else f"; {found.described(names)}"
-    return f"{chains} of {draws} draws after a warm-up of {tune}{found_text}."
+    behind = "" if thin == 1 else f", each the last of {thin} iterations,"
+    return f"{chains} of {draws} draws{behind} after a warm-up of {tune}{found_text}."
 
 
 def _acceptance(statistics: Mapping[int, PhaseStatistics]) -> str:
     rates = {i: chain.accept_rate for i, chain in statistics.items()}
     ends = dict.fromkeys(_percent(rate) for rate in (min(rates.values()), max(rates.values())))
-    few = [
-        f" Chain {i} accepted one in only {_percent(rate)} % of its iterations."
-        for i, rate in rates.items()
-        if rate < MIN_ACCEPT_RATE
-    ]
     text = f"The chains accepted a proposal in {' to '.join(ends)} % of their iterations."
     if by_record := [rate for chain in statistics.values() for rate in chain.by_record]:
         text = _acceptance_of_blocks(list(statistics.values()), by_record)
-    return text + "".join(few)
+    return text
 
 
 def _acceptance_of_blocks(statistics: Sequence[PhaseStatistics], by_record: Sequence[float]) -> str:
@@ -136,32 +192,6 @@ def _failures(statistics: Mapping[int, PhaseStatistics]) -> str:
     return (
         f"{n_failed} of {n_evaluations} evaluations after the warm-up "
         f"({_percent(n_failed / n_evaluations)} %) failed and were rejected: {reasons}."
-    )
-
-
-def _advice(
-    statistics: Mapping[int, PhaseStatistics],
-    lower: Sequence[LowerChain],
-    found: Convergence | None,
-    until_ess: float | None,
-) -> str:
-    if lower:
-        return (
-            "These draws are not from one distribution: start the chains in the posterior "
-            "(initvals=psf.find_starts()), or tune longer."
-        )
-    if min(chain.accept_rate for chain in statistics.values()) < MIN_ACCEPT_RATE:
-        return "The warnings about single chains say what may help."
-    if found is None:
-        return ""
-    enough = until_ess or _ENOUGH_PER_CHAIN * len(statistics)
-    if found.reaches(enough):
-        return "Nothing in these numbers speaks against the draws."
-    how = f"until_ess={enough:g} does" if until_ess is None else "with a larger max_draws"
-    factor = max(2, math.ceil(enough / max(found.ess.min(), 1.0)))
-    return (
-        f"Draw about {factor} times as many ({how}); if R-hat stays above {MAX_RHAT}, tune longer "
-        "or start elsewhere (psf.find_starts)."
     )
 
 

@@ -21,7 +21,7 @@ from ..kernel.state import (
     STAGE,
     ChainState,
     Draws,
-    has_moved,
+    n_accepted,
 )
 from ..target.record_target import RecordTarget
 from ..target.target import Target
@@ -99,45 +99,55 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
 
 
 def whole_chain(
-    target: Target | RecordTarget, draws: Draws, state: ChainState, tune: int
+    target: Target | RecordTarget, draws: Draws, state: ChainState, tune: int, thin: int = 1
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Positions and statistics of a whole chain, as copies.
+
+    Each draw after the warm-up is the last of ``thin`` iterations: what is accepted is their share.
 
     ``proposal_cov`` is a view without a stride if the covariances of the warm-up were not kept.
     """
     if isinstance(target, RecordTarget):
-        return draws.positions.copy(), _of_records(target, draws, tune)
+        return draws.positions.copy(), _of_records(target, draws, tune, thin)
     n = len(draws.positions)
     stats = {name: values.copy() for name, values in of_draws(target, draws, slice(0, n)).items()}
-    moved = draws.counts[:, STAGE] > 0
-    stats["accept_rate"] = np.concatenate(
-        [np.cumsum(phase) / np.arange(1, phase.size + 1) for phase in np.split(moved, [tune])]
-    )
+    accepted = n_accepted(draws.counts)[:, 0] / _n_behind(n, tune, thin)
+    stats |= {"accepted": accepted, "accept_rate": _running_means(accepted, tune)}
     covs = np.broadcast_to(state.proposal_cov, (n, *state.proposal_cov.shape))
     if len(draws.covs):
         covs = np.concatenate([draws.covs[:n], covs[tune:]])
     return draws.positions.copy(), stats | {"proposal_cov": covs}
 
 
-def _of_records(target: RecordTarget, draws: Draws, tune: int) -> dict[str, np.ndarray]:
+def _n_behind(n: int, tune: int, thin: int) -> np.ndarray:
+    """Iterations behind each of n draws, of which the first are the warm-up."""
+    return np.where(np.arange(n) < tune, 1, thin)
+
+
+def _running_means(values: np.ndarray, tune: int) -> np.ndarray:
+    """Means since the beginning of the warm-up, and since its end."""
+    phases = np.split(values, [tune])
+    return np.concatenate([np.cumsum(of) / np.arange(1, of.size + 1) for of in phases])
+
+
+def _of_records(target: RecordTarget, draws: Draws, tune: int, thin: int) -> dict[str, np.ndarray]:
     """Statistics of a whole chain that moves records one by one."""
     counts, n = draws.counts, len(draws.counts)
-    moved = has_moved(counts)
+    behind = _n_behind(n, tune, thin)
+    moved = n_accepted(counts) / behind[:, None]
     accepted = moved.mean(axis=1)
     stats = {name: draws.numbers[:, column].copy() for name, column in _NUMBERS.items()}
     stats |= {name: counts[:, column].copy() for name, column in _RECORD_COUNTS.items()}
     stats |= {
         "accepted": accepted,
-        "accept_rate": np.concatenate(
-            [np.cumsum(of) / np.arange(1, of.size + 1) for of in np.split(accepted, [tune])]
-        ),
+        "accept_rate": _running_means(accepted, tune),
         "record_accepted": moved,
         "exact": np.full(n, target.exact),
     }
     if target.structure.shared:
-        stats["shared_accepted"] = counts[:, -N_COMMON_BLOCKS] * 1.0
+        stats["shared_accepted"] = counts[:, -N_COMMON_BLOCKS] / behind
     if target.structure.population:
-        stats["population_accepted"] = counts[:, -1] / N_POPULATION_MOVES
+        stats["population_accepted"] = counts[:, -1] / N_POPULATION_MOVES / behind
     for column, name in enumerate(target.seed_names):
         seeds = draws.seeds[:, target.layout.columns == column]
         is_of_records = name in stat_dims(target)

@@ -1,15 +1,14 @@
 """Statistics of a phase of a chain, and the warnings about chains when they have ended."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from pymc.stats.convergence import SamplerWarning, WarningType
 
 from ...filters.outcomes import COLLAPSED, Failure
-from ...lower_chains import LowerChain, lower_chains
+from ...lower_chains import TOLERATED, LowerChain, lower_chains
 from ...progress import MIN_ACCEPT_RATE
 from ..kernel.record_arrays import N_POPULATION_MOVES
 from ..kernel.state import (
@@ -25,7 +24,7 @@ from ..kernel.state import (
     STAGE,
     ChainState,
     Draws,
-    has_moved,
+    n_accepted,
 )
 from ..target.record_target import RecordTarget
 from ..target.sampled_model import Growth
@@ -45,6 +44,10 @@ TOLERATED_GROWTH = 1e3
 
 # Fraction of the draws whose particles may have collapsed: a rare surprise only costs mixing.
 TOLERATED_COLLAPSES = 0.5
+
+
+# Causes that explain why chains have not mixed.
+STANDSTILL, LOWER = "standstill", "lower"
 
 
 class PhaseStatistics(NamedTuple):
@@ -89,26 +92,27 @@ class PhaseStatistics(NamedTuple):
         )
 
     @classmethod
-    def from_draws(cls, draws: Draws, begin: int, end: int) -> "PhaseStatistics":
-        """Count the iterations from ``begin`` to before ``end``."""
+    def from_draws(cls, draws: Draws, begin: int, end: int, thin: int = 1) -> "PhaseStatistics":
+        """Count the iterations from row ``begin`` to before row ``end``, ``thin`` for each."""
         counts = draws.counts[begin:end]
         codes = counts[:, FAILURE]
         failures = tuple(
             (int(code), int(counts[codes == code, N_FAILED].sum()))
             for code in np.unique(codes[counts[:, N_FAILED] > 0])
         )
-        moved = has_moved(counts)
-        rates = moved.mean(axis=0) if len(counts) else np.zeros(moved.shape[1])
+        n, accepted = thin * len(counts), n_accepted(counts)
+        rates = accepted.sum(axis=0) / max(n, 1)
         dwells = [
-            np.diff(np.flatnonzero(of_part), prepend=0, append=len(counts)) for of_part in moved.T
+            thin * np.diff(np.flatnonzero(of_part), prepend=0, append=len(counts))
+            for of_part in accepted.T
         ]
         slowest = int(np.argmax([of_part.max() for of_part in dwells]))
         statistics = cls(
-            len(counts),
-            float(rates.mean() * len(counts)),
+            n,
+            float(rates.mean() * n),
             int(counts[:, N_EVALUATIONS].sum()),
             failures,
-            int(np.count_nonzero(draws.numbers[begin:end, N_EFFECTIVE] < COLLAPSED)),
+            thin * int(np.count_nonzero(draws.numbers[begin:end, N_EFFECTIVE] < COLLAPSED)),
             int(counts[:, N_SCREENED].sum()),
             int(counts[:, N_SCREEN_FAILED].sum()),
             int(dwells[slowest][-1]),
@@ -116,7 +120,7 @@ class PhaseStatistics(NamedTuple):
         )
         if counts.shape[1] == N_COUNTS:
             return statistics
-        shared, population = counts[:, -N_COMMON_BLOCKS:].mean(axis=0).tolist()
+        shared, population = (counts[:, -N_COMMON_BLOCKS:].sum(axis=0) / max(n, 1)).tolist()
         return statistics._replace(
             slowest=slowest,
             by_record=tuple(rates.tolist()),
@@ -130,22 +134,41 @@ class PhaseStatistics(NamedTuple):
         return self.moved / self.iterations if self.iterations else 0.0
 
 
+class Problem(NamedTuple):
+    """What went wrong in a chain, and the message about it."""
+
+    cause: str
+    message: str
+
+
 def closing_warning(
     statistics: PhaseStatistics, growth: Growth | None = None, remedy: str = ""
 ) -> SamplerWarning | None:
-    """Warn of what went wrong after warm-up, if anything did.
+    """Warn of what went wrong after warm-up, if anything did; arguments as of `closing_problem`.
+
+    PyMC logs the warning in the main process, in whichever process the chain ran.
+    """
+    problem = closing_problem(statistics, growth, remedy)
+    return None if problem is None else sampler_warning(problem.message)
+
+
+def closing_problem(
+    statistics: PhaseStatistics, growth: Growth | None = None, remedy: str = ""
+) -> Problem | None:
+    """The first thing that went wrong after warm-up, if anything did.
 
     ``growth`` is that of the adapted proposals, ``remedy`` what the model's filters can do about
-    collapse. PyMC logs the warning in the main process, in whichever process the chain ran.
+    collapse.
     """
-    message = (
-        _screen_problem(statistics)
-        or _collapse_problem(statistics, remedy)
-        or _mobility_problem(statistics, is_noisy=bool(remedy))
-        or _growth_problem(growth)
-        or _failure_problem(statistics)
-    )
-    return None if message is None else sampler_warning(message)
+    messages = {
+        "screen": _screen_problem(statistics),
+        "collapse": _collapse_problem(statistics, remedy),
+        STANDSTILL: _mobility_problem(statistics, is_noisy=bool(remedy)),
+        "growth": _growth_problem(growth),
+        "failures": _failure_problem(statistics),
+    }
+    found = (Problem(cause, text) for cause, text in messages.items() if text is not None)
+    return next(found, None)
 
 
 def lower_chains_of(chains: Sequence[Draws], tune: int) -> list[LowerChain]:
@@ -158,11 +181,20 @@ def lower_chains_of(chains: Sequence[Draws], tune: int) -> list[LowerChain]:
     return lower_chains(log_densities, chains[0].positions.shape[1])
 
 
-def _lower_chain_warning(chain: LowerChain) -> SamplerWarning:
-    return sampler_warning(
-        f"{str(chain).capitalize()}: it may be in a lower mode, or not have found the posterior. "
-        "Start it there (initvals, psf.find_starts) or tune longer."
-    )
+def below_known(highest: float, chains: Sequence[Draws], tune: int) -> float | None:
+    """By how many nats all chains stayed below a log-density that is known; None if they did not.
+
+    A point of the posterior of d parameters lies some d / 2 nats below the highest one.
+    """
+    levels = [
+        float(np.median(draws.numbers[tune:, LOG_DENSITY]))
+        for draws in chains
+        if len(draws.positions) > tune
+    ]
+    if not levels or not math.isfinite(highest):
+        return None
+    nats = highest - max(levels)
+    return nats if nats > TOLERATED + chains[0].positions.shape[1] else None
 
 
 def sampler_warning(message: str) -> SamplerWarning:
@@ -199,40 +231,47 @@ def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | N
                 "(psf.suggest_particles). Otherwise its"
             )
         return (
-            f"DRAM stayed at one point for {statistics.longest_dwell} of {n} draws. {begin} "
+            f"DRAM stayed at one point for {statistics.longest_dwell} of {n} iterations. {begin} "
             "proposals do not lead away from there: tune longer, start elsewhere (initvals), or "
             "give proposal_cov."
         )
     return None
 
 
-def _record_warning(target: RecordTarget, statistics: PhaseStatistics) -> SamplerWarning | None:
-    """Warn of the record that moved least, or of the parameters that all records decide on."""
-    n, rates = statistics.iterations, statistics.by_record
+def _record_problem(target: RecordTarget, statistics: PhaseStatistics) -> Problem | None:
+    """What is wrong with the record that moved least, or with what all records decide on."""
+    n, rates, is_noisy = statistics.iterations, statistics.by_record, bool(target.n_noisy)
     slow = sorted((rate, g) for g, rate in enumerate(rates) if rate < MIN_ACCEPT_RATE)
     others = f" and {len(slow) - 1} more" if len(slow) > 1 else ""
+    particles = ", or give its filter more particles" if is_noisy else ""
     if slow:
         rate, g = slow[0]
-        return sampler_warning(
+        return Problem(
+            STANDSTILL,
             f"Record {target.labels[g]!r}{others} hardly moved: it accepted {rate * n:.0f} of {n} "
-            "proposals after warm-up. Tune longer, start elsewhere (initvals), or, if the "
-            "likelihood is noisy, give its filter more particles."
+            f"proposals after warm-up. Tune longer, start elsewhere (initvals){particles}.",
         )
     shared = target.structure.shared
     if shared and statistics.shared_rate < MIN_ACCEPT_RATE:
         names = ", ".join(target.variable_name(value) for value in shared)
-        return sampler_warning(
+        because, more = "", "tune longer"
+        if is_noisy:
+            because, more = ": the noise of all records decides on each", "give more particles"
+        return Problem(
+            STANDSTILL,
             f"The parameters that all records share ({names}) accepted "
-            f"{statistics.shared_rate * n:.0f} of {n} proposals after warm-up: the noise of all "
-            "records decides on each. Give every record its own, with a distribution of the "
-            "population (the centred form), or the filter more particles."
+            f"{statistics.shared_rate * n:.0f} of {n} proposals after warm-up{because}. Give every "
+            "record its own, with a distribution of the population (the centred form), or "
+            f"{more}.",
         )
     if statistics.longest_dwell > max(LEAST_DWELL, LONG_DWELL * n):
-        return sampler_warning(
+        remedy = "Tune longer, or start elsewhere (initvals)."
+        if is_noisy:
+            remedy = "If its estimate there is too high, give its filter more particles. " + remedy
+        return Problem(
+            STANDSTILL,
             f"Record {target.labels[statistics.slowest or 0]!r} stayed at one point for "
-            f"{statistics.longest_dwell} of {n} draws. If the likelihood is noisy, its estimate "
-            "there is an overestimate: give its filter more particles. Otherwise tune longer, or "
-            "start elsewhere (initvals)."
+            f"{statistics.longest_dwell} of {n} iterations. {remedy}",
         )
     return None
 
@@ -275,20 +314,63 @@ def _failure_problem(statistics: PhaseStatistics) -> str | None:
 
 
 def chain_warnings(
-    target: Target | RecordTarget, results: Sequence[tuple[Draws, ChainState]], tune: int
-) -> list[SamplerWarning]:
-    """Warnings about single chains, at most one for each."""
+    target: Target | RecordTarget,
+    results: Sequence[tuple[Draws, ChainState]],
+    tune: int,
+    thin: int,
+) -> dict[str, SamplerWarning]:
+    """Warnings about single chains, by their cause: one for all chains that have it."""
     lower = {low.chain: low for low in lower_chains_of([draws for draws, _ in results], tune)}
-    warnings = []
+    by_cause: dict[str, dict[int, str]] = {}
     for i, (draws, state) in enumerate(results):
-        statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions))
-        if statistics.iterations:
-            growth = target.growth(state)
-            warning = closing_warning(statistics, growth, target.collapse_remedy)
-            if isinstance(target, RecordTarget):
-                warning = _record_warning(target, statistics) or warning
-            if warning is not None:
-                warnings.append(replace(warning, message=f"Chain {i}: {warning.message}"))
-            elif i in lower:
-                warnings.append(_lower_chain_warning(lower[i]))
-    return warnings
+        statistics = PhaseStatistics.from_draws(draws, tune, len(draws.positions), thin)
+        problem = _problem_of(target, state, statistics) if statistics.iterations else None
+        if problem is not None:
+            by_cause.setdefault(problem.cause, {})[i] = problem.message
+        elif i in lower:
+            by_cause.setdefault(LOWER, {})[i] = ""
+    found = {cause: sampler_warning(_of_chains(texts)) for cause, texts in by_cause.items()}
+    if LOWER in by_cause:
+        text = _lower_text([lower[i] for i in by_cause[LOWER]])
+        found[LOWER] = sampler_warning(text)
+    return found
+
+
+def _problem_of(
+    target: Target | RecordTarget, state: ChainState, statistics: PhaseStatistics
+) -> Problem | None:
+    problem = closing_problem(statistics, target.growth(state), target.collapse_remedy)
+    if isinstance(target, RecordTarget):
+        return _record_problem(target, statistics) or problem
+    return problem
+
+
+def _of_chains(texts: Mapping[int, str]) -> str:
+    """The message of the first chain, for all of them."""
+    first, *_ = texts.values()
+    if len(texts) == 1:
+        return f"Chain {next(iter(texts))}: {first}"
+    numbers = "" if len(set(texts.values())) == 1 else f" (The numbers are of chain {min(texts)}.)"
+    return f"Chains {listed(texts)}: {first}{numbers}"
+
+
+def listed(chains: Iterable[int]) -> str:
+    """Numbers of chains in words: 0, 2 and 3."""
+    *firsts, last = map(str, chains)
+    return f"{', '.join(firsts)} and {last}" if firsts else last
+
+
+def _lower_text(lower: Sequence[LowerChain]) -> str:
+    if len(lower) == 1:
+        begin, they, them = str(lower[0]).capitalize(), "it may", "it"
+    else:
+        nats = sorted(low.nats for low in lower)
+        begin = (
+            f"Chains {listed(low.chain for low in lower)} stayed {nats[0]:.0f} to {nats[-1]:.0f} "
+            f"nats below chain {lower[0].highest} (median log-density)"
+        )
+        they, them = "they may", "them"
+    return (
+        f"{begin}: {they} be in a lower mode, or not have found the posterior. Start {them} there "
+        "(initvals, psf.find_starts) or tune longer."
+    )

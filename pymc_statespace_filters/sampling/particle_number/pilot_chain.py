@@ -15,7 +15,7 @@ from ..kernel.independence import no_mixture
 from ..kernel.state import LOG_DENSITY
 from ..run.chain_task import ChainTask
 from ..run.thread_pool import ChainPool
-from ..target.settings import DRAMSettings
+from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from .effort import Effort
 
@@ -27,7 +27,7 @@ _FAR = 10.0
 
 _FEWEST = 25  # iterations, if the time runs short
 
-SETTINGS = DRAMSettings(adapt_every=50, refresh_noise=False)
+SETTINGS = RandomWalkSettings(adapt_every=50, refresh_noise=False)
 
 
 class Pilot(NamedTuple):

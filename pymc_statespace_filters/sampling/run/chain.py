@@ -7,12 +7,21 @@ import numpy as np
 
 from ..kernel.adaptation_state import pack, packed_size, start_adaptation
 from ..kernel.independence import no_mixture
-from ..kernel.state import N_COUNTS, ChainState, Evaluation, PhaseSettings, RandomBlock, draw_seeds
+from ..kernel.state import (
+    N_COUNTS,
+    ChainState,
+    Draws,
+    Evaluation,
+    PhaseSettings,
+    RandomBlock,
+    draw_seeds,
+)
 from ..kernel.transition import advance
 from ..output.likelihood_variance import SeedSpread, seed_spread
 from ..target.initial_points import EvaluatedPoint, best_initial_point
 from ..target.target import Target
 from .chain_arrays import ChainArrays
+from .thinned_draws import Thinning
 
 
 class Chain(ChainArrays):
@@ -24,9 +33,11 @@ class Chain(ChainArrays):
     key : ndarray of uint64, shape (2,)
         Key of the chain's random numbers.
     n_rows, n_covs : int
-        Iterations whose draws are kept, and those, the first ones, whose proposal covariance is.
+        Draws that are kept, and the first iterations whose proposal covariance is.
     proposal_cov : ndarray, shape (d, d), optional
         Of the first proposals. Default: the target's.
+    thinning : Thinning, optional
+        Which iterations are kept. Default: all.
     """
 
     _target: Target
@@ -38,6 +49,7 @@ class Chain(ChainArrays):
         n_rows: int,
         n_covs: int,
         proposal_cov: np.ndarray | None = None,
+        thinning: Thinning | None = None,
     ):
         self._density = target.density.bind()
         self._screen = None if target.screen is None else target.screen.bind()
@@ -54,7 +66,8 @@ class Chain(ChainArrays):
             self._density.carried,
             np.array(key),
         )
-        super().__init__(target, state, n_rows, N_COUNTS, np.empty((n_covs, dim, dim)))
+        covs = np.empty((n_covs, dim, dim))
+        super().__init__(target, state, n_rows, N_COUNTS, covs, thinning)
 
     @property
     def others(self) -> list[np.ndarray]:
@@ -128,11 +141,17 @@ class Chain(ChainArrays):
         self._restore_correlation()
 
     def _iterate(
-        self, settings: PhaseSettings, random: RandomBlock, first: int, row: int, n: int
+        self,
+        settings: PhaseSettings,
+        random: RandomBlock,
+        first: int,
+        draws: Draws,
+        row: int,
+        n: int,
     ) -> int:
         target = self._density.native
         screen = target if self._screen is None else self._screen.native
-        state, draws, control = self.state, self.draws, self.control
+        state, control = self.state, self.control
         return advance(settings, target, screen, state, random, first, draws, row, n, control)
 
     def _raise_error(self) -> None:

@@ -27,6 +27,7 @@ from ..kernel.state import (
 )
 from ..target.record_target import RecordTarget
 from ..target.target import Target
+from .thinned_draws import Thinning, add_iterations, coarsen, rows_of
 
 
 class StopRequested(Exception):
@@ -42,11 +43,13 @@ class ChainArrays:
         Prepared.
     state : ChainState
     n_rows : int
-        Iterations whose draws are kept.
+        Draws that are kept.
     n_counts : int
         Columns of the counts of a draw.
     covs : ndarray, shape (n_covs, d, d)
         For the proposal covariances of the first iterations.
+    thinning : Thinning, optional
+        Which iterations are kept. Default: all.
 
     Attributes
     ----------
@@ -63,9 +66,10 @@ class ChainArrays:
         n_rows: int,
         n_counts: int,
         covs: np.ndarray,
+        thinning: Thinning | None = None,
     ):
         self._target: Any = target
-        self.state = state
+        self.state, self.thinning = state, thinning or Thinning(n_rows)
         self.draws = Draws(
             np.empty((n_rows, state.position.size)),
             np.empty((n_rows, N_NUMBERS)),
@@ -75,6 +79,8 @@ class ChainArrays:
         )
         self.control = np.zeros(2, dtype=np.int64)
         self._block: tuple[int, Any] | None = None
+        # Counts of the row that was not full when the draws were last saved.
+        self._saved_counts = np.zeros(n_counts, dtype=np.int64)
 
     def advance(self, tune: bool, iteration: int, row: int, n: int) -> int:
         """Make up to n iterations, within one block of random numbers, and record them from a row.
@@ -82,10 +88,40 @@ class ChainArrays:
         Returns the number of iterations made: fewer at the end of the block, or after a pause was
         requested. ``iteration`` counts from the start of the chain. Raises what the model raised.
         """
+        return self._advance(tune, iteration, self.draws, row, n)
+
+    def advance_thinned(self, iteration: int, n: int) -> int:
+        """As `advance`, after the warm-up, into the draws that ``thinning`` keeps."""
+        made = int(self.control[N_DONE])
+        if self.thinning.every == 1:
+            return self.advance(False, iteration, made, n)
+        every = self._empty_block()
+        done = self._advance(False, iteration, every, 0, n)
+        rows = self.thinning.rows(np.arange(made, made + done))
+        add_iterations(self.draws, rows, rows_of(every, slice(0, done)))
+        return done
+
+    def _empty_block(self) -> Draws:
+        arrays = self.draws._asdict()
+        covs = arrays.pop("covs")[:0]
+        return Draws(
+            **{name: np.zeros((BLOCK, *a.shape[1:]), a.dtype) for name, a in arrays.items()},
+            covs=covs,
+        )
+
+    def coarsen(self, every: int) -> None:
+        """Keep from now on the last of more iterations, also of those made."""
+        after = self.thinning._replace(every=every)
+        full = self.thinning.n_rows(int(self.control[N_DONE]))
+        coarsen(self.draws, full, self.thinning, after)
+        self.thinning = after
+        self._note_saved()
+
+    def _advance(self, tune: bool, iteration: int, draws: Draws, row: int, n: int) -> int:
         random, first = self._random_numbers(iteration)
         n = min(n, BLOCK - first)
         with held_interrupts():
-            done = self._iterate(self._phase_settings(tune), random, first, row, n)
+            done = self._iterate(self._phase_settings(tune), random, first, draws, row, n)
         if done < n and not self.control[PAUSE_REQUESTED]:
             self._raise_error()
             raise RuntimeError("the model's log-density raised an error that did not occur again")
@@ -111,10 +147,18 @@ class ChainArrays:
     def snapshot(self, begin: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Draws from an iteration on, and the state, as plain arrays for a checkpoint.
 
-        Rows that repeat the row before, as after a rejection, are stored once.
+        ``ends`` are the iterations after which the rows were as they are stored. Of a row that was
+        stored before it was full, the counts are those since then. Rows that repeat the row before,
+        as after a rejection, are stored once.
         """
-        rows = slice(begin, int(self.control[N_DONE]))
-        counts, numbers = self.draws.counts[rows], self.draws.numbers[rows]
+        done = int(self.control[N_DONE])
+        first, last = self.thinning.rows(np.array([begin, done - 1])).tolist()
+        rows = slice(first, last + 1)
+        counts, numbers = self.draws.counts[rows].copy(), self.draws.numbers[rows]
+        additive = np.ones(counts.shape[1], dtype=bool)
+        additive[[STAGE, FAILURE]] = False
+        counts[0, additive] -= self._saved_counts[additive]
+        ends = [self.thinning.n_iterations(row + 1) for row in range(first, last + 1)]
         changed = counts[:, STAGE] > 0
         changed[1:] |= numbers[1:, SCALING] != numbers[:-1, SCALING]
         changed[:1] = True
@@ -125,24 +169,37 @@ class ChainArrays:
             "positions": self.draws.positions[rows][changed],
             "numbers": numbers[changed],
             "seeds": self.draws.seeds[rows][changed],
+            "ends": np.minimum(ends, done),
             "covs": self.draws.covs[rows],
         }
+        self._note_saved()
         return draws, self.state._asdict()
 
     def restore(self, draws: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> None:
         """Continue from the concatenated snapshots of a checkpoint."""
-        done = len(draws["counts"])
         last_change = np.cumsum(draws["changed"]) - 1
-        for name in ("positions", "numbers", "seeds"):
-            getattr(self.draws, name)[:done] = draws[name][last_change]
-        self.draws.counts[:done] = draws["counts"]
-        self.draws.numbers[:done, ACCEPTANCE] = draws["acceptance"]
+        positions, numbers, seeds = (
+            draws[name][last_change] for name in ("positions", "numbers", "seeds")
+        )
+        numbers[:, ACCEPTANCE] = draws["acceptance"]
+        stored = Draws(positions, numbers, draws["counts"], seeds, self.draws.covs[:0])
+        add_iterations(self.draws, self.thinning.rows(draws["ends"] - 1), stored)
         self.draws.covs[: len(draws["covs"])] = draws["covs"]
         self.load_state(ChainState(**state))
-        self.control[N_DONE] = done
+        self.control[N_DONE] = draws["ends"][-1]
+        self._note_saved()
 
-    def _iterate(self, settings: PhaseSettings, random: Any, first: int, row: int, n: int) -> int:
-        """Make up to n iterations in machine code; the number made."""
+    def _note_saved(self) -> None:
+        """Note the counts of the row that is not full, all of which are stored."""
+        done = int(self.control[N_DONE])
+        full = self.thinning.n_rows(done)
+        is_full = self.thinning.n_iterations(full) == done
+        self._saved_counts[:] = 0 if is_full else self.draws.counts[full]
+
+    def _iterate(
+        self, settings: PhaseSettings, random: Any, first: int, draws: Draws, row: int, n: int
+    ) -> int:
+        """Make up to n iterations in machine code, recorded from a row; the number made."""
         raise NotImplementedError
 
     def _raise_error(self) -> None:

@@ -22,13 +22,14 @@ from ..kernel.state import (
     Draws,
     draw_key,
     draw_seeds,
-    has_moved,
+    n_accepted,
 )
 from ..output.likelihood_variance import N_SEEDS, N_STUCK, start_warning
 from ..target.record_target import RecordTarget
 from ..target.target import Target
 from .chain_arrays import StopRequested
 from .record_chain import chain_of
+from .thinned_draws import Thinning
 
 CHECKPOINT_SECONDS = 5.0
 
@@ -50,7 +51,9 @@ class ChainTask:
     seed : numpy.random.SeedSequence
         The chain's randomness.
     n_rows : int
-        Iterations that it may have after `extend`.
+        Draws, with those of the warm-up, that it may have after `extend`.
+    thin : int
+        Iterations after the warm-up of which one draw, the last, is kept.
     mixture : ndarray
         Packed, of the first proposals.
     population : ndarray, shape (m, d), optional
@@ -65,6 +68,8 @@ class ChainTask:
     keeps_warmup : bool
     measures_noise : bool
         Whether the variance of the estimated log-likelihood is measured at the start.
+    former : (ChainState, int), optional
+        The state of a chain that is to go on, and the number of its iterations.
     """
 
     def __init__(
@@ -77,6 +82,7 @@ class ChainTask:
         *,
         n_rows: int,
         mixture: np.ndarray,
+        thin: int = 1,
         population: np.ndarray | None = None,
         proposal_cov: np.ndarray | None = None,
         index: int = 0,
@@ -84,6 +90,7 @@ class ChainTask:
         checkpoint: Checkpoint | None = None,
         keeps_warmup: bool = False,
         measures_noise: bool = False,
+        former: tuple[ChainState, int] | None = None,
     ):
         self._tune, self._n_iterations = tune, n_iterations
         self._candidates, self._measures_noise = candidates, measures_noise
@@ -95,8 +102,14 @@ class ChainTask:
         n_covs = tune if keeps_warmup else 0
         # Pages of these arrays that are never written to take no memory.
         self._target = target
-        self.chain = chain_of(target, draw_key(self._rng), n_rows, n_covs, proposal_cov)
+        self.chain = chain_of(
+            target, draw_key(self._rng), n_rows, n_covs, proposal_cov, Thinning(tune, thin)
+        )
         self.chain.state.mixture[:] = mixture
+        self._first, self._goes_on = 0, former is not None
+        if former is not None:
+            state, self._first = former
+            self.chain.load_state(state)
         self._log = None if checkpoint is None else checkpoint.journal(index)
         if self._log is not None and (stored := self._log.read()) is not None:
             self.chain.restore(*stored)
@@ -114,13 +127,21 @@ class ChainTask:
     @property
     def positions(self) -> np.ndarray:
         """Draws made so far, after the warm-up, shape (n, d)."""
-        return self.chain.draws.positions[self._tune : min(self.n_done, self._n_iterations)]
+        return self.chain.draws.positions[self._tune : self._n_rows]
 
-    def extend(self, n_iterations: int, mixture: np.ndarray) -> None:
+    @property
+    def _n_rows(self) -> int:
+        """Draws of the iterations made so far, with those of the warm-up."""
+        return self.chain.thinning.n_rows(min(self.n_done, self._n_iterations))
+
+    def extend(self, n_iterations: int, thin: int, mixture: np.ndarray) -> None:
         """Let the chain, which has ended, run again, until it has made so many iterations.
 
-        A chain from a checkpoint that is further has this mixture, or a later one.
+        Of more of them, one is kept from now on. A chain from a checkpoint that is further has this
+        mixture, or a later one.
         """
+        if thin > self.chain.thinning.every:
+            self.chain.coarsen(thin)
         if self.n_done == self._n_iterations:
             self.chain.state.mixture[:] = mixture
         self._n_iterations = n_iterations
@@ -134,7 +155,7 @@ class ChainTask:
         """Run to the end, or until the event is set."""
         began = time.monotonic()
         try:
-            failures = () if self.n_done > 0 else self._start()
+            failures = () if self._goes_on or self.n_done > 0 else self._start()
             while self.n_done < self._n_iterations and not stop.is_set():
                 self.chain.control[PAUSE_REQUESTED] = 0  # the main thread repeats its request
                 self._advance()
@@ -157,9 +178,8 @@ class ChainTask:
 
         A chain from a checkpoint may be longer than it has to be so far: it is cut.
         """
-        done = min(self.n_done, self._n_iterations)
         draws = {
-            name: array if name == "covs" else array[:done]
+            name: array if name == "covs" else array[: self._n_rows]
             for name, array in self.chain.draws._asdict().items()
         }
         state = self.chain.state._replace(carried=np.empty(0))  # as long as the record
@@ -167,11 +187,13 @@ class ChainTask:
 
     def progress(self) -> dict[str, float]:
         """Statistics for a progress bar, after at least one iteration."""
-        draws, done = self.chain.draws, self.n_done
-        begin = self._tune if done > self._tune else 0
+        draws, thinning = self.chain.draws, self.chain.thinning
+        end = thinning.n_rows(self.n_done)
+        begin = self._tune if end > self._tune else 0
+        n = thinning.n_iterations(end) - begin
         return {
-            "accept_rate": float(np.mean(has_moved(draws.counts[begin:done]))),
-            "n_failed": int(draws.counts[done - 1, N_FAILED]),
+            "accept_rate": float(n_accepted(draws.counts[begin:end]).mean(axis=1).sum() / n),
+            "n_failed": int(draws.counts[end - 1, N_FAILED]),
         }
 
     def _start(self) -> tuple[int, ...]:
@@ -195,8 +217,11 @@ class ChainTask:
         """Advance to the end of the block of random numbers, or of the phase."""
         done = self.n_done
         tune = done < self._tune
-        end = min(self._tune, self._n_iterations) if tune else self._n_iterations
-        self.chain.advance(tune, done, done, end - done)
+        if tune:
+            end = min(self._tune, self._n_iterations)
+            self.chain.advance(tune, done, done, end - done)
+        else:
+            self.chain.advance_thinned(self._first + done, self._n_iterations - done)
 
     def _must_save(self) -> bool:
         due = time.monotonic() - self._saved_at >= CHECKPOINT_SECONDS

@@ -37,7 +37,7 @@ _SEED_ADVICE = (
     ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
     "made of the same seed and have drawn as much"
 )
-_PILOT_ADVICE = ', and the same pilot, which gather="all" gives to all ranks'
+_PILOT_ADVICE = ', and the same pilot, which psf.Ranks(gather="all") gives to all ranks'
 
 
 def sample_models(
@@ -52,11 +52,12 @@ def sample_models(
     for each model, or none. Errors are those of ``sample_dram``.
     """
     options.check()
-    with communicator_of(options.comm, in_lockstep=options.ranks_per_chain > 1) as comm:
+    ranks = options.ranks
+    with communicator_of(ranks.comm, in_lockstep=ranks.per_chain > 1) as comm:
         if comm.size > 1:
             _check_agreement(comm, models, requests, options, bool(checkpoints))
         entropy = comm.broadcast(requests[0].entropy)
-        group, leaders = comm.groups(_group_size(options.ranks_per_chain, comm.size))
+        group, leaders = comm.groups(_group_size(ranks.per_chain, comm.size))
         trees = None
         with group:
             if leaders is None:
@@ -68,7 +69,7 @@ def sample_models(
                         for (name, model), request in zip(models.items(), requests, strict=True)
                     ]
                     trees = _run(tasks, leaders, options, checkpoints)
-        if options.gather == "all":
+        if ranks.gather == "all":
             trees = comm.broadcast(trees)
     return trees
 
@@ -120,7 +121,7 @@ def _run(
                 for task in kept
             }
 
-    return comm.run_collectively(trees) if options.gather == "all" else trees()
+    return comm.run_collectively(trees) if options.ranks.gather == "all" else trees()
 
 
 def _prepare(tasks: Sequence[ModelTask]) -> None:
@@ -138,15 +139,15 @@ def _find_populations(tasks: Sequence[ModelTask], comm: Communicator, *, progres
 
     found = comm.broadcast(comm.run_collectively(find))
     for task, population in zip(tasks, found, strict=True):
-        task.population = population
+        task.set_population(population)
 
 
-def _group_size(ranks_per_chain: int, n_ranks: int) -> int:
-    """Number of ranks in a group: ``ranks_per_chain``, or all of them if there are fewer."""
-    size = min(ranks_per_chain, n_ranks)
+def _group_size(per_chain: int, n_ranks: int) -> int:
+    """Number of ranks in a group: ``per_chain``, or all of them if there are fewer."""
+    size = min(per_chain, n_ranks)
     if n_ranks % size:
         raise ModelError(
-            f"ranks_per_chain must divide the number of ranks, got ranks_per_chain={size} with "
+            f"per_chain of Ranks must divide the number of ranks, got per_chain={size} with "
             f"{n_ranks} ranks"
         )
     return size
@@ -164,11 +165,7 @@ def _check_agreement(
     def keys() -> list[dict]:
         return [
             {"models": list(models)},
-            {
-                "ranks_per_chain": options.ranks_per_chain,
-                "gather": options.gather,
-                "checkpoint": has_checkpoint,
-            },
+            {**options.ranks.settings, "checkpoint": has_checkpoint},
             *(
                 request.cache_key(model, require_fingerprint=False)
                 for model, request in zip(models.values(), requests, strict=True)
@@ -211,3 +208,6 @@ def _open_checkpoints(
                 task.checkpoint = stack.enter_context(join_checkpoint(ticket))
 
     comm.run_collectively(partial(join_all, comm.broadcast(comm.run_collectively(open_all))))
+    lengths = comm.run_collectively(lambda: [t.stored_length() for t in tasks if comm.rank == 0])
+    for task, length in zip(tasks, comm.broadcast(lengths), strict=True):
+        task.set_length(length)

@@ -4,16 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import (
-    SamplerWarning,
-    WarningType,
-    log_warnings,
-    run_convergence_checks,
-)
+from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 from xarray import DataTree
 
 from ...parallel.communicator import Communicator
@@ -24,17 +19,39 @@ from ..output.convergence import Convergence, convergence
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.likelihood_variance import is_measured, spread_at_highest_draw
-from ..output.report import closing_report, left_out_warnings, until_ess_warning
+from ..output.remedies import ways_to_mix
+from ..output.report import (
+    below_known_warning,
+    closing_report,
+    left_out_warnings,
+    mixing_warning,
+    until_ess_warning,
+)
 from ..output.sample_stats import stat_dims, whole_chain
-from ..output.warnings import PhaseStatistics, chain_warnings, lower_chains_of
+from ..output.warnings import (
+    LOWER,
+    STANDSTILL,
+    PhaseStatistics,
+    below_known,
+    chain_warnings,
+)
 from ..target.initial_points import chain_candidates
 from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chain_task import ChainTask
-from .population_search import WarmUp, search_population, searched_cov, stops_of
+from .continuation import GROUP, stored_states
+from .population_search import (
+    SearchedPoints,
+    WarmUp,
+    search_population,
+    searched_cov,
+    stops_of,
+)
 from .record_chain import chain_of
 from .request import SamplingRequest
+from .stopping import Length, first_length, is_enough, next_length, remedy_of
+from .thinned_draws import Thinning
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
@@ -74,9 +91,11 @@ class ModelTask:
         self._group = group
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
+        self._highest = -np.inf  # log-density that the search for starts has met
         self._given = target
         self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
+        self.length = first_length(request)  # after the warm-up
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the lengths of the chains that they are of.
         self._convergence: tuple[list[int], Convergence | None] = [], None
@@ -125,7 +144,9 @@ class ModelTask:
             self.n_iterations,
             self._candidates[index],
             self._seeds[index],
-            n_rows=request.tune + (request.max_draws or request.draws),
+            n_rows=request.tune + self._most_draws,
+            thin=self.thin,
+            former=request.former and (request.former.states[index], request.former.iterations),
             index=index,
             name=f"chain {index} of model {self.name!r}" if self.name else None,
             checkpoint=self.checkpoint,
@@ -136,7 +157,7 @@ class ModelTask:
             mixture=self.mixture,
         )
 
-    def find_population(self, *, progressbar: bool) -> np.ndarray | None:
+    def find_population(self, *, progressbar: bool) -> SearchedPoints | None:
         """Points of the posterior, found once for all chains; None if starts are given otherwise.
 
         None, too, if every record finds its own start, see `RecordChain.start`.
@@ -181,25 +202,68 @@ class ModelTask:
     def is_complete(self) -> bool:
         """Whether all chains have made ``n_iterations``."""
         lengths = [len(draws.positions) for draws, _ in self._results.values()]
-        return lengths == [self.n_iterations] * self.request.chains
+        n_rows = Thinning(self.request.tune, self.thin).n_rows(self.n_iterations)
+        return lengths == [n_rows] * self.request.chains
 
     def extend(self) -> bool:
         """Raise ``n_iterations`` if complete chains are to go on: after a part of the warm-up.
 
-        Or by half the draws, if the effective sample size is too small.
+        Or to the next length, if the effective sample size is too small.
         """
-        request = self.request
-        if self.n_iterations < request.n_iterations:
-            chains = [self._results[i][0] for i in range(request.chains)]
-            self.n_iterations = self._warm_up.end_part(chains, self.n_iterations)
+        tune = self.request.tune
+        if self.n_iterations < tune or (self.n_iterations == tune and self.length.draws):
+            chains = [self._results[i][0] for i in range(self.request.chains)]
+            end = self._warm_up.end_part(chains, self.n_iterations)
+            self.n_iterations = end if end <= tune else tune + self.length.n_iterations
             return True
-        if request.until_ess is None or request.max_draws is None:
+        if self.request.until_ess is None:
             return False
-        found, draws = self.convergence(), self.n_iterations - request.tune
-        if draws >= request.max_draws or (found is not None and found.reaches(request.until_ess)):
+        longer = next_length(self.request, self.length, self.convergence(), self._seconds)
+        if longer is None:
             return False
-        self.n_iterations = request.tune + min(request.max_draws, draws + (draws + 1) // 2)
+        if longer.thin > self.length.thin:
+            self._results.clear()  # they are as long as what follows them
+        self.length, self.n_iterations = longer, tune + longer.n_iterations
+        self._store_length()
         return True
+
+    def set_population(self, found: SearchedPoints | None) -> None:
+        """Set what the search for starts has found."""
+        if found is not None:
+            self.population, self._highest = found
+
+    def set_length(self, length: Length) -> None:
+        """Set the length after which chains end, before any has begun."""
+        self.length = length
+        if self.request.tune == 0:
+            self.n_iterations = length.n_iterations
+
+    @property
+    def thin(self) -> int:
+        """Iterations of which one draw is kept."""
+        return self.length.thin
+
+    @property
+    def _most_draws(self) -> int:
+        """Draws that a chain may have after its warm-up."""
+        request = self.request
+        return request.draws if request.doubles_thin else request.max_draws or request.draws
+
+    @property
+    def _seconds(self) -> float:
+        return self._ended - self._began
+
+    def stored_length(self) -> Length:
+        """The length to which the chains of the checkpoint were to go on, if there is one."""
+        stored = None
+        if self.checkpoint is not None and self.request.doubles_thin:
+            stored = self.checkpoint.journal("length").read()
+        return self.length if stored is None else Length(*stored.draws["length"][-1].tolist())
+
+    def _store_length(self) -> None:
+        """Store the length in the checkpoint: coarser draws do not show why they went on."""
+        if self.checkpoint is not None and self.request.doubles_thin:
+            self.checkpoint.journal("length").append({"length": np.array([self.length])}, {})
 
     @property
     def mixture(self) -> np.ndarray:
@@ -229,6 +293,9 @@ class ModelTask:
         tune = self.request.tune
         positions = {i: draws.positions[tune:] for i, (draws, _) in self._results.items()}
         positions |= {i: chain.positions for i, chain in running.items()}
+        if self.request.former is not None:
+            before = self.request.former.positions
+            positions = {i: np.concatenate([before[i], new]) for i, new in positions.items()}
         return [positions[i] for i in sorted(positions)]
 
     def load_missing_results(self) -> None:
@@ -258,23 +325,24 @@ class ModelTask:
         times.
         """
         target, request = self.prepare(), self.request
-        closing = self._closing_messages(check_convergence, report_level)
-        closing += left_out_warnings(self._lengths, self._n_skipped)
+        report, mixing = self._closing_messages(check_convergence)
+        closing = left_out_warnings(self._lengths, self._n_skipped)
+        states = self._stored_states()
         results = [self._results.pop(index) for index in range(self.request.chains)]
-        warnings = chain_warnings(target, results, request.tune)
+        warnings = chain_warnings(target, results, request.tune, self.thin)
         attrs, noise_warnings = self._measure_noise(target, results)
+        unreached = self._unreached_warnings(target, [draws for draws, _ in results])
         key = results[0][1].key
-        warnings += noise_warnings
         chains = []
         while results:
-            chains.append(whole_chain(target, *results.pop(0), request.tune))
+            chains.append(whole_chain(target, *results.pop(0), request.tune, self.thin))
         tree = to_datatree(
             self.model,
             target.raveled,
             chains,
             tune=request.tune,
             keep_warmup=request.keeps_warmup,
-            sampling_time=self._ended - self._began,
+            sampling_time=self._seconds,
             stat_dims=stat_dims(target),
         )
         tree.attrs |= {
@@ -282,55 +350,93 @@ class ModelTask:
             "exact": int(target.exact),
             "refresh_noise": int(request.settings.refresh_noise),
             "correlation": request.settings.correlation or 0.0,
+            "iterations_per_draw": self.thin,
             **attrs,
         }
-        if check_convergence and "posterior" in tree:
-            with (
-                suppress(KeyboardInterrupt),  # the draws are kept if the user does not wait
-                np.errstate(invalid="ignore", divide="ignore"),  # chains that never moved
-            ):
-                warnings += run_convergence_checks(tree, self.model)
+        if states is not None:
+            tree[GROUP] = states
         check = self._check_filters(tree, key) if check_convergence else FilterCheck()
-        warnings += [*closing, *check.messages(report_level)]
-        log_warnings([replace(w, message=self._said(w.message)) for w in warnings])
+        noise_warnings += unreached
+        if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it
+            noise_warnings += mixing
+        said = [*warnings.values(), *noise_warnings, *closing]
+        if not said and not check.warned and check_convergence:
+            report += " No problems found."
+        said += [SamplerWarning(WarningType.CONVERGENCE, report, report_level)] if report else []
+        said += check.messages(report_level)
+        log_warnings([replace(w, message=self._said(w.message)) for w in said])
         warn_of_filters([self._said(text) for text in check.warned])
         return tree
+
+    def _stored_states(self) -> DataTree | None:
+        """The states from which complete chains can go on."""
+        request, former = self.request, self.request.former
+        if not self.is_complete or self.n_iterations <= request.tune:
+            return None
+        return stored_states(
+            self.model,
+            [self._results[i][1] for i in range(request.chains)],
+            iterations=self.n_iterations + (0 if former is None else former.iterations),
+            thin=self.thin,
+            settings=request.settings,
+        )
 
     def _check_filters(self, tree: DataTree, key: np.ndarray) -> FilterCheck:
         """Compare the filters with unbiased ones at some draws."""
         if "posterior" in tree:
             with suppress(KeyboardInterrupt):
                 rng = side_generator(key, 2)
-                seconds = self._ended - self._began
-                return check_filters(tree, self.model, self.n_iterations, seconds, rng)
+                return check_filters(tree, self.model, self.n_iterations, self._seconds, rng)
         return FilterCheck()
 
     def _said(self, message: str) -> str:
         """A message about this model, with its name if there are several."""
         return f"Model {self.name!r}: {message}" if self.name else message
 
-    def _closing_messages(self, check_convergence: bool, report_level: str) -> list[SamplerWarning]:
-        """The report, and a warning if ``max_draws`` ended the run."""
+    def _closing_messages(self, check_convergence: bool) -> tuple[str, list[SamplerWarning]]:
+        """The report, empty without draws, and a warning if the chains have not mixed."""
         request, names = self.request, element_names(self.model, self.prepare().raveled.variables)
         draws = [self._results[i][0] for i in range(request.chains)]
         statistics = {
-            i: PhaseStatistics.from_draws(of_chain, request.tune, len(of_chain.positions))
+            i: PhaseStatistics.from_draws(
+                of_chain, request.tune, len(of_chain.positions), self.thin
+            )
             for i, of_chain in enumerate(draws)
             if len(of_chain.positions) > request.tune
         }
         if not statistics:
-            return []
-        found, until_ess, messages = None, request.until_ess, []
+            return "", []
+        found = None
         with suppress(KeyboardInterrupt):
-            if check_convergence or until_ess is not None:
+            if check_convergence or request.until_ess is not None:
                 found = self.convergence()
-        n_draws = self.n_iterations - request.tune
-        if until_ess is not None and self.is_complete and n_draws == request.max_draws:
-            if found is None or not found.reaches(until_ess):
-                messages.append(until_ess_warning(until_ess, n_draws, found, names))
-        lower = lower_chains_of(draws, request.tune)
-        text = closing_report(statistics, request.tune, lower, found, names, until_ess)
-        return [*messages, SamplerWarning(WarningType.CONVERGENCE, text, report_level)]
+        report = closing_report(statistics, request.tune, found, names, self.thin)
+        return report, self._mixing_warnings(check_convergence, found, names)
+
+    def _mixing_warnings(
+        self, check_convergence: bool, found: Convergence | None, names: Sequence[str]
+    ) -> list[SamplerWarning]:
+        """Warn of chains that ended too early, or have not mixed."""
+        request, n = self.request, self.length.n_iterations
+        until_ess, ways = request.until_ess, partial(ways_to_mix, self.model)
+        if until_ess is not None and self.is_complete and not is_enough(request, found):
+            slowest = names[0] if found is None else names[int(found.rhat.argmax())]
+            remedy = remedy_of(request, self.length, ways(slowest))
+            return [until_ess_warning(until_ess, n, self._seconds, found, names, remedy)]
+        if not check_convergence:
+            return []
+        warning = mixing_warning(found, names, request.chains, n, self._seconds, ways)
+        return [] if warning is None else [warning]
+
+    def _unreached_warnings(
+        self, target: Target | RecordTarget, chains: Sequence[Draws]
+    ) -> list[SamplerWarning]:
+        """Warn if all chains stayed far below points that the search for starts has met.
+
+        An estimate may be far too high by chance, so that this says nothing of one with noise.
+        """
+        nats = below_known(self._highest, chains, self.request.tune)
+        return [] if nats is None or target.seed_names else [below_known_warning(nats)]
 
     def _measure_noise(
         self, target: Target | RecordTarget, results: Sequence[tuple[Draws, ChainState]]
@@ -338,7 +444,7 @@ class ModelTask:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request = self.request
         lengths = {len(draws.positions) for draws, _ in results}
-        if self._measures_noise and lengths == {max(self.n_iterations, request.n_iterations)}:
+        if self._measures_noise and lengths == {request.tune + self.length.draws}:
             with suppress(KeyboardInterrupt):
                 keys = [state.key for _, state in results]
                 spread, warning = spread_at_highest_draw(

@@ -1,6 +1,7 @@
 """The search for starts of a model's chains, and the mixture of proposals that they share."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pymc.model import Model
@@ -87,6 +88,13 @@ class WarmUp:
         return min(stop for stop in stops if stop > end)
 
 
+class SearchedPoints(NamedTuple):
+    """Points of the posterior (m, d), and the highest log-density among them, if it is known."""
+
+    x: np.ndarray
+    highest: float = -np.inf
+
+
 def search_population(
     model: Model,
     target: Target,
@@ -95,7 +103,7 @@ def search_population(
     said: Callable[[str], str],
     *,
     progressbar: bool,
-) -> np.ndarray | None:
+) -> SearchedPoints | None:
     """Points of the posterior, stored in the checkpoint; None if starts are given otherwise.
 
     None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
@@ -108,7 +116,7 @@ def search_population(
     """
     pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
     if pilot is not None and np.isfinite(pilot).all():
-        return pilot
+        return SearchedPoints(pilot)
     n_points = n_search_points(request, target)
     if (
         n_points == 0
@@ -121,7 +129,7 @@ def search_population(
         return None
     journal = None if checkpoint is None else checkpoint.journal("starts")
     if journal is not None and (stored := journal.read()) is not None:
-        return stored.draws["population"]
+        return SearchedPoints(stored.draws["population"], float(stored.state["highest"]))
     try:
         found = find_population(
             target,
@@ -135,9 +143,10 @@ def search_population(
         raise
     if (message := modes_message(model, target.raveled, found)) is not None:
         log_warnings([modes_warning(said(message))])
+    highest = float(found.log_density.max())
     if journal is not None:
-        journal.append({"population": found.x}, {})
-    return found.x
+        journal.append({"population": found.x}, {"highest": np.array(highest)})
+    return SearchedPoints(found.x, highest)
 
 
 def n_search_points(request: SamplingRequest, target: Target) -> int:

@@ -20,6 +20,7 @@ from ..kernel.state import (
     N_COMMON_BLOCKS,
     N_EFFECTIVE,
     ChainState,
+    Draws,
     PhaseSettings,
     draw_seeds,
 )
@@ -29,6 +30,7 @@ from ..target.record_target import RecordTarget
 from ..target.target import Target
 from .chain import Chain
 from .chain_arrays import ChainArrays
+from .thinned_draws import Thinning
 
 # Draws of the prior of which each record starts at the likeliest.
 N_TRIED = 50
@@ -57,12 +59,20 @@ class RecordChain(ChainArrays):
     key : ndarray of uint64, shape (2,)
         Key of the chain's random numbers.
     n_rows : int
-        Iterations whose draws are kept.
+        Draws that are kept.
+    thinning : Thinning, optional
+        Which iterations are kept. Default: all.
     """
 
     _target: RecordTarget
 
-    def __init__(self, target: RecordTarget, key: np.ndarray, n_rows: int):
+    def __init__(
+        self,
+        target: RecordTarget,
+        key: np.ndarray,
+        n_rows: int,
+        thinning: Thinning | None = None,
+    ):
         self._densities = target.densities.bind()
         layout, dim = target.layout, target.raveled.dim
         numbers = np.zeros(FIRST_ESTIMATE + layout.n_records + 1)
@@ -77,7 +87,7 @@ class RecordChain(ChainArrays):
             np.array(key),
         )
         n_counts = FIRST_ACCEPTED + layout.n_records + N_COMMON_BLOCKS
-        super().__init__(target, state, n_rows, n_counts, np.empty((0, dim, dim)))
+        super().__init__(target, state, n_rows, n_counts, np.empty((0, dim, dim)), thinning)
 
     def start(
         self,
@@ -170,7 +180,13 @@ class RecordChain(ChainArrays):
         return spreads[widest]._replace(of=of)
 
     def _iterate(
-        self, settings: PhaseSettings, random: RecordRandomBlock, first: int, row: int, n: int
+        self,
+        settings: PhaseSettings,
+        random: RecordRandomBlock,
+        first: int,
+        draws: Draws,
+        row: int,
+        n: int,
     ) -> int:
         return advance_records(
             settings,
@@ -179,7 +195,7 @@ class RecordChain(ChainArrays):
             self.state,
             random,
             first,
-            self.draws,
+            draws,
             row,
             n,
             self.control,
@@ -207,8 +223,9 @@ def chain_of(
     n_rows: int,
     n_covs: int,
     proposal_cov: np.ndarray | None = None,
+    thinning: Thinning | None = None,
 ) -> Chain | RecordChain:
     """The chain of a target, with arguments as of `Chain`."""
     if isinstance(target, RecordTarget):
-        return RecordChain(target, key, n_rows)
-    return Chain(target, key, n_rows, n_covs, proposal_cov)
+        return RecordChain(target, key, n_rows, thinning)
+    return Chain(target, key, n_rows, n_covs, proposal_cov, thinning)

@@ -4,8 +4,9 @@
 threads, ranks and output, on which they do not depend.
 """
 
+import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -16,9 +17,10 @@ from pytensor.graph.basic import Variable
 from ...errors import ModelError
 from ...system.checks import check_count, check_flag, check_positive, is_integer
 from ..checkpoint.manifest import model_data_fingerprint, model_fingerprint
-from ..target.settings import DRAMSettings
+from ..target.settings import RandomWalkSettings
+from .continuation import FormerChains
+from .ranks import Ranks
 
-_GATHER = ("root", "all")
 _MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory
 _MAX_GROWTH = 20  # default of max_draws, in draws
 _FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
@@ -38,16 +40,21 @@ class SamplingRequest(NamedTuple):
     initvals: Any
     keeps_warmup: bool
     proposal_cov: Any
-    settings: DRAMSettings
+    settings: RandomWalkSettings
     until_ess: float | None = None
     max_draws: int | None = None  # a number if until_ess is
     # Draws of a pilot on the unconstrained space, by rows; None for what it lacks.
     pilot: list[list[float | None]] | None = None
+    thin: int = 1  # iterations of which a draw is the last
+    # With until_ess: whether thin is doubled, until max_draws iterations, and not more draws made.
+    doubles_thin: bool = False
+    seconds: float = math.inf  # that doubling may take
+    former: FormerChains | None = None  # that are to go on
 
     @property
     def n_iterations(self) -> int:
         """Iterations of a chain, warm-up included; the fewest with ``until_ess``."""
-        return self.tune + self.draws
+        return self.tune + self.draws * self.thin
 
     def cache_key(self, model: Model, *, require_fingerprint: bool = True) -> dict[str, Any]:
         """Give all that a model's draws depend on, as values of JSON.
@@ -67,15 +74,18 @@ class SamplingRequest(NamedTuple):
         return {
             "random_seed": self.entropy if self.is_seeded else None,
             "initvals": _json_value(self.initvals),
-            "proposal_cov": _json_value(self.proposal_cov),
             "pilot": self.pilot,
             "draws": int(self.draws),
             "until_ess": self.until_ess,
             "max_draws": self.max_draws,
+            "thin": int(self.thin),
+            "doubles_thin": self.doubles_thin,
+            "continue_from": None if self.former is None else self.former.digest(),
             "tune": int(self.tune),
             "chains": int(self.chains),
             "discard_tuned_samples": not self.keeps_warmup,
             **{f.name: repr(getattr(self.settings, f.name)) for f in fields(self.settings)},
+            "proposal_cov": _json_value(self.proposal_cov),
             "model": fingerprint[:_FINGERPRINT_DIGITS],
             "data": model_data_fingerprint(model)[:_FINGERPRINT_DIGITS],
             "version": version("pymc-statespace-filters"),
@@ -88,9 +98,7 @@ class ExecutionOptions(NamedTuple):
     cores: int | None
     progressbar: bool | str
     compute_convergence_checks: bool
-    comm: Any
-    ranks_per_chain: int
-    gather: str
+    ranks: Ranks
 
     def check(self) -> None:
         """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""
@@ -99,15 +107,8 @@ class ExecutionOptions(NamedTuple):
                 f"progressbar must be True, False or a bar of pm.sample, got {self.progressbar!r}"
             )
         check_flag("compute_convergence_checks", self.compute_convergence_checks)
-        if not isinstance(self.gather, str) or self.gather not in _GATHER:
-            raise ModelError(f"gather must be one of {_GATHER}, got {self.gather!r}")
         if self.cores is not None and (not is_integer(self.cores) or self.cores < 1):
             raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
-        if check_count("ranks_per_chain", self.ranks_per_chain, 1) > 1 and self.comm is None:
-            raise ModelError(
-                f"ranks_per_chain={self.ranks_per_chain} needs comm, got None: comm='world' gives "
-                "the ranks that mpiexec started"
-            )
 
 
 def sampling_request(
@@ -119,7 +120,8 @@ def sampling_request(
     keeps_warmup: bool,
     until_ess: Any,
     max_draws: Any,
-    dram_settings: Mapping[str, Any],
+    kernel: RandomWalkSettings | None,
+    thin: int = 1,
 ) -> SamplingRequest:
     """Check the arguments of ``sample_dram`` that need no model, and make a request of them.
 
@@ -127,20 +129,22 @@ def sampling_request(
     ------
     ModelError
         If an argument is not as ``sample_dram`` describes it.
-    TypeError
-        If a setting has an unknown name.
     """
     check_count("draws", draws, 0, _MOST_ITERATIONS)
     check_count("tune", tune, 0, _MOST_ITERATIONS)
     check_count("chains", chains, 1, _MOST_CHAINS)
+    check_count("thin", thin, 1, _MOST_ITERATIONS)
     if draws + tune * keeps_warmup == 0:
         raise ModelError(
             f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, tune={tune}, "
             f"discard_tuned_samples={not keeps_warmup}; for the warm-up alone give "
             "discard_tuned_samples=False"
         )
-    settings = dict(dram_settings)
-    proposal_cov = settings.pop("proposal_cov", None)
+    if kernel is None:
+        kernel = RandomWalkSettings()
+    if not isinstance(kernel, RandomWalkSettings):
+        raise ModelError(f"kernel must be psf.RandomWalkSettings(...), got {kernel!r}")
+    enough, most = _stopping_rule(draws, until_ess, max_draws)
     return SamplingRequest(
         draws,
         tune,
@@ -149,9 +153,11 @@ def sampling_request(
         random_seed is not None,
         initvals,
         keeps_warmup,
-        proposal_cov,
-        DRAMSettings.from_arguments(settings),
-        *_stopping_rule(draws, until_ess, max_draws),
+        kernel.proposal_cov,
+        replace(kernel, proposal_cov=None),
+        until_ess=enough,
+        max_draws=most,
+        thin=int(thin),
     )
 
 

@@ -150,7 +150,7 @@ class _Manager:
 
     def _go_on_or_end(self, model: int, task: ModelTask) -> None:
         """Let all chains of a model make more draws, or none of them."""
-        goal = (task.n_iterations, task.mixture) if task.extend() else None
+        goal = (task.n_iterations, task.thin, task.mixture) if task.extend() else None
         if goal is None:
             self._n_unfinished -= self._n_per_model
         for number in range(model * self._n_per_model, (model + 1) * self._n_per_model):

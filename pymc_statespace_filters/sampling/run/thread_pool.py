@@ -47,10 +47,10 @@ class ChainPool:
         self.running[number] = task
         self._futures[self._pool.submit(task.run, self._stop)] = number
 
-    def go_on(self, number: int, goal: tuple[int, np.ndarray] | None) -> None:
+    def go_on(self, number: int, goal: tuple[int, int, np.ndarray] | None) -> None:
         """Run an ended chain again, as soon as a thread is idle; with None release it.
 
-        The goal has the number of iterations, and the packed mixture of the proposals.
+        The goal is as the arguments of `ChainTask.extend`.
         """
         task = self.ended.pop(number)
         if goal is not None:

@@ -15,6 +15,7 @@ from pymc.model import Model
 
 from ...errors import DataMismatchError, ModelError
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from ..target.settings import RandomWalkSettings
 from ..target.variables import continuous_value_vars
 from .request import SamplingRequest
 
@@ -26,14 +27,12 @@ LEAST_RATIO, LARGEST_RATIO = 1e-3, 4.0
 MOST_KEPT = 500  # draws, for the first mixture of the proposals
 
 
-def warm_started(
-    request: SamplingRequest, model: Model, pilot: Any, *, adapts: bool
-) -> SamplingRequest:
+def warm_started(request: SamplingRequest, model: Model, pilot: Any) -> SamplingRequest:
     """Start chains at draws of a pilot, with proposals from its chains or its draws.
 
-    The warm-up, which may be short, changes the proposal covariance only if ``adapts``. A pilot
-    that lacks variables of the model determines neither starts nor covariance, only the population
-    from which they are found.
+    The warm-up, which may be short, changes the proposal covariance only if the user has chosen
+    how. A pilot that lacks variables of the model determines neither starts nor covariance, only
+    the population from which they are found.
 
     Raises
     ------
@@ -64,8 +63,14 @@ def warm_started(
     return request._replace(
         initvals=_starts(posterior, names, request.chains),
         proposal_cov=_rounded(np.mean(adapted or [cov], axis=0)),
-        settings=request.settings if adapts else without_adaptation,
+        settings=request.settings if _is_chosen(request.settings) else without_adaptation,
     )
+
+
+def _is_chosen(settings: RandomWalkSettings) -> bool:
+    """Whether the user has said how the covariance is to be adapted."""
+    default = RandomWalkSettings()
+    return (settings.adaptation, settings.adapt_every) != (default.adaptation, default.adapt_every)
 
 
 def _shared_names(posterior: xr.Dataset, model: Model) -> list[str]:
@@ -98,7 +103,7 @@ def _rows(draws: np.ndarray, shared: list[str], model: Model) -> list[list[float
 
 
 def warm_started_models(
-    request: SamplingRequest, models: Mapping[str, Model], pilot: Any, *, adapts: bool
+    request: SamplingRequest, models: Mapping[str, Model], pilot: Any
 ) -> list[SamplingRequest]:
     """The requests of several models: a pilot for each name, or one for all that share variables.
 
@@ -133,7 +138,7 @@ def warm_started_models(
         try:
             started = request
             if name in pilots:
-                started = warm_started(request, model, pilots[name], adapts=adapts)
+                started = warm_started(request, model, pilots[name])
         except (ModelError, DataMismatchError) as error:
             raise type(error)(f"models[{name!r}]: {error}") from None
         requests.append(started)
@@ -171,9 +176,11 @@ def _adapted_covs(pilot: xr.DataTree, dim: int) -> list[np.ndarray]:
     if "proposal_cov" not in stats:
         return []
     proposed = stats["proposal_cov"]
-    if not {"chain", "draw"} <= set(proposed.dims):
+    if "chain" not in proposed.dims:
         return []
-    last = proposed.isel(draw=-1).transpose("chain", ...).values
+    if "draw" in proposed.dims:  # as of pm.sample
+        proposed = proposed.isel(draw=-1)
+    last = proposed.transpose("chain", ...).values
     return list(last) if last.shape[1:] == (dim, dim) else []
 
 

@@ -24,7 +24,7 @@ from ...pymc_model.prior import can_sample
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ..kernel.state import draw_seeds
 from ..target.initial_points import N_DRAWS
-from ..target.settings import DRAMSettings
+from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
 from .annealing import Population, anneal
@@ -64,7 +64,7 @@ def population_of(
             f"the prior of {', '.join(improper)} is improper and cannot be sampled: "
             "give it a proper prior"
         )
-    target = Target(model, None, DRAMSettings())
+    target = Target(model, None, RandomWalkSettings())
     target.prepare()
     return find_population(target, rng, progressbar=progressbar), target.raveled
 

@@ -21,7 +21,7 @@ from ...ops.distributed import PythonCallback, check_ranks, distributed_evaluato
 from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, Message, describe_error
 from ...parallel.signals import deferred_interrupts, held_interrupts, ignored_interrupts
 from ...pymc_model.inspection import noisy_filters, panel_variables
-from .settings import DRAMSettings
+from .settings import RandomWalkSettings
 
 # Messages of the leader: a likelihood with its record, an evaluation of it, the end.
 _RECORD, _EVALUATE, _END = "record", "evaluate", "end"
@@ -47,7 +47,7 @@ class _RecordArrays(NamedTuple):
     t0: float
 
 
-def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
+def check_group(model: Model, settings: RandomWalkSettings, n_ranks: int) -> None:
     """Check that several ranks can evaluate a model's likelihoods together.
 
     Raises
@@ -58,19 +58,19 @@ def check_group(model: Model, settings: DRAMSettings, n_ranks: int) -> None:
     """
     if settings.correlation is not None:
         raise ModelError(
-            f"ranks_per_chain must be 1 with correlation={settings.correlation!r}, got {n_ranks}: "
-            "correlated noise is carried by one rank"
+            f"per_chain of psf.Ranks must be 1 with correlation={settings.correlation!r}, got "
+            f"{n_ranks}: correlated noise is carried by one rank"
         )
     filters = noisy_filters(model)
     if not filters:
         raise ModelError(
-            "ranks_per_chain must be 1 for a model without a StateSpace variable whose filter has "
-            f"particles, got {n_ranks}"
+            "per_chain of psf.Ranks must be 1 for a model without a StateSpace variable whose "
+            f"filter has particles, got {n_ranks}"
         )
     if panels := [name for name in filters if name in panel_variables(model)]:
         raise ModelError(
-            f"ranks_per_chain must be 1 for the panel {panels[0]!r}, got {n_ranks}: every rank "
-            "evaluates all records of its chains"
+            f"per_chain of psf.Ranks must be 1 for the panel {panels[0]!r}, got {n_ranks}: "
+            "every rank evaluates all records of its chains"
         )
     for filter in filters.values():
         check_ranks(filter, n_ranks)

@@ -33,7 +33,7 @@ from ..kernel.record_arrays import (
 )
 from ..kernel.state import ChainState
 from .sampled_model import Growth, SampledModel
-from .settings import DRAMSettings, checked_proposal_cov
+from .settings import RandomWalkSettings, checked_proposal_cov
 from .target import Target
 
 
@@ -147,7 +147,7 @@ class RecordTarget(SampledModel):
     Parameters
     ----------
     model : pymc.Model
-    settings : DRAMSettings
+    settings : RandomWalkSettings
     structure : PanelStructure
     proposal_cov : array_like, shape (d, d), optional
         Of the first proposals; each block takes its own part.
@@ -174,7 +174,7 @@ class RecordTarget(SampledModel):
     def __init__(
         self,
         model: Model,
-        settings: DRAMSettings,
+        settings: RandomWalkSettings,
         structure: PanelStructure,
         proposal_cov: np.ndarray | None = None,
         *,
@@ -262,7 +262,7 @@ class RecordTarget(SampledModel):
 
 def target_of(
     model: Model,
-    settings: DRAMSettings,
+    settings: RandomWalkSettings,
     proposal_cov: np.ndarray | None,
     group: Communicator | None,
     *,
@@ -277,8 +277,8 @@ def target_of(
         return Target(model, None, settings, proposal_cov, group=group)
     if group is not None and group.size > 1:
         raise ModelError(
-            f"ranks_per_chain must be 1 for the panel {structure.name!r}, got {group.size}: every "
-            "rank evaluates all records of its chains"
+            f"per_chain of psf.Ranks must be 1 for the panel {structure.name!r}, got "
+            f"{group.size}: every rank evaluates all records of its chains"
         )
     return RecordTarget(model, settings, structure, proposal_cov, of_all=has_pilot)
 
@@ -287,7 +287,7 @@ def _joined(places: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.empty(0, dtype=np.int64), *map(np.ravel, places)])
 
 
-def _check_settings(settings: DRAMSettings, name: str) -> None:
+def _check_settings(settings: RandomWalkSettings, name: str) -> None:
     """Raise if a setting asks for what the moves of single records do not have."""
     asked = {"screen": settings.screen, "correlation": settings.correlation}
     for setting, value in asked.items():

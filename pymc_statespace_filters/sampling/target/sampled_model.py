@@ -12,7 +12,7 @@ from ...errors import ModelError
 from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds, noisy_filters
 from ...pymc_model.unused_priors import warn_of_unused_priors
 from .initial_points import PriorDraws
-from .settings import DRAMSettings
+from .settings import RandomWalkSettings
 from .variables import RaveledVariables, check_noise_dependencies, continuous_value_vars
 
 
@@ -31,7 +31,7 @@ class SampledModel:
     model : pymc.Model
     vars : sequence of TensorVariable, optional
         Continuous variables to sample. Default: all.
-    settings : DRAMSettings
+    settings : RandomWalkSettings
 
     Attributes
     ----------
@@ -49,7 +49,9 @@ class SampledModel:
         ``vars``.
     """
 
-    def __init__(self, model: Model, vars: Sequence[TensorVariable] | None, settings: DRAMSettings):
+    def __init__(
+        self, model: Model, vars: Sequence[TensorVariable] | None, settings: RandomWalkSettings
+    ):
         warn_of_unused_priors(model)
         self.settings = settings
         variables = continuous_value_vars(vars, model)

@@ -4,7 +4,7 @@ import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +13,52 @@ from ...pymc_model.inspection import is_filter
 from ...system.checks import check_count, is_integer
 
 ADAPTATIONS = ("chain", "continuous")
+_OF_RANKS = {"ranks_per_chain": "per_chain", "gather": "gather"}
 
 
 @dataclass(frozen=True)
-class DRAMSettings:
-    """Settings of delayed rejection adaptive Metropolis, described in `DRAM`.
+class RandomWalkSettings:
+    """Settings of the random walk of `sample`, `sample_dram` and `run_models`: ``kernel=``.
 
-    ``stages`` becomes a pair, while tuning and afterwards; ``correlation=0`` becomes None.
+    They are those of the step method `DRAM`, which describes the algorithm.
+
+    Parameters
+    ----------
+    stages : int or (int, int), default (2, 1)
+        Maximum number of proposals in an iteration, or a pair: during tuning and afterwards.
+    stage_scale : float, default 0.2
+        Factor of the standard deviations of a stage's proposals, relative to the stage before.
+    adaptation : {"chain", "continuous"}, default "chain"
+        Whether the covariance is updated after blocks of iterations, or at every one.
+    adapt_every : int, default 100
+        Iterations in a block.
+    proposal_cov : array_like, shape (d, d), optional
+        Covariance of the first proposals, on the unconstrained space, in the order of the model's
+        free variables. Default: found by the search for starts, or else the prior's.
+    refresh_noise : bool, default True
+        Whether each proposal has its own noise seed.
+    correlation : float, optional
+        In (0, 1): the noise of a proposal is an autoregression on that of the current point.
+    screen : filter, optional
+        A cheap filter on whose likelihood proposals are made first.
+    screen_power : float, default 0.5
+        Exponent of the likelihood of the screen.
+
+    Raises
+    ------
+    ModelError
+        If an argument is not as described.
+
+    Notes
+    -----
+    Settings are equal if their values are. ``stages`` becomes a pair, ``correlation=0`` None, and
+    ``proposal_cov`` rows of numbers.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.RandomWalkSettings(stages=1).stages
+    (1, 1)
     """
 
     stages: Any = (2, 1)
@@ -30,23 +69,7 @@ class DRAMSettings:
     correlation: float | None = None
     screen: Any = None
     screen_power: float = 0.5
-
-    @classmethod
-    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self:
-        """Make settings of arguments by name, as a user gave them.
-
-        Raises
-        ------
-        TypeError
-            If there is no such setting.
-        """
-        names = [field.name for field in fields(cls)]
-        if unknown := [name for name in arguments if name not in names]:
-            raise TypeError(
-                f"unexpected keyword argument {unknown[0]!r}: the settings of DRAM are "
-                f"proposal_cov, {', '.join(names)}"
-            )
-        return cls(**arguments)
+    proposal_cov: Any = None
 
     def __post_init__(self) -> None:
         for field in fields(self):  # equal settings must have equal representations
@@ -75,6 +98,9 @@ class DRAMSettings:
             object.__setattr__(self, "correlation", None)
         if self.correlation is not None:
             self._check_correlation(self.correlation)
+        if self.proposal_cov is not None:
+            cov = checked_proposal_cov(self.proposal_cov)
+            object.__setattr__(self, "proposal_cov", tuple(map(tuple, cov.tolist())))
 
     def _check_correlation(self, correlation: float) -> None:
         if not _is_real(correlation) or not 0.0 < correlation < 1.0:
@@ -97,20 +123,32 @@ class DRAMSettings:
             )
 
 
-def checked_proposal_cov(proposal_cov: object, dim: int) -> np.ndarray:
+def refuse_moved(caller: str, arguments: Mapping[str, Any]) -> None:
+    """Raise a TypeError that says where an argument has moved to, or that there is none."""
+    for name in arguments:
+        place = ""
+        if name in (field.name for field in fields(RandomWalkSettings)):
+            place = f": it is a setting of kernel=psf.RandomWalkSettings({name}=...)"
+        elif name in _OF_RANKS:
+            place = f": it is a setting of comm=psf.Ranks({_OF_RANKS[name]}=...)"
+        raise TypeError(f"{caller}() got an unexpected keyword argument {name!r}{place}")
+
+
+def checked_proposal_cov(proposal_cov: object, dim: int | None = None) -> np.ndarray:
     """Return the user's proposal covariance as a symmetric positive definite matrix.
 
     Raises
     ------
     ModelError
-        If it is not a symmetric positive definite matrix of numbers, ``dim`` by ``dim``.
+        If it is not a symmetric positive definite matrix of numbers, ``dim`` by ``dim`` if given.
     """
-    expected = f"proposal_cov must be a symmetric positive definite {dim} x {dim} matrix, got"
+    size = "" if dim is None else f" {dim} x {dim}"
+    expected = f"proposal_cov must be a symmetric positive definite{size} matrix, got"
     try:
         cov = np.array(proposal_cov, dtype=np.float64)
     except (TypeError, ValueError):
         raise ModelError(f"{expected} {proposal_cov!r}") from None
-    if cov.shape != (dim, dim):
+    if cov.ndim != 2 or cov.shape != (len(cov) if dim is None else dim,) * 2:
         raise ModelError(f"{expected} shape {cov.shape}")
     tolerance = {"rtol": 1e-8, "atol": 1e-12 * np.abs(cov).max(initial=0.0)}
     if not np.isfinite(cov).all() or not np.allclose(cov, cov.T, **tolerance):

@@ -22,7 +22,7 @@ from ..kernel.transition import evaluate
 from .leader_follower import check_group
 from .log_density import LogDensity, screening_density, tempered_density
 from .sampled_model import Growth, SampledModel
-from .settings import DRAMSettings, checked_proposal_cov
+from .settings import RandomWalkSettings, checked_proposal_cov
 
 PILOT_POWER = 0.5
 
@@ -52,7 +52,7 @@ class Target(SampledModel):
         self,
         model: Model,
         vars: Sequence[TensorVariable] | None,
-        settings: DRAMSettings,
+        settings: RandomWalkSettings,
         proposal_cov: np.ndarray | None = None,
         compile_kwargs: dict | None = None,
         *,

@@ -1,0 +1,89 @@
+"""Which sampler suits a model: the random walk of `sample_dram`, or NUTS."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+import pytensor
+from pymc.model import Model
+
+from ..pymc_model.density import ModelDensity
+from ..pymc_model.inspection import gradient_obstacle, noisy_filters
+
+DRAM, NUTS = "dram", "nuts"
+
+# Effective draws that the costs are compared for, and what `benchmarks/choice.py` has measured on
+# its posteriors: effective draws per evaluation of a walk in d dimensions times d^2, and per
+# gradient of NUTS; gradients of an iteration of its warm-up; the cost of a gradient in values; and
+# CPU seconds that take compiling it.
+_N_EFFECTIVE = 400
+_WALK_EFFICIENCY = 0.6
+_NUTS_EFFICIENCY = 0.015
+_NUTS_STEPS = 15
+_GRADIENT = 3.0
+_COMPILATION = 7.0
+# Evaluations of a search for starts.
+_STARTS = 8000
+# Seconds of a measurement of the cost, and evaluations at most.
+_TIMED_SECONDS, _MOST_TIMED = 0.01, 512
+
+
+class Choice(NamedTuple):
+    """A sampler, and why."""
+
+    sampler: str
+    reason: str
+
+
+def choose_sampler(model: Model, chains: int, tune: int) -> Choice:
+    """The sampler that takes less time, of those that are able to sample the model."""
+    if reason := why_no_nuts(model):
+        return Choice(DRAM, reason)
+    point = model.initial_point(random_seed=0)
+    dim = sum(np.size(point[value.name]) for value in model.value_vars)
+    cost = seconds_per_evaluation(model)
+    seconds = {name: expected_seconds(name, dim, cost, chains, tune) for name in (DRAM, NUTS)}
+    quicker = min(seconds, key=lambda name: seconds[name])
+    return Choice(
+        quicker,
+        f"{dim} parameters and {1e3 * cost:.2g} ms a log-density: about {seconds[DRAM]:.2g} CPU s "
+        f"by DRAM and {seconds[NUTS]:.2g} by NUTS",
+    )
+
+
+def expected_seconds(sampler: str, dim: int, cost: float, chains: int, tune: int) -> float:
+    """CPU seconds for `_N_EFFECTIVE` effective draws, if a log-density takes ``cost`` seconds."""
+    if sampler == DRAM:
+        efficiency = min(0.1, _WALK_EFFICIENCY / max(dim, 1) ** 2)
+        return cost * (_STARTS + chains * tune + _N_EFFECTIVE / efficiency)
+    gradients = chains * tune * _NUTS_STEPS + _N_EFFECTIVE / _NUTS_EFFICIENCY
+    return _COMPILATION + cost * (_STARTS + _GRADIENT * gradients)
+
+
+def why_no_nuts(model: Model) -> str:
+    """What keeps NUTS from sampling a model; empty if nothing does."""
+    if noisy := list(noisy_filters(model)):
+        return f"the likelihood of {noisy[0]!r} is estimated with noise"
+    if obstacle := gradient_obstacle(model):
+        return obstacle
+    try:
+        pytensor.grad(model.logp(), [model.rvs_to_values[rv] for rv in model.free_RVs])
+    except (NotImplementedError, TypeError, ValueError) as error:
+        return f"the model has no gradient ({type(error).__name__})"
+    return ""
+
+
+def seconds_per_evaluation(model: Model) -> float:
+    """CPU seconds that the log-density takes at the model's initial point."""
+    density = ModelDensity(model)
+    point = model.initial_point(random_seed=0)
+    x = np.concatenate([np.ravel(point[model.rvs_to_values[rv].name]) for rv in model.free_RVs])
+    density.evaluate(x[None])  # loads the machine code
+    n = 1
+    while True:  # more points for a short one, so that what Python takes does not count
+        began = time.process_time()
+        density.evaluate(np.broadcast_to(x, (n, x.size)))
+        seconds = time.process_time() - began
+        if seconds > _TIMED_SECONDS or n >= _MOST_TIMED:
+            return seconds / n
+        n *= 8

@@ -1,0 +1,1 @@
+"""NUTS by nutpie, with starts and results as of the other samplers."""

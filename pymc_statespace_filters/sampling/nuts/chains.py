@@ -1,0 +1,160 @@
+"""Chains of nutpie, looked at while they run, until their draws are worth enough."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from threading import Semaphore
+from typing import Any, NamedTuple
+
+import numpy as np
+import nutpie
+from numpy.typing import NDArray
+from nutpie.compiled_pyfunc import from_pyfunc
+from xarray import DataTree
+
+from ...progress import ChainProgress
+from ..output.convergence import Convergence, convergence
+from ..run.request import SamplingRequest
+from ..run.stopping import Length, first_length, next_length
+from .gradient import DensityGradient
+
+Array = NDArray[np.float64]
+
+# Of the statistics of nutpie, those that are kept, by their names in PyMC.
+STATISTICS = {
+    "logp": "model_logp",
+    "diverging": "diverging",
+    "energy": "energy",
+    "depth": "tree_depth",
+    "maxdepth_reached": "reached_max_treedepth",
+    "n_steps": "n_steps",
+    "step_size": "step_size",
+    "mean_tree_accept": "acceptance_rate",
+}
+_SECONDS = 0.05
+# Draws of a run without a limit of its own, in those that are kept: they are in memory.
+MOST_THIN = 64
+
+
+class NutsChains(NamedTuple):
+    """Positions (chain, draw, d) and statistics of kept draws, and what lies behind them."""
+
+    positions: Array
+    statistics: dict[str, np.ndarray]
+    length: Length
+    found: Convergence | None
+    seconds: float
+
+
+def run_nuts(
+    density: DensityGradient,
+    start: Callable[[np.random.Generator], Array],
+    dim: int,
+    request: SamplingRequest,
+    *,
+    cores: int,
+    seed: int,
+    progressbar: bool | str,
+) -> NutsChains:
+    """Run the chains of a request, each from ``start`` with a generator of its own.
+
+    Ctrl-C ends them; the draws that all have made are kept.
+    """
+    allowed = Semaphore(cores)
+
+    def evaluate_in_turn() -> Callable[[Array], tuple[float, Array]]:
+        evaluate = density.for_a_thread()
+
+        def waiting(x: Array) -> tuple[float, Array]:
+            with allowed:
+                return evaluate(x)
+
+        return waiting
+
+    model = from_pyfunc(
+        dim,
+        evaluate_in_turn,
+        lambda *_: lambda x: {"position": x.copy()},
+        [np.dtype(np.float64)],
+        [(dim,)],
+        ["position"],
+        make_initial_point_fn=lambda seed: start(np.random.default_rng(seed)),
+    )
+    began = time.monotonic()
+    with ChainProgress(request.chains, request.draws, request.tune, progressbar) as bars:
+        sampler = nutpie.sample(
+            model,
+            draws=request.max_draws or request.draws,
+            tune=request.tune,
+            chains=request.chains,
+            cores=request.chains,  # or the first would run to their end before the others begin
+            seed=seed,
+            progress_bar=False,
+            progress_rate=50,
+            adaptation="low_rank",  # no worse than whitened by the starts
+            blocking=False,
+            progress_callback=(watch := _Watch()),
+        )
+        return _followed(sampler, watch, request, bars, began)
+
+
+class _Watch:
+    """The last progress of each chain, which nutpie reports from a thread of its own."""
+
+    def __init__(self) -> None:
+        self.chains: list[Any] = []
+
+    def __call__(self, chains: list[Any]) -> None:
+        self.chains = chains
+
+
+def _followed(
+    sampler: Any, watch: _Watch, request: SamplingRequest, bars: ChainProgress, began: float
+) -> NutsChains:
+    """Wait for the chains, and end them at the first length whose draws are worth enough."""
+    length, found = first_length(request), None
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(_SECONDS)
+            made = [chain.finished_draws for chain in watch.chains]
+            for i, chain in enumerate(watch.chains):
+                bars.update(i, chain.finished_draws, _shown(chain))
+            is_over = _is_finished(sampler)
+            if not is_over and (not made or min(made) < request.tune + length.n_iterations):
+                continue
+            positions = _positions(sampler.inspect())[:, : length.n_iterations]
+            found = convergence(list(positions[:, length.thin - 1 :: length.thin]))
+            longer = next_length(request, length, found, time.monotonic() - began)
+            if longer is None or is_over:
+                break
+            length = longer
+            for i in range(request.chains):
+                bars.extend(i, request.tune + length.n_iterations)
+    return _kept(sampler.abort(), length, found, time.monotonic() - began)
+
+
+def _is_finished(sampler: Any) -> bool:
+    with suppress(TimeoutError):  # nutpie did not answer at once
+        return bool(sampler.is_finished)
+    return False
+
+
+def _shown(chain: Any) -> dict[str, float]:
+    return {"accept_rate": np.nan, "n_failed": chain.divergences}
+
+
+def _positions(trace: DataTree) -> Array:
+    return np.asarray(trace["posterior"].dataset["position"])
+
+
+def _kept(trace: DataTree, length: Length, found: Convergence | None, seconds: float) -> NutsChains:
+    """Every ``thin``-th draw of a trace, as far as all chains have come."""
+    rows = slice(length.thin - 1, length.n_iterations, length.thin)
+    positions = _positions(trace)
+    is_made = np.isfinite(positions).all(axis=(0, 2))
+    rows = slice(rows.start, min(rows.stop, int(is_made.sum())), rows.step)
+    stats = trace["sample_stats"].dataset
+    statistics = {
+        kept: stats[name].values[:, rows] for name, kept in STATISTICS.items() if name in stats
+    }
+    return NutsChains(positions[:, rows], statistics, length, found, seconds)

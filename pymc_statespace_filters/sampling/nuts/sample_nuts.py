@@ -1,0 +1,109 @@
+"""A whole run of NUTS, from the request to the DataTree."""
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+from pymc.initial_point import make_initial_point_fn
+from pymc.model import Model
+from pymc.stats.convergence import log_warnings
+from xarray import DataTree
+
+from ...errors import ModelError
+from ...parallel.cpu_affinity import available_cores
+from ...pymc_model.inspection import element_names, exactness, filters_used
+from ..output.datatree import to_datatree
+from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
+from ..run.request import SamplingRequest
+from ..starts.population import find_population
+from ..target.settings import RandomWalkSettings
+from ..target.target import Target
+from ..target.variables import check_no_generators
+from .chains import NutsChains, run_nuts
+from .gradient import DensityGradient
+from .report import messages_of
+
+Array = NDArray[np.float64]
+
+
+def sample_nuts(
+    model: Model, request: SamplingRequest, *, cores: int | None, progressbar: bool | str
+) -> DataTree:
+    """Draw from the posterior by nutpie; errors are those of `sample`."""
+    check_no_generators(model)
+    rng = np.random.default_rng(request.entropy)
+    target = Target(model, None, RandomWalkSettings())
+    start = _start(model, target, request, rng, progressbar=bool(progressbar))
+    chains = run_nuts(
+        DensityGradient(model, target.raveled),
+        start,
+        target.raveled.dim,
+        request,
+        cores=cores or available_cores(),
+        seed=int(rng.integers(2**32)),
+        progressbar=progressbar,
+    )
+    if not chains.positions.shape[1]:
+        raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
+    tree = _tree(model, target, chains, request)
+    check = FilterCheck()
+    with suppress(KeyboardInterrupt):
+        iterations = request.tune + chains.length.n_iterations
+        check = check_filters(tree, model, iterations, chains.seconds, rng)
+    level = "info" if progressbar else "debug"
+    names = element_names(model, target.raveled.variables)
+    log_warnings([*messages_of(chains, request, names, level), *check.messages(level)])
+    warn_of_filters(check.warned)
+    return tree
+
+
+def _tree(model: Model, target: Target, chains: NutsChains, request: SamplingRequest) -> DataTree:
+    arrays = [
+        (positions, {name: values[i] for name, values in chains.statistics.items()})
+        for i, positions in enumerate(chains.positions)
+    ]
+    tree = to_datatree(
+        model,
+        target.raveled,
+        arrays,
+        tune=0,
+        keep_warmup=False,
+        sampling_time=chains.seconds,
+    )
+    tree["posterior"].attrs["tuning_steps"] = request.tune
+    tree.attrs |= {
+        **filters_used(model),
+        "exact": int(exactness(model)),
+        "refresh_noise": 1,
+        "correlation": 0.0,
+        "iterations_per_draw": chains.length.thin,
+    }
+    return tree
+
+
+def _start(
+    model: Model,
+    target: Target,
+    request: SamplingRequest,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool,
+) -> Callable[[np.random.Generator], Array]:
+    """Where a chain starts, by a generator of its own: at a point of the posterior.
+
+    Or at the user's point, or, if a prior is improper, near the model's initial point.
+    """
+    initvals = request.initvals
+    if initvals is not None and not isinstance(initvals, Mapping):
+        raise ModelError(
+            f"initvals must be a mapping for sampler='nuts', got {type(initvals).__name__}: "
+            "sampler='dram' takes one for each chain"
+        )
+    if initvals is not None or not target.prior_draws.may_start:
+        point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
+        centre, width = target.raveled.ravel(point(0)), 0.0 if initvals else 1.0
+        return lambda own: centre + own.uniform(-width, width, centre.size)
+    target.prepare()
+    population = find_population(target, rng, progressbar=progressbar)
+    return lambda own: population.x[own.integers(len(population.x))]

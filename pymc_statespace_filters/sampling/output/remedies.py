@@ -1,0 +1,15 @@
+"""What helps chains of a model that mix slowly, by name."""
+
+from pymc.model import Model
+
+from ...pymc_model.inspection import gradient_obstacle, noisy_filters
+
+
+def ways_to_mix(model: Model, name: str) -> str:
+    """What works for this model if the chains are slow along the element with this name."""
+    ways = ["tune longer"]
+    if not noisy_filters(model) and not gradient_obstacle(model):
+        ways.append("use psf.sample(sampler='nuts')")
+    if noisy_filters(model):
+        ways.append("give the filter more particles (psf.suggest_particles)")
+    return ", ".join([*ways, f"or reparametrise {name}"])

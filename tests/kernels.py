@@ -1,0 +1,17 @@
+"""Flat settings of chains, as parametrized tests list them, as arguments of the samplers."""
+
+from dataclasses import fields
+
+import pymc_statespace_filters as psf
+
+_OF_KERNEL = {field.name for field in fields(psf.RandomWalkSettings)}
+
+
+def with_kernel(settings):
+    """Settings with those of the random walk in ``kernel``, and those of ranks in ``comm``."""
+    of_kernel = {name: settings[name] for name in settings if name in _OF_KERNEL}
+    rest = {name: value for name, value in settings.items() if name not in _OF_KERNEL}
+    ranks = {name: rest.pop(name) for name in ("per_chain", "gather") if name in rest}
+    if ranks:
+        rest["comm"] = psf.Ranks(rest.get("comm"), **ranks)
+    return rest | ({"kernel": psf.RandomWalkSettings(**of_kernel)} if of_kernel else {})
