@@ -16,6 +16,7 @@ from ...pymc_model.inspection import element_names, exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..run.request import SamplingRequest
+from ..starts.modes import modes_message, modes_warning
 from ..starts.population import find_population
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
@@ -106,4 +107,6 @@ def _start(
         return lambda own: centre + own.uniform(-width, width, centre.size)
     target.prepare()
     population = find_population(target, rng, progressbar=progressbar)
+    if (message := modes_message(model, target.raveled, population)) is not None:
+        log_warnings([modes_warning(message)])
     return lambda own: population.x[own.integers(len(population.x))]
